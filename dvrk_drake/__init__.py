@@ -1,0 +1,1 @@
+"""Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."""

@@ -1,0 +1,1 @@
+"""An arm's equations: symbolic gravity, base parameters, joint effects, identified models."""

@@ -1,0 +1,127 @@
+"""Symbolic expressions as fast functions and as source to read or to use elsewhere (numba, Python, C, LaTeX)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import sympy
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class SharedTerms:
+    """An array of expressions after common subexpression elimination.
+
+    Attributes:
+        assignments: (symbol, expression), in order of use.
+        entries: (index, expression) of each entry that is not identically zero.
+        shape: of the array.
+    """
+
+    assignments: list[tuple[sympy.Symbol, sympy.Expr]]
+    entries: list[tuple[tuple[int, ...], sympy.Expr]]
+    shape: tuple[int, ...]
+
+
+def share_terms(array: sympy.NDimArray | sympy.MatrixBase) -> SharedTerms:
+    """Common subexpression elimination over a vector or matrix of expressions."""
+    dense = sympy.ImmutableDenseNDimArray(array)
+    indices = list(np.ndindex(*dense.shape))
+    flat = [dense[index] for index in indices]
+    assignments, reduced = sympy.cse(flat, symbols=sympy.numbered_symbols("x"), optimizations="basic")
+    entries = [(index, e) for index, e in zip(indices, reduced, strict=True) if e != 0]
+    return SharedTerms(assignments, entries, dense.shape)
+
+
+def python_source(
+    name: str, arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms, docstring: str = ""
+) -> str:
+    """A Python function `name(*arguments, out)` that fills the array `out`; needs only the standard library's math.
+
+    Args:
+        name: of the function.
+        arguments: (name, symbols) each; a one-element tuple of the same name is a scalar, else symbols are unpacked.
+        terms: what to compute.
+        docstring: first statement of the function.
+    """
+    lines = [f"def {name}({', '.join(n for n, _ in arguments)}, out):"]
+    if docstring:
+        lines.append(f'    """{docstring}"""')
+    lines += _unpacking(arguments, terms, "    {symbol} = {array}[{index}]")
+    lines += [f"    {symbol} = {sympy.pycode(e)}" for symbol, e in terms.assignments]
+    if len(terms.entries) < math.prod(terms.shape):
+        lines.append("    out[:] = 0.0")
+    lines += [f"    out[{', '.join(map(str, index))}] = {sympy.pycode(e)}" for index, e in terms.entries]
+    return "\n".join(lines) + "\n"
+
+
+def c_source(
+    name: str, arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms, comment: str = ""
+) -> str:
+    """A C99 function `void name(..., double *out)`; out is row-major. Arguments as in `python_source`."""
+    parameters = [f"double {n}" if _is_scalar(n, s) else f"const double {n}[{len(s)}]" for n, s in arguments]
+    size = math.prod(terms.shape)
+    lines = [f"/* {comment} */"] if comment else []
+    lines += ["#include <math.h>", "", f"void {name}({', '.join(parameters)}, double out[{size}]) {{"]
+    lines += _unpacking(arguments, terms, "  const double {symbol} = {array}[{index}];")
+    lines += [f"  const double {symbol} = {sympy.ccode(e)};" for symbol, e in terms.assignments]
+    lines.append(f"  for (int i = 0; i < {size}; ++i) out[i] = 0.0;")
+    for index, e in terms.entries:
+        lines.append(f"  out[{np.ravel_multi_index(index, terms.shape)}] = {sympy.ccode(e)};")
+    return "\n".join([*lines, "}", ""])
+
+
+def compile_function(
+    name: str, arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms
+) -> Callable[..., None]:
+    """The function of `python_source`, compiled with numba for float64; vectors and `out` must be C-contiguous."""
+    namespace: dict[str, object] = {"math": math}
+    exec(python_source(name, arguments, terms), namespace)
+    kinds = [numba.float64 if _is_scalar(n, s) else numba.float64[::1] for n, s in arguments]
+    out = (numba.float64[::1], numba.float64[:, ::1])[len(terms.shape) - 1]
+    return numba.njit(numba.void(*kinds, out), fastmath=False)(namespace[name])
+
+
+def compile_batch(function: Callable[..., None], num_arguments: int, shape: tuple[int, ...]) -> Callable:
+    """A compiled loop of `function` over the rows of its first argument.
+
+    Returns:
+        f(rows, *others) -> (len(rows), *shape), where rows is (m, k) C-contiguous.
+    """
+    others = ", ".join(f"a{i}" for i in range(1, num_arguments))
+    call = f"rows[i], {others + ', ' if others else ''}out[i]"
+    source = (
+        f"def batch(rows, {others}{', ' if others else ''}out):\n"
+        "    for i in range(rows.shape[0]):\n"
+        f"        function({call})\n"
+    )
+    namespace: dict[str, object] = {"function": function}
+    exec(source, namespace)
+    loop = numba.njit(namespace["batch"])
+
+    def evaluate(rows: NDArray[np.float64], *arguments: object) -> NDArray[np.float64]:
+        rows = np.ascontiguousarray(rows, dtype=np.float64)
+        out = np.empty((len(rows), *shape))
+        loop(rows, *arguments, out)
+        return out
+
+    return evaluate
+
+
+def _is_scalar(name: str, symbols: Sequence[sympy.Symbol]) -> bool:
+    return len(symbols) == 1 and symbols[0].name == name
+
+
+def _unpacking(arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms, form: str) -> list[str]:
+    used = set().union(*(e.free_symbols for _, e in [*terms.assignments, *terms.entries]), set())
+    return [
+        form.format(symbol=symbol, array=name, index=index)
+        for name, symbols in arguments
+        if not _is_scalar(name, symbols)
+        for index, symbol in enumerate(symbols)
+        if symbol in used
+    ]

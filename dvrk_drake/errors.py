@@ -1,0 +1,21 @@
+"""Errors that a user can act on: each message says what is wrong, where, and what is allowed."""
+
+
+class DvrkDrakeError(Exception):
+    """Base of every error that this package raises on purpose; the command line turns it into exit code 2."""
+
+
+class ArmError(DvrkDrakeError):
+    """An arm that does not exist, or whose files contradict each other."""
+
+
+class RecordingError(DvrkDrakeError):
+    """A recording that cannot be read or used."""
+
+
+class ModelError(DvrkDrakeError):
+    """An identified model that cannot be read, or does not fit what it is used with."""
+
+
+class IdentificationError(DvrkDrakeError):
+    """A recording that does not determine what was asked of it."""

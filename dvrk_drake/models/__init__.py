@@ -1,0 +1,1 @@
+"""What an arm is, and what a recording of one is."""

@@ -1,0 +1,170 @@
+"""What an arm is: its joints, limits, linkage and transmission, read from its YAML and SDF."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.common.yaml import yaml_load_typed
+
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm_schema import ArmDescription, CoupledLimit, Gains, LoopClosure, Mechanism
+from dvrk_drake.models.linear_map import LinearMap
+from dvrk_drake.models.sdf_facts import read_sdf_facts
+
+MODELS_FOLDER = Path(__file__).parent
+PACKAGE_URL = "package://dvrk_drake/"
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """One arm of a dVRK. Vectors of n independent joints, in the dVRK's order; rad and N m, m and N if prismatic.
+
+    Attributes:
+        name: as the dVRK names it, e.g. "MTML".
+        joint_names: the n independent joints.
+        tree_joint_names: the joints of the SDF tree, linkage included.
+        sdf: package URL of the model file.
+        position_lower, position_upper: (n,) limits of this arm.
+        effort_limits: (n,) limits of the joint torques, from the SDF.
+        coupled_limits: limits of sums of joint positions.
+        linkage: q_tree = G q + c, from the SDF's `drake:mimic` tags.
+        transmission: a = J q, actuator from joint positions.
+        loop_closures: frames that must coincide.
+        gravity: (3,) gravity vector in the base frame [m/s^2].
+        gains: default gains of the controller.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    tree_joint_names: tuple[str, ...]
+    sdf: str
+    position_lower: NDArray[np.float64]
+    position_upper: NDArray[np.float64]
+    effort_limits: NDArray[np.float64]
+    coupled_limits: tuple[CoupledLimit, ...]
+    linkage: LinearMap
+    transmission: LinearMap
+    loop_closures: tuple[LoopClosure, ...]
+    gravity: NDArray[np.float64]
+    gains: Gains
+
+    @property
+    def num_joints(self) -> int:
+        """Number of independent joints."""
+        return len(self.joint_names)
+
+    def limit_matrix(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """All limits as lower <= A q <= upper: the joint box first, then the coupled limits."""
+        rows = [[limit.coefficients.get(j, 0.0) for j in self.joint_names] for limit in self.coupled_limits]
+        A = np.vstack([np.eye(self.num_joints), np.array(rows).reshape(-1, self.num_joints)])
+        lower = np.concatenate([self.position_lower, [limit.lower for limit in self.coupled_limits]])
+        upper = np.concatenate([self.position_upper, [limit.upper for limit in self.coupled_limits]])
+        return A, lower, upper
+
+    def limit_violations(self, q: ArrayLike, tolerance: float = 0.0) -> list[str]:
+        """Readable violations of the limits by one pose q (n,) beyond `tolerance` [rad or m]; empty if none."""
+        A, lower, upper = self.limit_matrix()
+        names = [*self.joint_names, *(limit.name for limit in self.coupled_limits)]
+        value = A @ np.asarray(q, float)
+        bad = np.flatnonzero((value < lower - tolerance) | (value > upper + tolerance))
+        return [f"{names[i]} = {value[i]:.4g} is outside {lower[i]:.4g}..{upper[i]:.4g}" for i in bad]
+
+    def sample_poses(
+        self, count: int, generator: np.random.Generator, margin: float = 0.0
+    ) -> NDArray[np.float64]:
+        """`count` random poses (count, n), uniform in the joint box and inside the coupled limits.
+
+        Args:
+            count: number of poses.
+            generator: source of randomness.
+            margin: fraction of each range that is kept free at both of its ends, 0..0.5.
+        """
+        A, lower, upper = self.limit_matrix()
+        inset = margin * (upper - lower)
+        lower, upper = lower + inset, upper - inset
+        n = self.num_joints
+        poses = np.empty((0, n))
+        while len(poses) < count:
+            q = generator.uniform(lower[:n], upper[:n], (2 * count + 8, n))
+            value = q @ A.T
+            poses = np.vstack([poses, q[np.all((value >= lower) & (value <= upper), axis=1)]])
+        return poses[:count]
+
+    def with_gravity(self, gravity: Sequence[float]) -> Arm:
+        """The same arm mounted so that gravity is `gravity` (3,) [m/s^2] in its base frame."""
+        return dataclasses.replace(self, gravity=np.asarray(gravity, float))
+
+
+def known_arms() -> list[str]:
+    """Names that `load_arm` accepts."""
+    return sorted(path.stem for path in (MODELS_FOLDER / "arms").glob("*.yaml"))
+
+
+@cache
+def load_arm(name: str) -> Arm:
+    """Loads an arm by name (e.g. "mtml"; case does not matter) or by the path of an arm's YAML file.
+
+    Raises:
+        ArmError: no such arm, or its files contradict each other.
+    """
+    path = Path(name)
+    if path.suffix not in (".yaml", ".yml"):
+        path = MODELS_FOLDER / "arms" / f"{name.lower()}.yaml"
+        if not path.is_file():
+            raise ArmError(f'unknown arm "{name}"; known arms: {", ".join(known_arms())}')
+    if not path.is_file():
+        raise ArmError(f"{path}: no such arm file")
+    try:
+        description = yaml_load_typed(schema=ArmDescription, filename=str(path))
+        mechanism_path = MODELS_FOLDER / "mechanisms" / f"{description.mechanism}.yaml"
+        mechanism = yaml_load_typed(schema=Mechanism, filename=str(mechanism_path))
+    except Exception as error:
+        # yaml_load_typed raises many types, from YAML's to KeyError; each text names the field.
+        raise ArmError(f"{path}: {error}") from error
+    return _build_arm(path, description, mechanism)
+
+
+def _build_arm(path: Path, description: ArmDescription, mechanism: Mechanism) -> Arm:
+    joints = mechanism.joints
+    facts = read_sdf_facts(MODELS_FOLDER / mechanism.sdf.removeprefix(PACKAGE_URL))
+    if set(joints) != set(description.position_limits):
+        raise ArmError(f"{path}: position_limits must name exactly {', '.join(joints)}")
+    if missing := set(joints) - set(facts.joint_names):
+        raise ArmError(f"{mechanism.sdf}: has no joint {', '.join(sorted(missing))}")
+    limits = np.array([description.position_limits[j] for j in joints])
+    if limits.shape != (len(joints), 2) or np.any(limits[:, 0] >= limits[:, 1]):
+        raise ArmError(f"{path}: each of position_limits must be [lower, upper] with lower < upper")
+    for which, values in dataclasses.asdict(mechanism.gains).items():
+        if len(values) != len(joints):
+            raise ArmError(f"{path}: gains.{which} has {len(values)} numbers, one a joint is {len(joints)}")
+    J = np.eye(len(joints))
+    for actuator, row in mechanism.transmission.items():
+        J[joints.index(actuator)] = [row.get(j, 0.0) for j in joints]
+    G = np.zeros((len(facts.joint_names), len(joints)))
+    c = np.zeros(len(facts.joint_names))
+    for row, name in enumerate(facts.joint_names):
+        leader, multiplier, offset = facts.mimics.get(name, (name, 1.0, 0.0))
+        if leader not in joints:
+            raise ArmError(f"{mechanism.sdf}: joint {name} is neither independent nor a mimic of one that is")
+        G[row, joints.index(leader)], c[row] = multiplier, offset
+    return Arm(
+        name=description.name,
+        joint_names=tuple(joints),
+        tree_joint_names=facts.joint_names,
+        sdf=mechanism.sdf,
+        position_lower=limits[:, 0],
+        position_upper=limits[:, 1],
+        effort_limits=np.array([facts.effort_limits[j] for j in joints]),
+        coupled_limits=tuple(mechanism.coupled_limits),
+        linkage=LinearMap(G, c),
+        transmission=LinearMap(J, np.zeros(len(joints))),
+        loop_closures=tuple(mechanism.loop_closures),
+        gravity=np.asarray(description.gravity, float),
+        gains=mechanism.gains,
+    )

@@ -1,0 +1,55 @@
+"""Schemas of `arms/*.yaml` and `mechanisms/*.yaml`, for yaml_load_typed: a typo in a file is an error.
+
+No postponed annotations here: yaml_load_typed reads the types at run time.
+"""
+
+from dataclasses import dataclass, field
+
+
+@dataclass
+class CoupledLimit:
+    """lower <= sum of coefficient * joint position <= upper; `name` is what messages call it."""
+
+    name: str = ""
+    coefficients: dict[str, float] = field(default_factory=dict)
+    lower: float = 0.0
+    upper: float = 0.0
+
+
+@dataclass
+class LoopClosure:
+    """Two frames of the SDF whose origins coincide at every pose that the linkage allows."""
+
+    frame_a: str = ""
+    frame_b: str = ""
+
+
+@dataclass
+class Gains:
+    """Diagonal PID gains per joint: kp [N m/rad], kd [N m s/rad], ki [N m/(rad s)]; N and m on a prismatic joint."""
+
+    kp: list[float] = field(default_factory=list)
+    kd: list[float] = field(default_factory=list)
+    ki: list[float] = field(default_factory=list)
+
+
+@dataclass
+class Mechanism:
+    """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common."""
+
+    sdf: str = ""
+    joints: list[str] = field(default_factory=list)
+    gains: Gains = field(default_factory=Gains)
+    transmission: dict[str, dict[str, float]] = field(default_factory=dict)
+    coupled_limits: list[CoupledLimit] = field(default_factory=list)
+    loop_closures: list[LoopClosure] = field(default_factory=list)
+
+
+@dataclass
+class ArmDescription:
+    """Schema of `arms/*.yaml`. `gravity` is the gravity vector [m/s^2] in the arm's base frame."""
+
+    name: str = ""
+    mechanism: str = ""
+    position_limits: dict[str, list[float]] = field(default_factory=dict)
+    gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81])

@@ -1,0 +1,99 @@
+"""An arm as a Drake MultibodyPlant."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.systems.framework import Context
+
+from dvrk_drake.models.arm import MODELS_FOLDER, PACKAGE_URL, Arm
+from dvrk_drake.models.sdf_facts import DRAKE
+
+#: How the loops of a linkage are held: "mimic" couples the joints of a tree, "ball" pins the cut loop with constraints.
+Closure = Literal["mimic", "ball"]
+
+
+def add_arm(plant: MultibodyPlant, arm: Arm, closure: Closure = "mimic") -> ModelInstanceIndex:
+    """Adds `arm` to a plant that is not finalized, welds its base to the world and sets gravity and limits.
+
+    Needs a discrete plant with the SAP solver, as all of Drake's joint couplings and ball constraints do.
+    """
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
+    parser = Parser(plant)
+    parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))
+    if closure == "mimic":
+        (instance,) = parser.AddModelsFromUrl(arm.sdf)
+    else:
+        (instance,) = parser.AddModelsFromString(_without_mimics(arm), "sdf")
+        for loop in arm.loop_closures:
+            A = plant.GetFrameByName(loop.frame_a, instance)
+            B = plant.GetFrameByName(loop.frame_b, instance)
+            p_AP = A.GetFixedPoseInBodyFrame().translation()
+            p_BQ = B.GetFixedPoseInBodyFrame().translation()
+            plant.AddBallConstraint(A.body(), p_AP, B.body(), p_BQ)
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link", instance))
+    plant.mutable_gravity_field().set_gravity_vector(arm.gravity)
+    for name, lower, upper in zip(arm.joint_names, arm.position_lower, arm.position_upper, strict=True):
+        plant.GetJointByName(name, instance).set_position_limits([lower], [upper])
+    return instance
+
+
+def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic") -> MultibodyPlant:
+    """A finalized plant that holds nothing but `arm`; `time_step` [s]."""
+    plant = MultibodyPlant(time_step)
+    add_arm(plant, arm, closure)
+    plant.Finalize()
+    return plant
+
+
+def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex | None = None) -> NDArray[np.int_]:
+    """Index into the plant's q (and v: all joints have one degree of freedom) of each of `arm.tree_joint_names`."""
+    joints = [plant.GetJointByName(n, instance) if instance else plant.GetJointByName(n) for n in arm.tree_joint_names]
+    return np.array([joint.position_start() for joint in joints])
+
+
+def set_arm_positions(plant: MultibodyPlant, context: Context, arm: Arm, q: ArrayLike) -> None:
+    """Sets the whole tree, linkage included, to the pose of the independent joints q (n,)."""
+    q_plant = plant.GetPositions(context)
+    q_plant[tree_selector(plant, arm)] = arm.linkage.position(q)
+    plant.SetPositions(context, q_plant)
+
+
+def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray[np.float64]:
+    """Torque (n,) on the independent joints that holds the arm against gravity at the context's pose.
+
+    Drake's gravity forces ignore constraints, so they are projected through the linkage: tau = -G' tau_g.
+    """
+    tau_g = plant.CalcGravityGeneralizedForces(context)[tree_selector(plant, arm)]
+    return -arm.linkage.pull_back_effort(tau_g)
+
+
+def _without_mimics(arm: Arm) -> str:
+    root = ElementTree.parse(MODELS_FOLDER / arm.sdf.removeprefix(PACKAGE_URL)).getroot()
+    for joint in root.iter("joint"):
+        for mimic in joint.findall(f"{DRAKE}mimic"):
+            # A rotor that follows another joint closes no loop: only its coupler can hold it.
+            if joint.get("name") in _loop_joints(root, arm):
+                joint.remove(mimic)
+    ElementTree.register_namespace("drake", DRAKE.strip("{}"))
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _loop_joints(root: ElementTree.Element, arm: Arm) -> set[str]:
+    """Dependent joints on the way from the base to a loop's cut."""
+    parent_joint = {joint.findtext("child"): joint for joint in root.iter("joint")}
+    frame_link = {frame.get("name"): frame.get("attached_to") for frame in root.iter("frame")}
+    names = set()
+    for loop in arm.loop_closures:
+        for frame in (loop.frame_a, loop.frame_b):
+            link = frame_link[frame]
+            while link in parent_joint:
+                names.add(parent_joint[link].get("name", ""))
+                link = parent_joint[link].findtext("parent")
+    return names - set(arm.joint_names)

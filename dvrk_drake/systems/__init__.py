@@ -1,0 +1,1 @@
+"""What runs inside a Drake Diagram; one LeafSystem a file."""
