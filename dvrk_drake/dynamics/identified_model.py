@@ -1,0 +1,192 @@
+"""What an identification leaves behind: parameters with their uncertainty, and where they came from. Stored as YAML."""
+
+# No postponed annotations here: yaml_load_typed reads the types at run time.
+import os
+import tempfile
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+
+from dvrk_drake.dynamics.joint_effects import EFFECT_KINDS, JointEffect
+from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
+from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
+from dvrk_drake.errors import ArmError, ModelError
+from dvrk_drake.models.arm import Arm, load_arm
+
+
+@dataclass
+class BaseParameterEstimate:
+    """A base parameter [kg m]; `distinguishable`: its size exceeds two standard errors."""
+
+    name: str = ""
+    value: float = 0.0
+    standard_error: float = 0.0
+    distinguishable: bool = False
+
+
+@dataclass
+class EffectEstimate:
+    """The coefficient of a joint effect [N m, or N on a prismatic joint]."""
+
+    joint: str = ""
+    kind: str = ""
+    value: float = 0.0
+    standard_error: float = 0.0
+    distinguishable: bool = False
+
+
+@dataclass
+class JointStatistics:
+    """How one joint was fitted. Torques are RMS in N m (N if prismatic), angles in rad (m).
+
+    `rms_zero_torque` is the error of commanding nothing: the RMS of the measured torque. `rms_leave_one_out` predicts each
+    pose from all others; `rms_cross_validation` chooses the effects anew as well (ten folds). `_undoubted` leaves out the
+    measurements that were doubted (`num_doubted` of them). `trust` scales the joint's torque: 1, or less where the data
+    do not support the model. `position_lower`, `position_upper`: the range that the poses covered; `coverage`: its share
+    of the arm's range.
+    """
+
+    name: str = ""
+    rms_zero_torque: float = 0.0
+    rms_fit: float = 0.0
+    rms_leave_one_out: float = 0.0
+    rms_zero_torque_undoubted: float = 0.0
+    rms_fit_undoubted: float = 0.0
+    rms_leave_one_out_undoubted: float = 0.0
+    rms_cross_validation_undoubted: float = 0.0
+    num_doubted: int = 0
+    trust: float = 1.0
+    position_lower: float = 0.0
+    position_upper: float = 0.0
+    coverage: float = 0.0
+
+
+@dataclass
+class Provenance:
+    """Where a model came from; `sha256` is of the recording's bytes."""
+
+    recording: str = ""
+    sha256: str = ""
+    poses: int = 0
+    method: str = ""
+    rank: int = 0
+    condition_number: float = 0.0
+    version: str = ""
+
+
+@dataclass
+class IdentifiedModel:
+    """A static model of one arm: tau = trust o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
+
+    `gravity` [m/s^2] is the gravity vector in the base frame that the base parameters were identified with.
+    """
+
+    format: str = "dvrk_drake identified model 1"
+    arm: str = ""
+    gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81])
+    base_parameters: list[BaseParameterEstimate] = field(default_factory=list)
+    joint_effects: list[EffectEstimate] = field(default_factory=list)
+    joints: list[JointStatistics] = field(default_factory=list)
+    provenance: Provenance = field(default_factory=Provenance)
+
+    @classmethod
+    def from_arm(cls, arm: Arm) -> "IdentifiedModel":
+        """The model that the arm's SDF states: its own inertias, no joint effects."""
+        gravity = derive_gravity(arm)
+        return cls(
+            arm=arm.name.lower(),
+            gravity=[float(x) for x in arm.gravity],
+            base_parameters=[
+                BaseParameterEstimate(name, float(value), 0.0, True)
+                for name, value in zip(gravity.base.names, gravity.base_values, strict=True)
+            ],
+            joints=[JointStatistics(name=name) for name in arm.joint_names],
+            provenance=Provenance(recording=arm.sdf, method="nominal"),
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> "IdentifiedModel":
+        """Reads a model file.
+
+        Raises:
+            ModelError: no such file, not a model, or one that does not fit its arm.
+        """
+        if not Path(path).is_file():
+            raise ModelError(f"{path}: no such file")
+        try:
+            model = yaml_load_typed(schema=cls, filename=str(path))
+        except Exception as error:
+            # yaml_load_typed raises many types, from YAML's to AssertionError.
+            raise ModelError(f"{path}: not a model file: {error}") from error
+        try:
+            model.check()
+        except (ModelError, ArmError) as error:
+            raise ModelError(f"{path}: {error}") from error
+        return model
+
+    def save(self, path: str | Path) -> None:
+        """Writes the model file at once or not at all."""
+        path = Path(path)
+        text = yaml_dump_typed(self)
+        try:
+            handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        except OSError as error:
+            raise ModelError(f"{path}: cannot be written: {error.strerror}") from error
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+
+    def check(self) -> None:
+        """Raises ModelError unless the parameters fit the arm that the model names."""
+        if self.format != IdentifiedModel.format:
+            raise ModelError(f'format is "{self.format}", this version reads "{IdentifiedModel.format}"')
+        arm = self.load_arm()
+        names = derive_gravity(arm).base.names
+        if tuple(p.name for p in self.base_parameters) != names:
+            raise ModelError(f"base parameters must be, in this order: {'; '.join(names)}")
+        if tuple(joint.name for joint in self.joints) != arm.joint_names:
+            raise ModelError(f"joints must be, in this order: {', '.join(arm.joint_names)}")
+        for effect in self.joint_effects:
+            if effect.joint not in arm.joint_names or effect.kind not in EFFECT_KINDS:
+                raise ModelError(f"unknown joint effect {effect.joint} {effect.kind}; kinds: {', '.join(EFFECT_KINDS)}")
+        if not np.all(np.isfinite(self.theta)) or not np.all((self.trust >= 0) & (self.trust <= 1)):
+            raise ModelError("parameters must be finite numbers and trust between 0 and 1")
+
+    def load_arm(self) -> Arm:
+        """The arm that this model is of, mounted as it was when identified."""
+        return _arm_with_gravity(self.arm, tuple(self.gravity))
+
+    @property
+    def theta(self) -> NDArray[np.float64]:
+        """(b + e,) base parameters, then coefficients of the joint effects, as `StaticModel` wants them."""
+        return np.array([p.value for p in [*self.base_parameters, *self.joint_effects]])
+
+    @property
+    def trust(self) -> NDArray[np.float64]:
+        """(n,) factor of each joint's torque."""
+        return np.array([joint.trust for joint in self.joints])
+
+    @cached_property
+    def static_model(self) -> StaticModel:
+        """The compiled structure that `theta` belongs to."""
+        return compile_static_model(self.load_arm(), tuple(JointEffect(e.joint, e.kind) for e in self.joint_effects))
+
+    def holding_torque(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Torque [N m, N] on the joints that holds the arm: (n,) for q (n,), (m, n) for q (m, n)."""
+        return self.trust * self.static_model.torque(q, self.theta)
+
+
+_ARMS: dict[tuple[str, tuple[float, ...]], Arm] = {}
+
+
+def _arm_with_gravity(name: str, gravity: tuple[float, ...]) -> Arm:
+    """One Arm object per mounting, so that derivations and compilations are done once."""
+    arm = load_arm(name)
+    if np.allclose(arm.gravity, gravity, rtol=0, atol=1e-12):
+        return arm
+    return _ARMS.setdefault((name, gravity), arm.with_gravity(gravity))

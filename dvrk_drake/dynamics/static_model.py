@@ -1,0 +1,81 @@
+"""The static torque model tau = trust o (Y(q) beta + effects(q)): compiled, for any arm and choice of effects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import sympy
+from numpy.typing import ArrayLike, NDArray
+
+from dvrk_drake.dynamics import codegen
+from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, SymbolicGravity, derive_gravity
+from dvrk_drake.models.arm import Arm
+
+
+@dataclass(frozen=True, eq=False)
+class StaticModel:
+    """Compiled regressor and torque of one structure (arm and joint effects); the parameters stay arguments.
+
+    Parameters theta are the b base parameters [kg m], then one coefficient per effect [N m, or N on a prismatic joint].
+
+    Attributes:
+        gravity: the symbolic derivation.
+        effects: the joint effects, in the order of theta.
+        torque_into: compiled f(q, theta, out), float64 C-contiguous (n,), (b + e,), (n,); no allocation, for control loops.
+    """
+
+    gravity: SymbolicGravity
+    effects: tuple[JointEffect, ...]
+    torque_into: Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None]
+    _regressor_batch: Callable[..., NDArray[np.float64]]
+    _torque_batch: Callable[..., NDArray[np.float64]]
+
+    @property
+    def num_parameters(self) -> int:
+        """Length of theta."""
+        return len(self.gravity.base.names) + len(self.effects)
+
+    def regressor(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Y with tau = Y theta: (n, p) for one pose q (n,), (m, n, p) for m poses (m, n)."""
+        q = np.asarray(q, dtype=np.float64)
+        return self._regressor_batch(q) if q.ndim == 2 else self._regressor_batch(q[None])[0]
+
+    def torque(self, q: ArrayLike, theta: ArrayLike) -> NDArray[np.float64]:
+        """Holding torque [N m or N]: (n,) for one pose q (n,), (m, n) for m poses (m, n)."""
+        q = np.asarray(q, dtype=np.float64)
+        theta = np.ascontiguousarray(theta, dtype=np.float64)
+        return self._torque_batch(q, theta) if q.ndim == 2 else self._torque_batch(q[None], theta)[0]
+
+
+def symbolic_regressor(gravity: SymbolicGravity, effects: tuple[JointEffect, ...]) -> sympy.Matrix:
+    """The regressor (n, b + e) as sympy, with the number of |gravity| put in."""
+    columns = [sympy.Matrix(gravity.regressor).subs(GRAVITY, sympy.Float(gravity.gravity_magnitude))]
+    for effect in effects:
+        column = sympy.zeros(gravity.arm.num_joints, 1)
+        j = gravity.arm.joint_names.index(effect.joint)
+        column[j] = effect.expression(gravity.q[j])
+        columns.append(column)
+    return sympy.Matrix.hstack(*columns)
+
+
+@cache
+def compile_static_model(arm: Arm, effects: tuple[JointEffect, ...] = ()) -> StaticModel:
+    """Derives and compiles the model; takes about two seconds the first time, nothing afterwards."""
+    gravity = derive_gravity(arm)
+    Y = symbolic_regressor(gravity, effects)
+    theta = sympy.symbols(f"theta0:{Y.shape[1]}")
+    q_argument = ("q", gravity.q)
+    regressor = codegen.compile_function("regressor", [q_argument], codegen.share_terms(Y))
+    torque_terms = codegen.share_terms(sympy.Array(list(Y * sympy.Matrix(theta))))
+    torque = codegen.compile_function("torque", [q_argument, ("theta", theta)], torque_terms)
+    return StaticModel(
+        gravity,
+        effects,
+        torque,
+        codegen.compile_batch(regressor, 1, Y.shape),
+        codegen.compile_batch(torque, 2, (Y.shape[0],)),
+    )
