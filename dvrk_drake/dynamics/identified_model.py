@@ -1,8 +1,6 @@
 """What an identification leaves behind: parameters with their uncertainty, and where they came from. Stored as YAML."""
 
 # No postponed annotations here: yaml_load_typed reads the types at run time.
-import os
-import tempfile
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +14,7 @@ from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.atomic_file import atomic_write
 
 
 @dataclass
@@ -130,16 +129,8 @@ class IdentifiedModel:
 
     def save(self, path: str | Path) -> None:
         """Writes the model file at once or not at all."""
-        path = Path(path)
-        text = yaml_dump_typed(self)
-        try:
-            handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        except OSError as error:
-            raise ModelError(f"{path}: cannot be written: {error.strerror}") from error
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
+        with atomic_write(path) as stream:
+            stream.write(yaml_dump_typed(self))
 
     def check(self) -> None:
         """Raises ModelError unless the parameters fit the arm that the model names."""

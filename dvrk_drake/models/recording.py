@@ -1,0 +1,211 @@
+"""A recording of an arm: positions and efforts over time or over poses, read from and written to CSV."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.atomic_file import atomic_write
+
+Coordinates = Literal["joint", "actuator"]
+
+#: A pose further than this outside the arm's limits is refused [rad or m]; nearer ones are real: stops give way.
+LIMIT_TOLERANCE = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One row a sample; rad and N m, m and N on a prismatic joint, s.
+
+    Attributes:
+        q: (m, n) positions.
+        tau: (m, n) efforts that the motors apply, or None.
+        qd: (m, n) velocities, or None.
+        t: (m,) time, or None for poses.
+        coordinates: whether q, qd and tau are of the joints or of the actuators.
+        source: where it came from, for messages.
+        lines: (m,) line of each row in the source, for messages.
+        sha256: of the source's bytes, or "".
+    """
+
+    q: NDArray[np.float64]
+    tau: NDArray[np.float64] | None = None
+    qd: NDArray[np.float64] | None = None
+    t: NDArray[np.float64] | None = None
+    coordinates: Coordinates = "joint"
+    source: str = ""
+    lines: NDArray[np.int_] | None = None
+    sha256: str = ""
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def where(self, row: int) -> str:
+        """`file:line` of a row, or the row's number where there is no file."""
+        return f"{self.source}:{self.lines[row]}" if self.lines is not None else f"{self.source or 'row'} {row + 1}"
+
+    def measured_effort(self) -> NDArray[np.float64]:
+        """tau (m, n).
+
+        Raises:
+            RecordingError: the recording has none.
+        """
+        if self.tau is None:
+            raise RecordingError(f"{self.source}: has no efforts; needs columns tau1..tau{self.q.shape[1]}")
+        return self.tau
+
+    def in_joint_coordinates(self, arm: Arm) -> Recording:
+        """The same recording with q, qd and tau of the arm's joints."""
+        if self.coordinates == "joint":
+            return self
+        to_joint = arm.transmission.inverse()
+        return replace(
+            self,
+            q=to_joint.position(self.q),
+            qd=None if self.qd is None else to_joint.velocity(self.qd),
+            tau=None if self.tau is None else arm.transmission.pull_back_effort(self.tau),
+            coordinates="joint",
+        )
+
+    def check_fits(self, arm: Arm) -> None:
+        """Refuses poses that `arm` cannot have taken.
+
+        Raises:
+            RecordingError: wrong number of joints, degrees suspected, or a pose far outside the limits.
+        """
+        if self.q.shape[1] != arm.num_joints:
+            raise RecordingError(f"{self.source}: has {self.q.shape[1]} joints, {arm.name} has {arm.num_joints}")
+        q = self.in_joint_coordinates(arm).q
+        excess = np.maximum(arm.position_lower - q, q - arm.position_upper)
+        row, joint = np.unravel_index(np.argmax(excess), excess.shape)
+        if excess[row, joint] <= LIMIT_TOLERANCE:
+            return
+        lower, upper = arm.position_lower[joint], arm.position_upper[joint]
+        message = (
+            f"{self.where(int(row))}: {arm.joint_names[joint]} (q{joint + 1}) = {q[row, joint]:.4g} is outside "
+            f"{lower:.4g}..{upper:.4g} of {arm.name}"
+        )
+        outside = np.mean(np.any(excess > LIMIT_TOLERANCE, axis=1))
+        if outside > 0.3 and np.all(np.abs(np.radians(q)) <= 1.2 * np.maximum(-arm.position_lower, arm.position_upper)):
+            message += "; are these degrees? Positions must be in radians (m on a prismatic joint)"
+        else:
+            message += "; is this the right arm, and are the coordinates (joint or actuator) right?"
+        raise RecordingError(message)
+
+
+def read_recording(path: str | Path, num_joints: int = 7, coordinates: Coordinates = "joint") -> Recording:
+    """Reads a CSV with a header: q1..qn, and optionally t, qd1..qdn and tau1..taun, in any order; others are ignored.
+
+    Raises:
+        RecordingError: names the file, the line and the column of what is wrong.
+    """
+    if coordinates not in get_args(Coordinates):
+        raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
+    path = Path(path)
+    if not path.is_file():
+        raise RecordingError(f"{path}: no such file")
+    content = path.read_bytes()
+    try:
+        rows = list(csv.reader(content.decode("utf-8-sig").splitlines()))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise RecordingError(f"{path}: not a CSV text file: {error}") from error
+    numbered = [(i + 1, [cell.strip() for cell in row]) for i, row in enumerate(rows) if any(c.strip() for c in row)]
+    if not numbered:
+        raise RecordingError(f"{path}: is empty; needs a header with {_wanted(num_joints)}")
+    header_line, header = numbered[0]
+    if all(_is_number(cell) for cell in header):
+        raise RecordingError(
+            f"{path}:{header_line}: has no header; the first line must name the columns, {_wanted(num_joints)} "
+            "(dvrk-drake convert reads headerless public formats)"
+        )
+    if len(set(header)) < len(header):
+        twice = next(name for name in header if header.count(name) > 1)
+        raise RecordingError(f"{path}:{header_line}: column {twice} is named twice")
+    blocks = {}
+    for prefix, needed in (("q", True), ("qd", False), ("tau", False)):
+        names = [f"{prefix}{i + 1}" for i in range(num_joints)]
+        missing = [name for name in names if name not in header]
+        if len(missing) == num_joints and not needed:
+            continue
+        if missing:
+            raise RecordingError(
+                f"{path}:{header_line}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
+                f"needs {_wanted(num_joints)}"
+            )
+        if f"{prefix}{num_joints + 1}" in header:
+            raise RecordingError(f"{path}:{header_line}: has {prefix}{num_joints + 1}, but the arm has {num_joints} joints")
+        blocks[prefix] = [header.index(name) for name in names]
+    if len(numbered) == 1:
+        raise RecordingError(f"{path}: has a header but no rows")
+    wanted = [column for block in blocks.values() for column in block]
+    if "t" in header:
+        wanted.append(header.index("t"))
+    values = np.empty((len(numbered) - 1, len(header)))
+    for row, (line, cells) in enumerate(numbered[1:]):
+        if len(cells) != len(header):
+            raise RecordingError(f"{path}:{line}: has {len(cells)} cells, the header names {len(header)} columns")
+        for column in wanted:
+            values[row, column] = _number(cells[column], f"{path}:{line}: {header[column]}")
+    return Recording(
+        q=values[:, blocks["q"]],
+        tau=values[:, blocks["tau"]] if "tau" in blocks else None,
+        qd=values[:, blocks["qd"]] if "qd" in blocks else None,
+        t=values[:, header.index("t")] if "t" in header else None,
+        coordinates=coordinates,
+        source=str(path),
+        lines=np.array([line for line, _ in numbered[1:]]),
+        sha256=hashlib.sha256(content).hexdigest(),
+    )
+
+
+def write_recording(recording: Recording, path: str | Path) -> None:
+    """Writes the CSV that `read_recording` reads, at once or not at all, with every digit of every number."""
+    n = recording.q.shape[1]
+    columns, header = [], []
+    for prefix, block in (("t", recording.t), ("q", recording.q), ("qd", recording.qd), ("tau", recording.tau)):
+        if block is not None:
+            columns.append(block.reshape(len(recording), -1))
+            header += [prefix] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(n)]
+    write_csv(path, header, np.hstack(columns))
+
+
+def write_csv(path: str | Path, header: list[str], values: NDArray[np.float64]) -> None:
+    """Writes a table of numbers at once or not at all; every digit is kept.
+
+    Raises:
+        DvrkDrakeError: the folder does not exist or cannot be written.
+    """
+    with atomic_write(path) as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows([repr(float(x)) for x in row] for row in values)
+
+
+def _wanted(num_joints: int) -> str:
+    return f"q1..q{num_joints} and tau1..tau{num_joints} (t and qd1..qd{num_joints} optional)"
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _number(cell: str, where: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        raise RecordingError(f'{where} is not a number: "{cell[:30]}"') from None
+    if not np.isfinite(value):
+        raise RecordingError(f"{where} is {cell}; only finite numbers are allowed")
+    return value
