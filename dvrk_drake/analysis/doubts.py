@@ -1,0 +1,74 @@
+"""Measurements that may not be holding torques at all: poses that press on a stop, or torques no arm can give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.recording import Recording
+
+#: Within this distance of a limit a joint may rest on its stop [rad or m].
+STOP_MARGIN = 0.01
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Why the torque of some joints in one pose is not used: `where` names the pose, `reason` is readable."""
+
+    row: int
+    joints: tuple[int, ...]
+    where: str
+    reason: str
+
+
+def find_doubts(recording: Recording, arm: Arm) -> list[Doubt]:
+    """What can be doubted before any fit. A stop carries load, so it makes the torque of its own joints meaningless.
+
+    Args:
+        recording: in joint coordinates, with efforts.
+        arm: whose limits count.
+    """
+    doubts = []
+    A, lower, upper = arm.limit_matrix()
+    names = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
+    values = recording.q @ A.T
+    at_stop = (values < lower + STOP_MARGIN) | (values > upper - STOP_MARGIN)
+    # A coupled limit is where contact begins, and stops there are soft: no margin inside of it.
+    coupled = slice(arm.num_joints, None)
+    at_stop[:, coupled] = (values < lower)[:, coupled] | (values > upper)[:, coupled]
+    for row, limit in np.argwhere(at_stop):
+        joints = tuple(int(j) for j in np.flatnonzero(A[limit]))
+        stop = lower[limit] if values[row, limit] < (lower[limit] + upper[limit]) / 2 else upper[limit]
+        reason = f"{names[limit]} at {values[row, limit]:.3f} rests on its stop ({stop:.3f})"
+        doubts.append(Doubt(int(row), joints, recording.where(int(row)), reason))
+    tau = recording.measured_effort()
+    for row, joint in np.argwhere(np.abs(tau) > arm.effort_limits):
+        reason = f"{arm.joint_names[joint]} effort {tau[row, joint]:.2f} exceeds its limit {arm.effort_limits[joint]:.2f}"
+        doubts.append(Doubt(int(row), (int(joint),), recording.where(int(row)), reason))
+    return doubts
+
+
+def outlier_doubts(
+    recording: Recording, arm: Arm, outliers: NDArray[np.bool_], residuals: NDArray[np.float64]
+) -> list[Doubt]:
+    """The measurements that a robust fit rejected, (m, n) each."""
+    return [
+        Doubt(
+            int(row),
+            (int(joint),),
+            recording.where(int(row)),
+            f"{arm.joint_names[joint]} effort is {residuals[row, joint]:+.3f} away from what all other poses say",
+        )
+        for row, joint in np.argwhere(outliers)
+    ]
+
+
+def usable_measurements(shape: tuple[int, int], doubts: list[Doubt]) -> NDArray[np.bool_]:
+    """(m, n) mask: False where a doubt names the pose and the joint."""
+    usable = np.ones(shape, dtype=bool)
+    for doubt in doubts:
+        usable[doubt.row, list(doubt.joints)] = False
+    return usable
