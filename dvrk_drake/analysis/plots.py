@@ -1,0 +1,93 @@
+"""Pictures of what was identified; each draws only what it is given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.recording import Recording
+
+MODEL_COLOUR, ZERO_COLOUR, MEASURED_COLOUR = "#1f6f8b", "#c9c9c9", "#d1495b"
+
+
+def _labels(names: tuple[str, ...]) -> list[str]:
+    return [f"J{i + 1}\n{name.replace('_', chr(10))}" for i, name in enumerate(names)]
+
+
+def plot_torque_error(
+    path: Path, names: tuple[str, ...], rms_zero: NDArray[np.float64], rms_model: dict[str, NDArray[np.float64]], title: str
+) -> None:
+    """Bars of RMS torque error per joint (n,) [N m]: zero torque beside each model; logarithmic, joints differ by decades."""
+    figure, axes = plt.subplots(figsize=(9, 4.5), layout="constrained")
+    bars = {"zero torque": rms_zero, **rms_model}
+    colours = [ZERO_COLOUR, MODEL_COLOUR, MEASURED_COLOUR, "#edae49"]
+    width = 0.8 / len(bars)
+    for i, (label, values) in enumerate(bars.items()):
+        x = np.arange(len(names)) + (i - (len(bars) - 1) / 2) * width
+        drawn = axes.bar(x, values, width, label=label, color=colours[i % len(colours)])
+        axes.bar_label(drawn, [f"{v:.2g}" for v in values], fontsize=7, padding=2)
+    axes.set_yscale("log")
+    axes.set_xticks(range(len(names)), _labels(names), fontsize=8)
+    axes.set_ylabel("RMS torque error [N m]")
+    axes.set_title(title)
+    axes.margins(y=0.15)
+    axes.legend(fontsize=8)
+    _save(figure, path)
+
+
+def plot_measured_against_predicted(path: Path, model: IdentifiedModel, recording: Recording) -> None:
+    """One panel a joint: predicted over measured torque of every pose; `recording` in joint coordinates."""
+    names = model.load_arm().joint_names
+    measured, predicted = recording.measured_effort(), model.holding_torque(recording.q)
+    figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained")
+    for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
+        span = np.array([min(measured[:, j].min(), predicted[:, j].min()), max(measured[:, j].max(), predicted[:, j].max())])
+        ax.plot(span, span, color="black", linewidth=0.8, label="measured = predicted")
+        ax.plot(measured[:, j], predicted[:, j], ".", color=MODEL_COLOUR, label="one pose")
+        ax.set_title(f"J{j + 1} {name}", fontsize=10)
+        ax.set_xlabel("measured [N m]", fontsize=8)
+        ax.set_ylabel("predicted [N m]", fontsize=8)
+        ax.tick_params(labelsize=7)
+    for ax in axes.flat[len(names) :]:
+        ax.axis("off")
+    axes.flat[0].legend(fontsize=7)
+    figure.suptitle(f"{model.arm.upper()}: holding torque, {len(recording)} poses of {Path(recording.source).name}")
+    _save(figure, path)
+
+
+def plot_positions(
+    path: Path, names: tuple[str, ...], t: NDArray[np.float64], curves: dict[str, NDArray[np.float64]], title: str
+) -> None:
+    """One panel a joint of positions over time: `curves` label -> (samples, n) [rad]; dashed from the second on."""
+    figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained", sharex=True)
+    colours = [MODEL_COLOUR, MEASURED_COLOUR, "#edae49"]
+    for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
+        for i, (label, q) in enumerate(curves.items()):
+            ax.plot(t, q[:, j], "-" if i == 0 else "--", color=colours[i % 3], linewidth=1.2, label=label)
+        low, high = ax.get_ylim()
+        if high - low < 2e-3:  # A joint that stands still should look still.
+            ax.set_ylim((low + high) / 2 - 1e-3, (low + high) / 2 + 1e-3)
+        ax.set_title(f"J{j + 1} {name}", fontsize=10)
+        ax.set_ylabel("position [rad]", fontsize=8)
+        ax.tick_params(labelsize=7)
+        ax.grid(alpha=0.3)
+    for ax in axes.flat[len(names) :]:
+        ax.axis("off")
+    for ax in axes[-1]:
+        ax.set_xlabel("time [s]", fontsize=8)
+    axes.flat[0].legend(fontsize=7)
+    figure.suptitle(title)
+    _save(figure, path)
+
+
+def _save(figure: plt.Figure, path: Path) -> None:
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

@@ -1,0 +1,106 @@
+"""How well a model predicts the torques of a recording."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.doubts import Doubt, find_doubts, usable_measurements
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.recording import Recording
+
+
+@dataclass(frozen=True)
+class JointError:
+    """One joint's error over a recording: RMS in N m (N if prismatic) in the coordinates that the recording is in.
+
+    `rms_torque` is what commanding zero torque would err by; `relative_error` = rms_error / rms_torque. `_undoubted` leaves
+    out `num_doubted` measurements of poses that rest on a stop or exceed the effort limit (joint coordinates only).
+    """
+
+    name: str
+    rms_torque: float
+    rms_error: float
+    relative_error: float
+    rms_torque_undoubted: float
+    rms_error_undoubted: float
+    num_doubted: int
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Errors of `model` on one recording; residuals are measured minus predicted, (m, n)."""
+
+    joints: list[JointError]
+    poses: int
+    residuals: NDArray[np.float64]
+    doubts: list[Doubt]
+
+    def as_dict(self) -> dict:
+        """What `validate --json` writes."""
+        return {
+            "joints": [asdict(joint) for joint in self.joints],
+            "poses": self.poses,
+            "doubted": [{"where": doubt.where, "reason": doubt.reason} for doubt in self.doubts],
+        }
+
+
+def predict(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
+    """Holding torques (m, n) at the recording's poses, in the recording's own coordinates.
+
+    Raises:
+        RecordingError: the recording does not fit the model's arm.
+    """
+    arm = model.load_arm()
+    recording.check_fits(arm)
+    tau = model.holding_torque(recording.in_joint_coordinates(arm).q)
+    if recording.coordinates == "actuator":
+        # tau_joint = J' tau_actuator, so the inverse map pulls back from joints to actuators.
+        tau = arm.transmission.inverse().pull_back_effort(tau)
+    return tau
+
+
+def validate(model: IdentifiedModel, recording: Recording) -> Validation:
+    """Compares a model with a recording.
+
+    Raises:
+        RecordingError: the recording does not fit the model's arm, or has no efforts.
+    """
+    arm = model.load_arm()
+    measured = recording.measured_effort()
+    residuals = measured - predict(model, recording)
+    in_joints = recording.in_joint_coordinates(arm)
+    doubts = find_doubts(in_joints, arm)
+    usable = usable_measurements(measured.shape, doubts)
+    if recording.coordinates == "actuator":
+        # A doubt about a joint touches every actuator that drives it.
+        usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
+    return Validation(_joint_errors(arm, measured, residuals, usable), len(recording), residuals, doubts)
+
+
+def _joint_errors(
+    arm: Arm, measured: NDArray[np.float64], residuals: NDArray[np.float64], usable: NDArray[np.bool_]
+) -> list[JointError]:
+    errors = []
+    for j, name in enumerate(arm.joint_names):
+        use = usable[:, j]
+        torque, error = _rms(measured[:, j]), _rms(residuals[:, j])
+        errors.append(
+            JointError(
+                name,
+                torque,
+                error,
+                error / torque if torque > 0 else float("nan"),
+                _rms(measured[use, j]),
+                _rms(residuals[use, j]),
+                int(np.sum(~use)),
+            )
+        )
+    return errors
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
