@@ -16,8 +16,9 @@ from dvrk_drake.models.arm import Arm
 
 #: Prior standard deviation of a base parameter, as a share of what would use up some joint's effort limit by itself.
 BASE_PRIOR = 0.25
-#: Prior standard deviation of a joint effect, as a share of the joint's effort limit.
-EFFECT_PRIOR = 0.3
+#: Prior standard deviation of a joint effect, as a share of the joint's effort limit. Offsets are kept small: over a narrow
+#: range a large one would take the place of gravity, and mislead outside of it.
+EFFECT_PRIOR = {"offset": 0.03, "spring": 0.3}
 #: Least standard deviation of a torque measurement, as a share of the effort limit.
 SIGMA_FLOOR = 2e-3
 #: An effect must lower the sum of squared left-out residuals (in sigma) by this much a coefficient: about log(poses), BIC's.
@@ -51,8 +52,9 @@ class StaticProblem:
 
     def prior_precision(self, effects: Sequence[JointEffect]) -> NDArray[np.float64]:
         """(b + e,) inverse prior variances about zero."""
-        limits = [self.arm.effort_limits[self.arm.joint_names.index(e.joint)] for e in effects]
-        sd = np.concatenate([BASE_PRIOR * _largest_base_parameters(self.base_model), EFFECT_PRIOR * np.array(limits)])
+        limit = dict(zip(self.arm.joint_names, self.arm.effort_limits, strict=True))
+        effect_sd = [EFFECT_PRIOR[effect.kind] * limit[effect.joint] for effect in effects]
+        sd = np.concatenate([BASE_PRIOR * _largest_base_parameters(self.base_model), effect_sd])
         return 1 / sd**2
 
     def fit(

@@ -12,6 +12,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.static_identification import StaticIdentification
+from dvrk_drake.analysis.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.recording import Recording
 
@@ -61,6 +63,34 @@ def plot_measured_against_predicted(path: Path, model: IdentifiedModel, recordin
     axes.flat[0].legend(fontsize=7)
     figure.suptitle(f"{model.arm.upper()}: holding torque, {len(recording)} poses of {Path(recording.source).name}")
     _save(figure, path)
+
+
+def plot_identification(folder: Path, result: StaticIdentification, recording: Recording) -> None:
+    """Writes torque_error.png and predicted.png of an identification; `recording` in joint coordinates."""
+    joints = result.model.joints
+    plot_torque_error(
+        folder / "torque_error.png",
+        tuple(j.name for j in joints),
+        np.array([j.rms_zero_torque_undoubted for j in joints]),
+        {
+            "leave-one-out": np.array([j.rms_leave_one_out_undoubted for j in joints]),
+            "ten-fold, effects chosen anew": np.array([j.rms_cross_validation_undoubted for j in joints]),
+        },
+        f"{result.model.arm.upper()}: poses not used for fitting ({Path(recording.source).name}, doubted ones left out)",
+    )
+    plot_measured_against_predicted(folder / "predicted.png", result.model, recording)
+
+
+def plot_validation(folder: Path, model: IdentifiedModel, validation: Validation, recording: Recording) -> None:
+    """Writes torque_error.png and predicted.png of a validation; `recording` in joint coordinates."""
+    plot_torque_error(
+        folder / "torque_error.png",
+        tuple(j.name for j in validation.joints),
+        np.array([j.rms_torque for j in validation.joints]),
+        {"model": np.array([j.rms_error for j in validation.joints])},
+        f"{model.arm.upper()}: all {validation.poses} poses of {Path(recording.source).name}",
+    )
+    plot_measured_against_predicted(folder / "predicted.png", model, recording)
 
 
 def plot_positions(

@@ -11,6 +11,7 @@ from rich.table import Table
 from dvrk_drake.analysis.doubts import Doubt
 from dvrk_drake.analysis.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity
 
 
 def print_model(console: Console, model: IdentifiedModel) -> None:
@@ -61,6 +62,23 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
                 "friction, or leave-one-out shows no gain over zero torque",
                 style="yellow",
             )
+
+
+def print_symbolic_model(console: Console, gravity: SymbolicGravity) -> None:
+    """The base parameters of an arm with the values that its SDF gives them, and its joints' limits."""
+    arm = gravity.arm
+    table = _table(f"{arm.name}: base parameters of gravity [kg m]", "parameter", "nominal value")
+    for name, value in zip(gravity.base.names, gravity.base_values, strict=True):
+        table.add_row(escape(name), f"{value:+.5f}")
+    console.print(table)
+    table = _table("Joints [rad, N m; m, N if prismatic]", "joint", "position", "effort limit")
+    for i, name in enumerate(arm.joint_names):
+        position = f"{arm.position_lower[i]:+.4f}..{arm.position_upper[i]:+.4f}"
+        table.add_row(f"q{i + 1} {name}", position, f"{arm.effort_limits[i]:.4g}")
+    for limit in arm.coupled_limits:
+        terms = " + ".join(f"{c:g} {joint}" if c != 1 else joint for joint, c in limit.coefficients.items())
+        table.add_row(f"{limit.name}: {terms}", f"{limit.lower:+.4f}..{limit.upper:+.4f}", "")
+    console.print(table)
 
 
 def print_doubts(console: Console, doubts: Sequence[Doubt], most: int = 30) -> None:

@@ -11,10 +11,11 @@ import sympy
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RigidBody, SpatialInertia_, UnitInertia_
+from pydrake.multibody.tree import ModelInstanceIndex, RigidBody, SpatialInertia_, UnitInertia_
 
 from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParameter, reduce_to_base
 from dvrk_drake.dynamics.trigonometry import simplify_trigonometry
+from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, tree_selector
 
@@ -53,7 +54,7 @@ class SymbolicGravity:
 
 
 @cache
-def derive_gravity(arm: Arm, frames: str = "dh") -> SymbolicGravity:
+def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> SymbolicGravity:
     """Derives the gravity torque of `arm` from its plant.
 
     The plant gives its potential energy P(q, m, c) with every link's mass m and centre of mass c as symbols
@@ -63,6 +64,10 @@ def derive_gravity(arm: Arm, frames: str = "dh") -> SymbolicGravity:
     Args:
         arm: the arm; its gravity vector sets the mounting.
         frames: prefix of the SDF frames in which the parameters are written: "dh" (dVRK) or, on the MTM, "paper".
+        serial: leaves out the links of the linkage (crank, coupler), as the paper does.
+
+    Raises:
+        ArmError: the arm's SDF has no frames of that prefix.
     """
     numeric = make_arm_plant(arm)
     plant = numeric.ToSymbolic()
@@ -82,9 +87,10 @@ def derive_gravity(arm: Arm, frames: str = "dh") -> SymbolicGravity:
     for label, (body, X_BF) in labels.items():
         m = symbolic.Variable(f"m_{label}")
         c_F = [symbolic.Variable(f"c_{label}{axis}") for axis in "xyz"]
+        R_BF = _exact(X_BF.rotation().matrix())
         p_BoBcm = [
             symbolic.Expression(X_BF.translation()[i])
-            + sum((_exact(X_BF.rotation().matrix()[i, j]) * c_F[j] for j in range(3)), symbolic.Expression(0))
+            + sum((R_BF[i, j] * c_F[j] for j in range(3)), symbolic.Expression(0))
             for i in range(3)
         ]
         M_BBo = SpatialInertia_[symbolic.Expression](
@@ -94,10 +100,10 @@ def derive_gravity(arm: Arm, frames: str = "dh") -> SymbolicGravity:
             skip_validity_check=True,
         )
         plant.get_body(body.index()).SetSpatialInertiaInBodyFrame(context, M_BBo)
-        if body.default_mass() > 0:
+        if body.default_mass() > 0 and (label.isdigit() or not serial):
             unknowns.append((m, c_F))
             parameters += [StandardParameter(label), *(StandardParameter(label, axis) for axis in "xyz")]
-            com_F = X_BF.inverse() @ body.default_com()
+            com_F = R_BF.T @ (body.default_com() - X_BF.translation())
             values += [body.default_mass(), *(body.default_mass() * com_F)]
 
     P = plant.CalcPotentialEnergy(context)
@@ -126,9 +132,9 @@ def derive_gravity(arm: Arm, frames: str = "dh") -> SymbolicGravity:
     return SymbolicGravity(arm, symbols, tuple(parameters), np.array(values), base, sympy.ImmutableDenseMatrix(regressor))
 
 
-def _exact(number: float) -> float:
-    """A rotation entry of an axis-parallel frame, without the rounding of its angles."""
-    return float(np.round(number)) if abs(number - np.round(number)) < 1e-12 else number
+def _exact(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A rotation matrix with the entries that are 0 or +-1 but for the rounding of their angles made exactly that."""
+    return np.where(np.abs(R - np.round(R)) < 1e-12, np.round(R), R)
 
 
 def _tree_positions(arm: Arm, q: list[symbolic.Variable]) -> list[symbolic.Expression]:
@@ -142,11 +148,13 @@ def _tree_positions(arm: Arm, q: list[symbolic.Variable]) -> list[symbolic.Expre
 def _labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[RigidBody, RigidTransform]]:
     """Moving bodies by label with the frame F that their parameters are written in, X_BF; numbered links first."""
     found = {}
-    for index in plant.GetFrameIndices(plant.get_body(plant.GetBodyIndices(_arm_instance(plant))[0]).model_instance()):
+    for index in plant.GetFrameIndices(_arm_instance(plant)):
         frame = plant.get_frame(index)
         prefix, _, label = frame.name().partition("_")
         if prefix == frames or (prefix == "dh" and not label.isdigit()):
             found[frame.body().index()] = (label, frame.GetFixedPoseInBodyFrame())
+    if not any(label.isdigit() for label, _ in found.values()):
+        raise ArmError(f'the SDF has no frames "{frames}_1", "{frames}_2", ...; try "dh"')
     bodies = {}
     for index in plant.GetBodyIndices(_arm_instance(plant)):
         body = plant.get_body(index)
@@ -156,7 +164,7 @@ def _labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[Rigi
     return dict(sorted(bodies.items(), key=lambda item: (not item[0].isdigit(), item[0])))
 
 
-def _arm_instance(plant: MultibodyPlant):  # noqa: ANN202 - ModelInstanceIndex
+def _arm_instance(plant: MultibodyPlant) -> ModelInstanceIndex:
     return plant.GetBodyByName("base_link").model_instance()
 
 

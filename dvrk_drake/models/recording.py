@@ -18,7 +18,7 @@ from dvrk_drake.models.atomic_file import atomic_write
 Coordinates = Literal["joint", "actuator"]
 
 #: A pose further than this outside the arm's limits is refused [rad or m]; nearer ones are real: stops give way.
-LIMIT_TOLERANCE = 0.15
+LIMIT_TOLERANCE = 0.2
 
 
 @dataclass(frozen=True, eq=False)

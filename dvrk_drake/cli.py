@@ -1,0 +1,225 @@
+"""The command line: one verb a command. Bad input gives one line on stderr and exit code 2."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+from dvrk_drake.errors import DvrkDrakeError
+
+# Verbs import what they need when they run: drake and numba take seconds, `--help` should not.
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one verb; returns the exit code: 0, or 2 for bad input."""
+    options = _parser().parse_args(arguments)
+    try:
+        options.run(options)
+    except DvrkDrakeError as error:
+        print(f"dvrk-drake: error: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:
+        # The reader (head, less) has seen enough.
+        sys.stderr.close()
+        return 0
+    except KeyboardInterrupt:
+        print("dvrk-drake: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _model(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.tables import print_symbolic_model
+    from dvrk_drake.dynamics import export
+    from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.atomic_file import atomic_write
+
+    gravity = derive_gravity(_mounted(load_arm(options.arm), options.gravity), options.frames, options.serial)
+    writers = {"latex": export.to_latex, "python": export.to_python, "c": export.to_c}
+    if options.format is None:
+        print_symbolic_model(Console(), gravity)
+        return
+    text = writers[options.format](gravity)
+    if options.output is None:
+        sys.stdout.write(text)
+    else:
+        with atomic_write(options.output) as stream:
+            stream.write(text)
+
+
+def _identify(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.plots import plot_identification
+    from dvrk_drake.analysis.static_identification import identify_static
+    from dvrk_drake.analysis.tables import print_doubts, print_model
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.recording import read_recording
+
+    arm = _mounted(load_arm(options.arm), options.gravity)
+    recording = read_recording(options.recording, arm.num_joints, options.coordinates)
+    _check_folder(options.output)
+    with _progress("identifying") as (progress, task):
+        result = identify_static(
+            recording, arm, options.method, lambda share: progress.update(task, completed=100 * share)
+        )
+    console = Console()
+    print_doubts(console, result.doubts)
+    print_model(console, result.model)
+    if options.plots is not None:
+        plot_identification(_made_folder(options.plots), result, recording.in_joint_coordinates(arm))
+        console.print(f"plots: {options.plots}")
+    result.model.save(options.output)
+    console.print(f"model: {options.output}")
+
+
+def _validate(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.plots import plot_validation
+    from dvrk_drake.analysis.tables import print_doubts, print_validation
+    from dvrk_drake.analysis.validation import validate
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.recording import read_recording
+
+    model = IdentifiedModel.load(options.model)
+    arm = model.load_arm()
+    recording = read_recording(options.recording, arm.num_joints, options.coordinates)
+    if options.json is not None:
+        _check_folder(options.json)
+    validation = validate(model, recording)
+    console = Console()
+    print_doubts(console, validation.doubts)
+    print_validation(console, validation)
+    if options.plots is not None:
+        plot_validation(_made_folder(options.plots), model, validation, recording.in_joint_coordinates(arm))
+        console.print(f"plots: {options.plots}")
+    if options.json is not None:
+        with atomic_write(options.json) as stream:
+            json.dump(validation.as_dict(), stream, indent=2)
+            stream.write("\n")
+
+
+def _predict(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.validation import predict
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.models.recording import read_recording, write_csv
+
+    model = IdentifiedModel.load(options.model)
+    recording = read_recording(options.recording, model.load_arm().num_joints, options.coordinates)
+    tau = predict(model, recording)
+    write_csv(options.output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="dvrk-drake", description="Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."
+    )
+    parser.add_argument("--version", action="version", version=version("dvrk-drake"))
+    verbs = parser.add_subparsers(required=True, metavar="VERB")
+
+    verb = verbs.add_parser("model", help="show an arm's gravity torque and regressor", description=_model_help)
+    verb.add_argument("arm", help="mtml, mtmr, or the path of an arm's YAML file")
+    shown = verb.add_mutually_exclusive_group()
+    for name in ("latex", "python", "c"):
+        shown.add_argument(f"--{name}", dest="format", action="store_const", const=name, help=f"write {name} source")
+    verb.add_argument("--frames", default="dh", help="link frames of the parameters: dh (dVRK) or paper (Table I)")
+    verb.add_argument("--serial", action="store_true", help="leave out the links of the linkage, as the paper does")
+    verb.add_argument("--output", metavar="FILE", help="write to a file instead of standard output")
+    _add_gravity(verb)
+    verb.set_defaults(run=_model)
+
+    verb = verbs.add_parser("identify", help="identify a model from a recording of poses and holding torques")
+    _add_recording(verb)
+    verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, or a YAML file")
+    verb.add_argument("--output", required=True, metavar="MODEL.yaml", help="the model file to write")
+    verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="default: robust")
+    verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
+    _add_gravity(verb)
+    verb.set_defaults(run=_identify)
+
+    verb = verbs.add_parser("validate", help="compare a model with a recording that it was not made from")
+    verb.add_argument("model", metavar="MODEL.yaml")
+    _add_recording(verb)
+    verb.add_argument("--json", metavar="FILE", help="write the errors as JSON")
+    verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
+    verb.set_defaults(run=_validate)
+
+    verb = verbs.add_parser("predict", help="write a model's holding torques at a recording's poses")
+    verb.add_argument("model", metavar="MODEL.yaml")
+    _add_recording(verb)
+    verb.add_argument("--output", required=True, metavar="FILE.csv", help="columns tau1.., one row a row")
+    verb.set_defaults(run=_predict)
+    return parser
+
+
+_model_help = "Prints the base parameters; with --latex, --python or --c the gravity torque and its regressor as source."
+
+
+def _add_recording(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("recording", metavar="RECORDING.csv", help="header with q1..qn, tau1..taun; t, qd1.. optional")
+    verb.add_argument(
+        "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
+    )
+
+
+def _add_gravity(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--gravity",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="gravity in the arm's base frame [m/s^2], for other mountings; default: the arm's file, 0 0 -9.81",
+    )
+
+
+def _mounted(arm, gravity):  # noqa: ANN001, ANN202 - Arm, imported late
+    import numpy as np
+
+    if gravity is None:
+        return arm
+    size = float(np.linalg.norm(gravity))
+    if not 1.0 <= size <= 30.0:
+        raise DvrkDrakeError(f"--gravity has the size {size:.3g} m/s^2; it must be between 1 and 30, on Earth 9.8")
+    return arm.with_gravity(gravity)
+
+
+def _check_folder(path: str) -> None:
+    """Refuses an output whose folder does not exist before work begins, not after."""
+    if not Path(path).resolve().parent.is_dir():
+        raise DvrkDrakeError(f"{path}: cannot be written: its folder does not exist")
+
+
+def _made_folder(path: str) -> Path:
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DvrkDrakeError(f"{path}: cannot be made a folder: {error.strerror}") from error
+    return Path(path)
+
+
+class _progress:
+    """A progress bar of 0..100 on stderr, gone when the work is done; silent where stderr is no terminal."""
+
+    def __init__(self, what: str):
+        self._progress = Progress(
+            TextColumn(what),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
+        self._task = self._progress.add_task(what, total=100)
+
+    def __enter__(self):  # noqa: ANN204
+        self._progress.start()
+        return self._progress, self._task
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()

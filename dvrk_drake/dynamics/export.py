@@ -1,0 +1,115 @@
+"""The gravity torque and its regressor as LaTeX to read, and as Python or C to use elsewhere."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import sympy
+
+from dvrk_drake.dynamics import codegen
+from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, SymbolicGravity
+
+
+def to_latex(gravity: SymbolicGravity) -> str:
+    """Base parameters, torque and regressor as LaTeX (needs amsmath); s_{23} is sin(q2 + q3)."""
+    short = _short_angles(gravity)
+    Y = sympy.Matrix(gravity.regressor).xreplace(short)
+    name = gravity.arm.name
+    lines = [
+        f"% {name}: torque that holds the arm against gravity, tau = Y(q) beta, |g| = {gravity.gravity_magnitude:g} m/s^2.",
+        "% s_i = sin q_i, c_i = cos q_i, s_{ij} = sin(q_i + q_j); beta in kg m, m_i c_i in link frame i.",
+        r"\begin{align*}",
+        *(
+            rf"\beta_{{{i + 1}}} &= {_latex_name(text)} = {value:.5g} \\"
+            for i, (text, value) in enumerate(zip(gravity.base.names, gravity.base_values, strict=True))
+        ),
+        r"\end{align*}",
+        r"\begin{align*}",
+    ]
+    for j in range(Y.rows):
+        terms = [
+            rf"\beta_{{{k + 1}}} {_factor(Y[j, k] / GRAVITY)}"
+            for k in range(Y.cols)
+            if Y[j, k] != 0
+        ]
+        lines.append(rf"\tau_{{{j + 1}}} &= " + (rf"g \left({' + '.join(terms)}\right) \\" if terms else r"0 \\"))
+    lines.append(r"\end{align*}")
+    lines.append(r"\begin{align*}")
+    for (row, column), entry in sorted(Y.todok().items()):
+        lines.append(rf"Y_{{{row + 1},{column + 1}}} &= {sympy.latex(entry)} \\")
+    return "\n".join([*lines, r"\end{align*}", ""])
+
+
+def to_python(gravity: SymbolicGravity) -> str:
+    """A Python module without dependencies: `gravity_torque(q, g, beta, out)` and `gravity_regressor(q, g, out)`."""
+    torque, regressor, arguments, beta_argument = _functions(gravity)
+    names = "".join(f"    ({value!r}, {name!r}),\n" for name, value in _named_values(gravity))
+    return (
+        f'"""{gravity.arm.name}: torque that holds the arm against gravity, tau = Y(q) beta [N m; N if prismatic].\n\n'
+        "Made by dvrk-drake from its Drake model. q [rad; m if prismatic] in the dVRK's order and signs, g [m/s^2] the size of\n"
+        'gravity, beta [kg m] the base parameters below; out is filled: out[j], or out[j, k] for the regressor (numpy).\n"""\n\n'
+        f"import math\n\n#: (value of the nominal model [kg m], meaning) of each base parameter.\nBASE_PARAMETERS = [\n{names}]\n\n\n"
+        + codegen.python_source("gravity_torque", [*arguments, beta_argument], torque, "Fills out (n) with Y(q) beta.")
+        + "\n\n"
+        + codegen.python_source("gravity_regressor", arguments, regressor, "Fills out (n, b) with Y(q).")
+    )
+
+
+def to_c(gravity: SymbolicGravity) -> str:
+    """C99 source: `<arm>_gravity_torque(q, g, beta, out)` and `<arm>_gravity_regressor(q, g, out)`, row-major."""
+    torque, regressor, arguments, beta_argument = _functions(gravity)
+    prefix = gravity.arm.name.lower()
+    table = "\n".join(f" *   beta[{i}] = {v!r}: {name}" for i, (name, v) in enumerate(_named_values(gravity)))
+    header = (
+        f"/* {gravity.arm.name}: torque that holds the arm against gravity, tau = Y(q) beta [N m; N if prismatic].\n"
+        " * Made by dvrk-drake from its Drake model. q [rad; m if prismatic] in the dVRK's order and signs, g [m/s^2] the\n"
+        f" * size of gravity, beta [kg m] the base parameters; nominal values:\n{table}\n */\n"
+    )
+    body = codegen.c_source(f"{prefix}_gravity_torque", [*arguments, beta_argument], torque)
+    body += "\n" + codegen.c_source(f"{prefix}_gravity_regressor", arguments, regressor).replace("#include <math.h>\n\n", "")
+    return header + body
+
+
+def _functions(
+    gravity: SymbolicGravity,
+) -> tuple[codegen.SharedTerms, codegen.SharedTerms, list[tuple[str, Sequence]], tuple[str, Sequence]]:
+    beta = _beta_symbols(gravity)
+    torque = codegen.share_terms(sympy.Array(list(sympy.Matrix(gravity.regressor) * sympy.Matrix(beta))))
+    regressor = codegen.share_terms(gravity.regressor)
+    return torque, regressor, [("q", gravity.q), ("g", (GRAVITY,))], ("beta", beta)
+
+
+def _named_values(gravity: SymbolicGravity) -> list[tuple[str, float]]:
+    return [(n, float(v)) for n, v in zip(gravity.base.names, gravity.base_values, strict=True)]
+
+
+def _beta_symbols(gravity: SymbolicGravity) -> tuple[sympy.Symbol, ...]:
+    return tuple(sympy.Symbol(f"beta{i + 1}") for i in range(len(gravity.base.names)))
+
+
+def _short_angles(gravity: SymbolicGravity) -> dict[sympy.Expr, sympy.Symbol]:
+    number = {q: str(i + 1) for i, q in enumerate(gravity.q)}
+    short = {}
+    for function in gravity.regressor.atoms(sympy.sin, sympy.cos):
+        letter = "s" if isinstance(function, sympy.sin) else "c"
+        indices = "".join(sorted(number[q] for q in function.args[0].free_symbols))
+        short[function] = sympy.Symbol(f"{letter}_{{{indices}}}")
+    return short
+
+
+def _factor(e: sympy.Expr) -> str:
+    """LaTeX of e as a factor: in brackets where it is a sum or begins with a minus."""
+    text = sympy.latex(e)
+    return rf"\left({text}\right)" if e.is_Add or text.startswith("-") else text
+
+
+def _latex_name(text: str) -> str:
+    """`L2 (m2+...+m7) + m2 c2x` -> `L_{2} (m_{2}+\\dots+m_{7}) + m_{2} c_{2x}`."""
+    words = []
+    for word in re.sub(r"([-+()])", r" \1 ", text.replace("...", r"\dots")).split():
+        if word[0] in "Lmc" and len(word) > 1:
+            words.append(rf"{word[0]}_{{{word[1:].lstrip('_').replace('_', chr(92) + ',')}}}")
+        else:
+            words.append(word)
+    return " ".join(words)
