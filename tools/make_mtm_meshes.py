@@ -5,14 +5,14 @@ between joints are read from mtm.sdf. Linkage and arm lie in planes side by side
 
     -56 yoke | -34 pulleys, cables -27 | -25 arm 25 | 28 crank 37 | 39 coupler 47 | 56 yoke
 
-and the wrist's brackets in shells around the wrist centre: handle < 56, yaw 56..72, pitch 72..104, platform > 106.
+and the wrist's brackets in shells around the wrist centre: handle < 56, yaw 56..72, pitch 72..104, platform > 105.
 """
 
 import xml.etree.ElementTree as ElementTree
 from argparse import ArgumentParser
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import atan2, cos, hypot, pi, sin
+from math import atan2, cos, hypot, sin
 from pathlib import Path
 
 import build123d as cad
@@ -56,9 +56,10 @@ def base_link(_: Lengths) -> Body:
 
 def outer_yaw_link(_: Lengths) -> Body:
     """Turning half of the yaw housing and the yoke that holds the shoulder from both sides."""
-    top, side, bend = 237.0, 65.0, 52.0
-    arch = cad.FilletPolyline((-side, 0, 0), (-side, 0, top), (side, 0, top), (side, 0, 0), radius=bend)
-    yoke = swept(arch.wire(), (-1, 0, 0), (62, 17, 7))
+    top, side, bend = 236.0, 65.0, 54.0
+    arch = cad.FilletPolyline((-side, 0, 0), (-side, 0, top), (0, 0, top), radius=bend)
+    half = swept(arch.wire(), (-1, 0, 0), (44, 16, 7), (66, 17, 7), (92, 18, 7))
+    yoke = half.fuse(half.mirror(cad.Plane.YZ))
     ends = [disc("x", low, low + 20, 37, edge=5) for low in (-76, 56)]
     neck = cad.Pos(0, 0, 240) * cad.Cone(50, 76, 20, align=(cad.Align.CENTER, cad.Align.CENTER, cad.Align.MIN))
     covers = [disc("x", -88, -74, 29, edge=5), disc("x", 74, 92, 29, edge=6)]
@@ -72,15 +73,19 @@ def outer_yaw_link(_: Lengths) -> Body:
 
 def pulley(low: float, radius: float) -> Body:
     """Grooved cable pulley, 7 wide, on the x axis."""
-    flanges = [disc("x", low, low + 2, radius, edge=0.6), disc("x", low + 5, low + 7, radius, edge=0.6)]
-    return of("steel", *flanges, disc("x", low + 1, low + 6, radius - 3))
+    wheel = disc("x", low, low + 2, radius, edge=0.6).fuse(
+        disc("x", low + 5, low + 7, radius, edge=0.6), disc("x", low + 1, low + 6, radius - 3)
+    )
+    for hole in bolts("x", low - 1, low + 8, 0.68 * radius, 6, 0.17 * radius):
+        wheel = wheel.cut(hole)
+    return [*of("steel", wheel), *of("cover", disc("x", low - 1.6, low + 1, 0.4 * radius, edge=1))]
 
 
 def upper_arm_link(lengths: Lengths) -> Body:
     """Motor pack above the shoulder, slim tube below, eye at the elbow, two cables beside the tube."""
     elbow = -lengths.upper_arm
     pack = plate("x", -48, 48, [(-15.5, 154, 38), (-15.5, 167, 38)], 13)
-    hub = plate("x", -25, 26, [(0, 0, 36), (-13, 125, 27)], 6)
+    hub = plate("x", -25, 26, [(0, 0, 36), (-13, 125, 28)], 10)
     eye = plate("x", -13, 13, [(0, elbow, 24), (0, elbow + 46, 15)], 2)
     cables = [disc("z", elbow, 0, 0.9, (-30.5, y)) for y in (-28, 28)]
     return [
@@ -155,8 +160,8 @@ def platform_link(lengths: Lengths) -> Body:
     bracket = swept(path, (0, 0, -1), (32, 14, 5.5), (27, 13.5, 5.5), (23, 13, 5.5))
     return [
         *fused("casting", bracket, disc("z", 25, 45, 25, edge=4), disc("x", 106.5, 124, 20, (0, rise), 3.5)),
-        *of("cover", disc("x", 123, 146, 16.5, (0, rise), 4)),
-        *of("steel", disc("x", 96, 107, 8, (0, rise)), bolts("x", 123, 125.4, 18.4, 6, 1.3, (0, rise))),
+        *of("cover", disc("x", 123, 146, 13.5, (0, rise), 4)),
+        *of("steel", disc("x", 96, 107, 8, (0, rise)), bolts("x", 123, 125, 15.4, 6, 1.2, (0, rise))),
         *of("steel", bolts("z", 44, 46, 17, 6, 1.8), disc("z", 44, 45.8, 9, edge=0.6)),
     ]
 
@@ -170,10 +175,12 @@ def wrist_pitch_link(_: Lengths) -> Body:
     bracket = swept(path, (1, 0, 0), (19, 9.5, 4), (19, 9.5, 4))
     motor = (62.0, -52.0)
     return [
-        *fused("casting", bracket, disc("x", 79, 98, 15, edge=2.5), disc("z", -100, -79, 14.5, edge=2.5)),
+        *fused("graphite", bracket, disc("x", 79, 98, 15, edge=2.5), disc("z", -100, -79, 14.5, edge=2.5),
+               disc("z", -42, -26, 10.5, motor, 2.5)),
         *of("anodised", disc("z", -40, 8, 8.5, motor, 1.5)),
+        *of("steel", disc("z", -20, -17.5, 8.8, motor), disc("z", 5, 9.2, 3, motor, 0.8)),
         *of("steel", disc("x", 75, 80, 6), disc("z", -80, -72, 7)),
-    ]
+    ]  # fmt: skip
 
 
 def wrist_yaw_link(_: Lengths) -> Body:
@@ -183,23 +190,34 @@ def wrist_yaw_link(_: Lengths) -> Body:
     path = arc(cad.Vector(0, 0, 0), (0, 0, -radius), (0, -half, -half), (0, -radius, 0))
     return [
         *fused("casting", swept(path, (0, 0, -1), (17, 8, 3.5), (15, 8, 3.5)),
-               disc("z", -72, -56, 11.5, edge=2), disc("y", -70, -52, 12.5, edge=2)),
-        *of("anodised", disc("y", -47, -18, 6.5, (-48, 0), 1)),
-        *of("steel", disc("y", -53, -46, 6)),
+               disc("z", -72, -56, 11.5, edge=2), disc("y", -70, -52, 12.5, edge=2),
+               disc("y", -50, -37, 8.5, (-47, 0), 2)),
+        *of("anodised", disc("y", -48, -16, 6.8, (-47, 0), 1)),
+        *of("steel", disc("y", -53, -46, 6), disc("y", -34, -32, 7.1, (-47, 0))),
+        *of("cover", disc("y", -70.6, -69, 9)),
     ]  # fmt: skip
 
 
 def wrist_roll_link(_: Lengths) -> Body:
     """Handle: stem along the roll axis, two sprung levers with finger pads and straps, slightly open."""
-    body = fused("casting", disc("y", -47, -36, 10.5, edge=2), plate("y", -40, -8, [(-5, 0, 6.5), (5, 0, 6.5)], 3))
-    body += of("steel", disc("y", -10, 16, 4, edge=2), disc("z", -12.5, 12.5, 3, (-7, -30)), disc("z", -12.5, 12.5, 3, (7, -30)))
+    profile = cad.Polyline((0, -47), (9, -47), (11, -45), (11.5, -36), (10.5, -30), (10.5, -20))
+    nose = cad.Spline((10.5, -20), (7, -8), (4.5, 10), (0, 17), tangents=((0, 1), (-1, 0)))
+    section = cad.make_face(cad.Curve() + [profile, nose, cad.Line((0, 17), (0, -47))])
+    stem = cad.revolve(section, cad.Axis.Y)
+    slots = [cad.Pos(side * 11, -18, 0) * cad.Box(10, 28, 13.5) for side in (-1, 1)]
+    body = of("graphite", stem - slots)
+    body += of("steel", disc("y", -49, -46, 7), [disc("z", -8.5, 8.5, 1.9, (x, -27)) for x in (-8, 8)])
+    body += of("steel", [cad.Pos(x, -1, 0) * cad.Rot(0, 90, 0) * cad.Torus(4.2, 0.6) for x in (-11, -9, -7, 7, 9, 11)])
     for side in (-1, 1):
-        hinge = cad.Pos(side * 8, -30, 0) * cad.Rot(0, 0, -side * 14)
-        neck = plate("x", -1.8, 1.8, [(0, 0, 6), (40, 0, 6)], 1)
-        pad = plate("x", -1.8, 1.8, [(44, 0, 10), (66, 0, 10)], 1.2)
-        inlay = plate("x", 1.2 if side > 0 else -3.4, 3.4 if side > 0 else -1.2, [(45, 0, 8), (65, 0, 8)], 0.9)
-        strap = cad.Pos(side * 1.5, 55, 0) * disc("y", -7, 7, 12.5) - cad.Pos(side * 1.5, 55, 0) * disc("y", -8, 8, 11)
-        body += [(m, hinge * s) for m, s in (*fused("casting", neck, pad), *of("rubber", inlay), *of("strap", strap))]
+        hinge = cad.Pos(side * 8, -27, 0) * cad.Rot(0, 0, -side * 14)
+        neck = plate("x", -2, 2, [(0, 0, 5.5), (40, 0, 7)], 1.2)
+        pad = plate("x", -2.2, 2.2, [(44, 0, 11), (62, 0, 10)], 1.8)
+        faces = sorted((side * 1.5, side * 4.2))
+        inlay = plate("x", *faces, [(44, 0, 9), (61, 0, 8.2)], 1.1)
+        loop = [(-7, 0, 4.5), (7, 0, 4.5), (0, side * 11, 11)]
+        strap = plate("y", 42, 58, loop) - plate("y", 41, 59, [(u, v, radius - 1.4) for u, v, radius in loop])
+        parts = (*fused("casting", neck, pad), *of("rubber", inlay), *of("strap", strap))
+        body += [(material, hinge * part) for material, part in parts]
     return body
 
 

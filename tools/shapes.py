@@ -20,15 +20,17 @@ Body = list[tuple[str, cad.Shape]]  # what a link is made of: the name of a mate
 
 # Base colour (linear red, green, blue), metallic and roughness factors.
 MATERIALS: dict[str, tuple[Point, float, float]] = {
-    "casting": ((0.36, 0.36, 0.345), 0.0, 0.50),
-    "aluminium": ((0.30, 0.31, 0.325), 0.35, 0.32),
-    "steel": ((0.17, 0.175, 0.185), 0.45, 0.30),
+    "casting": ((0.235, 0.235, 0.225), 0.0, 0.50),
+    "aluminium": ((0.19, 0.20, 0.21), 0.35, 0.32),
+    "steel": ((0.11, 0.115, 0.12), 0.45, 0.30),
+    "graphite": ((0.045, 0.047, 0.052), 0.10, 0.42),
     "cover": ((0.018, 0.019, 0.022), 0.0, 0.45),
     "anodised": ((0.010, 0.0105, 0.012), 0.15, 0.35),
     "rubber": ((0.012, 0.012, 0.013), 0.0, 0.85),
     "strap": ((0.035, 0.045, 0.075), 0.0, 0.95),
 }
-LINEAR_TOLERANCE = 0.25  # millimetres
+LINEAR_TOLERANCE = 1 / 400  # of a solid's diagonal, but
+FINEST, COARSEST = 0.09, 0.25  # millimetres
 ANGULAR_TOLERANCE = 0.60  # radians
 
 
@@ -102,7 +104,8 @@ def fused(material: str, *solids: cad.Shape) -> Body:
 
 def triangulated(solid: cad.Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices, unit normals (exact, of the surface) and triangles; faces share no vertices, so edges stay crisp."""
-    BRepMesh_IncrementalMesh(solid.wrapped, LINEAR_TOLERANCE, False, ANGULAR_TOLERANCE, False)
+    tolerance = min(COARSEST, max(FINEST, LINEAR_TOLERANCE * solid.bounding_box().diagonal))
+    BRepMesh_IncrementalMesh(solid.wrapped, tolerance, False, ANGULAR_TOLERANCE, False)
     points, normals, triangles, count = [], [], [], 0
     for face in solid.faces():
         location = TopLoc_Location()
@@ -112,8 +115,8 @@ def triangulated(solid: cad.Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         reverse = face.wrapped.Orientation() == TopAbs_REVERSED
         for node in range(1, mesh.NbNodes() + 1):
             point, normal = mesh.Node(node).Transformed(move), mesh.Normal(node).Transformed(move)
-            points.append((point.X(), point.Y(), point.Z()))
-            normals.append((normal.X(), normal.Y(), normal.Z()))
+            points.append(point.Coord())
+            normals.append((normal.Reversed() if reverse else normal).Coord())
         for index in range(1, mesh.NbTriangles() + 1):
             a, b, c = mesh.Triangle(index).Get()
             triangles.append((count + a - 1, count + c - 1, count + b - 1) if reverse else
