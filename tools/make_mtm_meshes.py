@@ -1,11 +1,13 @@
-"""Make the visual meshes of the MTM, dvrk_drake/models/sdf/meshes/mtm/<link>.gltf (needs the `geometry` extra).
+"""Make the visual meshes of the MTM, models/sdf/meshes/mtm/<link>.gltf (needs the `geometry` extra).
 
-All numbers are millimetres in the link's own frame: +X to the operator's left, +Y toward the operator, +Z up. The lengths
-between joints are read from mtm.sdf. Linkage and arm lie in planes side by side along x:
+All numbers are millimetres in the link's own frame: +X to the operator's left, +Y toward the operator, +Z up.
+The lengths between joints are read from mtm.sdf. Linkage and arm lie in planes side by side along x:
 
     -56 yoke | -34 pulleys, cables -27 | -25 arm 25 | 28 crank 37 | 39 coupler 47 | 56 yoke
 
-and the wrist's brackets in shells around the wrist centre: handle < 56, yaw 56..72, pitch 72..104, platform > 105.
+and the wrist's brackets in shells around the wrist centre, which keeps them apart at every pose:
+
+    handle < 56 | yaw 56..72 | pitch 72..104 | platform > 105
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -48,7 +50,9 @@ def base_link(_: Lengths) -> Body:
     corners = [(x, y, 16) for x in (-74, 74) for y in (-74, 74)]
     return [
         *of("casting", plate("z", 318, 330, corners, 3), disc("z", 291, 320, 76, edge=4)),
-        *of("cover", disc("z", 287, 292, 70), disc("z", 330, 388, 33, edge=9), disc("z", 330, 336, 45, edge=2)),
+        *of(
+            "cover", disc("z", 287, 292, 70), disc("z", 330, 388, 33, edge=9), disc("z", 330, 336, 45, edge=2)
+        ),
         *of("steel", bolts("z", 329, 334, 92, 4, 6)),
         *of("steel", bolts("z", 335, 338, 39, 6, 2.5)),
     ]
@@ -61,7 +65,9 @@ def outer_yaw_link(_: Lengths) -> Body:
     half = swept(arch.wire(), (-1, 0, 0), (44, 16, 7), (66, 17, 7), (92, 18, 7))
     yoke = half.fuse(half.mirror(cad.Plane.YZ))
     ends = [disc("x", low, low + 20, 37, edge=5) for low in (-76, 56)]
-    neck = cad.Pos(0, 0, 240) * cad.Cone(50, 76, 20, align=(cad.Align.CENTER, cad.Align.CENTER, cad.Align.MIN))
+    neck = cad.Pos(0, 0, 240) * cad.Cone(
+        50, 76, 20, align=(cad.Align.CENTER, cad.Align.CENTER, cad.Align.MIN)
+    )
     covers = [disc("x", -88, -74, 29, edge=5), disc("x", 74, 92, 29, edge=6)]
     return [
         *fused("casting", yoke, *ends, neck, disc("z", 258, 286, 76, edge=4)),
@@ -100,7 +106,7 @@ def upper_arm_link(lengths: Lengths) -> Body:
 
 
 def crank_link(lengths: Lengths) -> Body:
-    """Crank beside the upper arm and the counterweight behind the shoulder: three slabs bolted to its tail."""
+    """Crank beside the upper arm, counterweight behind the shoulder, three slabs bolted to its tail."""
     centre = (152.0, -42.0)
     tilt = atan2(centre[1], centre[0])
     corners = []
@@ -125,7 +131,9 @@ def coupler_link(lengths: Lengths) -> Body:
     foot = -lengths.upper_arm
     bar = plate("x", 40, 46, [(0, 0, 6.5), (0, foot, 6.5)], 1.5)
     eyes = [disc("x", 39, 47, 12, (0, z), 1.5) for z in (0, foot)]
-    necks = [plate("x", 39.5, 46.5, [(0, z, 10), (0, z + sign * 34, 6.5)], 1.5) for z, sign in ((0, -1), (foot, 1))]
+    necks = [
+        plate("x", 39.5, 46.5, [(0, z, 10), (0, z + sign * 34, 6.5)], 1.5) for z, sign in ((0, -1), (foot, 1))
+    ]
     return fused("aluminium", bar, *eyes, *necks)
 
 
@@ -175,12 +183,17 @@ def wrist_pitch_link(_: Lengths) -> Body:
     bracket = swept(path, (1, 0, 0), (19, 9.5, 4), (19, 9.5, 4))
     motor = (62.0, -52.0)
     return [
-        *fused("graphite", bracket, disc("x", 79, 98, 15, edge=2.5), disc("z", -100, -79, 14.5, edge=2.5),
-               disc("z", -42, -26, 10.5, motor, 2.5)),
+        *fused(
+            "graphite",
+            bracket,
+            disc("x", 79, 98, 15, edge=2.5),
+            disc("z", -100, -79, 14.5, edge=2.5),
+            disc("z", -42, -26, 10.5, motor, 2.5),
+        ),
         *of("anodised", disc("z", -40, 8, 8.5, motor, 1.5)),
         *of("steel", disc("z", -20, -17.5, 8.8, motor), disc("z", 5, 9.2, 3, motor, 0.8)),
         *of("steel", disc("x", 75, 80, 6), disc("z", -80, -72, 7)),
-    ]  # fmt: skip
+    ]
 
 
 def wrist_yaw_link(_: Lengths) -> Body:
@@ -189,25 +202,31 @@ def wrist_yaw_link(_: Lengths) -> Body:
     half = radius / 2**0.5
     path = arc(cad.Vector(0, 0, 0), (0, 0, -radius), (0, -half, -half), (0, -radius, 0))
     return [
-        *fused("casting", swept(path, (0, 0, -1), (17, 8, 3.5), (15, 8, 3.5)),
-               disc("z", -72, -56, 11.5, edge=2), disc("y", -70, -52, 12.5, edge=2),
-               disc("y", -50, -37, 8.5, (-47, 0), 2)),
+        *fused(
+            "casting",
+            swept(path, (0, 0, -1), (17, 8, 3.5), (15, 8, 3.5)),
+            disc("z", -72, -56, 11.5, edge=2),
+            disc("y", -70, -52, 12.5, edge=2),
+            disc("y", -50, -37, 8.5, (-47, 0), 2),
+        ),
         *of("anodised", disc("y", -48, -16, 6.8, (-47, 0), 1)),
         *of("steel", disc("y", -53, -46, 6), disc("y", -34, -32, 7.1, (-47, 0))),
         *of("cover", disc("y", -70.6, -69, 9)),
-    ]  # fmt: skip
+    ]
 
 
 def wrist_roll_link(_: Lengths) -> Body:
     """Handle: stem along the roll axis, two sprung levers with finger pads and straps, slightly open."""
     profile = cad.Polyline((0, -47), (9, -47), (11, -45), (11.5, -36), (10.5, -30), (10.5, -20))
     nose = cad.Spline((10.5, -20), (7, -8), (4.5, 10), (0, 17), tangents=((0, 1), (-1, 0)))
-    section = cad.make_face(cad.Curve() + [profile, nose, cad.Line((0, 17), (0, -47))])
+    outline = [profile, nose, cad.Line((0, 17), (0, -47))]
+    section = cad.make_face([edge for curve in outline for edge in curve.edges()])
     stem = cad.revolve(section, cad.Axis.Y)
     slots = [cad.Pos(side * 11, -18, 0) * cad.Box(10, 28, 13.5) for side in (-1, 1)]
     body = of("graphite", stem - slots)
     body += of("steel", disc("y", -49, -46, 7), [disc("z", -8.5, 8.5, 1.9, (x, -27)) for x in (-8, 8)])
-    body += of("steel", [cad.Pos(x, -1, 0) * cad.Rot(0, 90, 0) * cad.Torus(4.2, 0.6) for x in (-11, -9, -7, 7, 9, 11)])
+    coil = cad.Rot(0, 90, 0) * cad.Torus(4.2, 0.6)
+    body += of("steel", [cad.Pos(x, -1, 0) * coil for x in (-11, -9, -7, 7, 9, 11)])
     for side in (-1, 1):
         hinge = cad.Pos(side * 8, -27, 0) * cad.Rot(0, 0, -side * 14)
         neck = plate("x", -2, 2, [(0, 0, 5.5), (40, 0, 7)], 1.2)
@@ -222,9 +241,17 @@ def wrist_roll_link(_: Lengths) -> Body:
 
 
 LINKS: tuple[Callable[[Lengths], Body], ...] = (
-    base_link, outer_yaw_link, upper_arm_link, forearm_link, platform_link,
-    wrist_pitch_link, wrist_yaw_link, wrist_roll_link, crank_link, coupler_link,
-)  # fmt: skip
+    base_link,
+    outer_yaw_link,
+    upper_arm_link,
+    forearm_link,
+    platform_link,
+    wrist_pitch_link,
+    wrist_yaw_link,
+    wrist_roll_link,
+    crank_link,
+    coupler_link,
+)
 
 
 def main() -> None:

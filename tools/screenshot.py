@@ -16,13 +16,27 @@ from pydrake.systems.framework import DiagramBuilder
 MODELS = Path(__file__).parents[1] / "dvrk_drake/models"
 SDF = MODELS / "sdf/mtm.sdf"
 DRIVEN = (
-    "outer_yaw", "shoulder_pitch", "elbow_pitch", "wrist_platform", "wrist_pitch", "wrist_yaw", "wrist_roll",
-)  # fmt: skip
+    "outer_yaw",
+    "shoulder_pitch",
+    "elbow_pitch",
+    "wrist_platform",
+    "wrist_pitch",
+    "wrist_yaw",
+    "wrist_roll",
+)
 CHROMIUM_FLAGS = (
-    "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
-    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--hide-scrollbars", "--virtual-time-budget=8000",
-)  # fmt: skip
+    "--headless",
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--hide-scrollbars",
+    "--virtual-time-budget=8000",
+)
 # Drake's page shows a control panel, which has no setting of its own.
 HIDE_PANEL = "<style>.dg, #status-message, #stats-plot { display: none !important; }</style>"
 
@@ -38,7 +52,9 @@ def joint_angles(sdf: Path, pose: Sequence[float]) -> dict[str, float]:
     return angles
 
 
-def scene(pose: Sequence[float], camera: Sequence[float], target: Sequence[float], zoom: float, role: Role) -> Meshcat:
+def scene(
+    pose: Sequence[float], camera: Sequence[float], target: Sequence[float], zoom: float, role: Role
+) -> Meshcat:
     """Meshcat that shows the arm at a pose on a light ground."""
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     builder = DiagramBuilder()
@@ -68,8 +84,14 @@ def picture(meshcat: Meshcat, file: Path, width: int, height: int, chromium: str
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / "scene.html"
         page.write_text(meshcat.StaticHtml().replace("</head>", HIDE_PANEL + "</head>", 1))
-        command = [chromium, *CHROMIUM_FLAGS, f"--user-data-dir={folder}/profile", f"--window-size={width},{height}",
-                   f"--screenshot={file.resolve()}", page.as_uri()]  # fmt: skip
+        command = [
+            chromium,
+            *CHROMIUM_FLAGS,
+            f"--user-data-dir={folder}/profile",
+            f"--window-size={width},{height}",
+            f"--screenshot={file.resolve()}",
+            page.as_uri(),
+        ]
         file.unlink(missing_ok=True)
         subprocess.run(command, check=True, capture_output=True, timeout=120)
     if not file.exists():
@@ -80,12 +102,20 @@ def main() -> None:
     """Read the options and write the picture."""
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path, help="PNG to write")
-    parser.add_argument("--pose", nargs=7, type=float, default=[0.0] * 7, metavar="q", help="driven joints, rad")
-    parser.add_argument("--camera", nargs=3, type=float, default=[1.1, 0.9, 0.35], metavar="m", help="its place")
-    parser.add_argument("--target", nargs=3, type=float, default=[0, -0.09, 0.045], metavar="m", help="seen point")
+    parser.add_argument(
+        "--pose", nargs=7, type=float, default=[0.0] * 7, metavar="q", help="driven joints, rad"
+    )
+    parser.add_argument(
+        "--camera", nargs=3, type=float, default=[1.1, 0.9, 0.35], metavar="m", help="its place"
+    )
+    parser.add_argument(
+        "--target", nargs=3, type=float, default=[0, -0.09, 0.045], metavar="m", help="seen point"
+    )
     parser.add_argument("--zoom", type=float, default=2.8, help="magnification of Meshcat's 75 degree view")
     parser.add_argument("--collision", action="store_true", help="show the collision shapes instead")
-    parser.add_argument("--size", nargs=2, type=int, default=[1200, 900], metavar="pixels", help="width, height")
+    parser.add_argument(
+        "--size", nargs=2, type=int, default=[1200, 900], metavar="pixels", help="width, height"
+    )
     parser.add_argument("--chromium", default=shutil.which("chromium") or "chromium", help="the browser")
     options = parser.parse_args()
     role = Role.kProximity if options.collision else Role.kIllustration

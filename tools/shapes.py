@@ -40,7 +40,9 @@ def across(axis: str, height: float) -> cad.Plane:
     return cad.Plane(origin=tuple(unit * height), x_dir=tuple(np.roll(unit, 1)), z_dir=tuple(unit))
 
 
-def disc(axis: str, low: float, high: float, radius: float, at: Sequence[float] = (0, 0), edge: float = 0) -> cad.Part:
+def disc(
+    axis: str, low: float, high: float, radius: float, at: Sequence[float] = (0, 0), edge: float = 0
+) -> cad.Part:
     """Cylinder between two heights on an axis, its rims rounded by `edge`."""
     align = (cad.Align.CENTER, cad.Align.CENTER, cad.Align.MIN)
     solid = across(axis, low) * cad.Pos(*at) * cad.Cylinder(radius, high - low, align=align)
@@ -48,7 +50,7 @@ def disc(axis: str, low: float, high: float, radius: float, at: Sequence[float] 
 
 
 def plate(axis: str, low: float, high: float, circles: Sequence[Circle], edge: float = 0) -> cad.Part:
-    """Plate between two heights on an axis, outlined by the convex hull of circles, its rims rounded by `edge`."""
+    """Plate between two heights on an axis, outlined by the hull of circles, rims rounded by `edge`."""
     outlines = [(cad.Pos(u, v) * cad.Circle(radius)).edges() for u, v, radius in circles]
     hull = cad.make_hull([edge for edges in outlines for edge in edges])
     solid = cad.extrude(across(axis, low) * hull, high - low)
@@ -73,18 +75,30 @@ def swept(path: cad.Edge | cad.Wire, outward: Point, *sections: tuple[float, flo
         sideways = np.cross(direction, tuple(tangent))
         plane = cad.Plane(origin=where.position, x_dir=tuple(sideways), z_dir=tangent)
         profiles.append(plane * cad.RectangleRounded(width, thickness, corner))
-    return cad.sweep(profiles if len(profiles) > 1 else profiles[0], path=path, multisection=len(profiles) > 1)
+    return cad.sweep(
+        profiles if len(profiles) > 1 else profiles[0], path=path, multisection=len(profiles) > 1
+    )
 
 
 def turn_with(start: cad.Vector, end: cad.Vector, direction: np.ndarray) -> np.ndarray:
     """The direction after the smallest rotation that takes one tangent to the other."""
     a, b = (np.asarray(tuple(vector)) / np.linalg.norm(tuple(vector)) for vector in (start, end))
     normal = np.cross(a, b)
-    return direction + np.cross(normal, direction) + np.cross(normal, np.cross(normal, direction)) / (1 + a @ b)
+    return (
+        direction + np.cross(normal, direction) + np.cross(normal, np.cross(normal, direction)) / (1 + a @ b)
+    )
 
 
-def bolts(axis: str, low: float, high: float, circle: float, count: int, radius: float, at: Sequence[float] = (0, 0),
-          phase: float = 0.5) -> list[cad.Part]:  # fmt: skip
+def bolts(
+    axis: str,
+    low: float,
+    high: float,
+    circle: float,
+    count: int,
+    radius: float,
+    at: Sequence[float] = (0, 0),
+    phase: float = 0.5,
+) -> list[cad.Part]:
     """Screw heads on a circle; `phase` is the first one's place as a fraction of their spacing."""
     angles = [2 * pi * (index + phase) / count for index in range(count)]
     places = [(at[0] + circle * cos(angle), at[1] + circle * sin(angle)) for angle in angles]
@@ -103,7 +117,7 @@ def fused(material: str, *solids: cad.Shape) -> Body:
 
 
 def triangulated(solid: cad.Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, unit normals (exact, of the surface) and triangles; faces share no vertices, so edges stay crisp."""
+    """Vertices, unit normals (exact, of the surface) and triangles; faces share none, so edges stay crisp."""
     tolerance = min(COARSEST, max(FINEST, LINEAR_TOLERANCE * solid.bounding_box().diagonal))
     BRepMesh_IncrementalMesh(solid.wrapped, tolerance, False, ANGULAR_TOLERANCE, False)
     points, normals, triangles, count = [], [], [], 0
@@ -119,8 +133,11 @@ def triangulated(solid: cad.Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             normals.append((normal.Reversed() if reverse else normal).Coord())
         for index in range(1, mesh.NbTriangles() + 1):
             a, b, c = mesh.Triangle(index).Get()
-            triangles.append((count + a - 1, count + c - 1, count + b - 1) if reverse else
-                             (count + a - 1, count + b - 1, count + c - 1))  # fmt: skip
+            triangles.append(
+                (count + a - 1, count + c - 1, count + b - 1)
+                if reverse
+                else (count + a - 1, count + b - 1, count + c - 1)
+            )
         count += mesh.NbNodes()
     return np.array(points), np.array(normals), np.array(triangles)
 
@@ -134,7 +151,7 @@ def joined(solids: Sequence[cad.Shape]) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def write_gltf(body: Body, path: Path) -> None:
-    """Write a body as one self-contained .gltf file in metres, Y up as the format asks (Drake turns it to Z up)."""
+    """Write a body as one .gltf file in metres, Y up as the format asks (Drake turns it to Z up)."""
     data, views, accessors, meshes, materials = bytearray(), [], [], [], []
     for name in dict.fromkeys(material for material, _ in body):
         points, normals, triangles = joined([solid for material, solid in body if material == name])
@@ -150,22 +167,44 @@ def write_gltf(body: Body, path: Path) -> None:
         ):
             content = array.tobytes()
             views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(content), "target": target})
-            accessors.append({"bufferView": len(views) - 1, "componentType": code,
-                              "count": len(array), "type": kind, **extra})  # fmt: skip
+            accessors.append(
+                {
+                    "bufferView": len(views) - 1,
+                    "componentType": code,
+                    "count": len(array),
+                    "type": kind,
+                    **extra,
+                }
+            )
             data += content + b"\0" * (-len(content) % 4)
         attributes = {"POSITION": first, "NORMAL": first + 1}
-        meshes.append({"name": name, "primitives": [
-            {"attributes": attributes, "indices": first + 2, "material": len(materials)}]})  # fmt: skip
+        meshes.append(
+            {
+                "name": name,
+                "primitives": [{"attributes": attributes, "indices": first + 2, "material": len(materials)}],
+            }
+        )
         colour, metallic, roughness = MATERIALS[name]
-        materials.append({"name": name, "pbrMetallicRoughness": {
-            "baseColorFactor": [*colour, 1], "metallicFactor": metallic, "roughnessFactor": roughness}})  # fmt: skip
+        materials.append(
+            {
+                "name": name,
+                "pbrMetallicRoughness": {
+                    "baseColorFactor": [*colour, 1],
+                    "metallicFactor": metallic,
+                    "roughnessFactor": roughness,
+                },
+            }
+        )
     uri = "data:application/octet-stream;base64," + b64encode(data).decode()
     document = {
         "asset": {"version": "2.0", "generator": "tools/make_mtm_meshes.py"},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))}],
         "nodes": [{"name": mesh["name"], "mesh": index} for index, mesh in enumerate(meshes)],
-        "meshes": meshes, "materials": materials, "accessors": accessors, "bufferViews": views,
+        "meshes": meshes,
+        "materials": materials,
+        "accessors": accessors,
+        "bufferViews": views,
         "buffers": [{"byteLength": len(data), "uri": uri}],
-    }  # fmt: skip
+    }
     path.write_text(json.dumps(document, separators=(",", ":")) + "\n")
