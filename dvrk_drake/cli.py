@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _model(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.tables import print_symbolic_model
+    from dvrk_drake.analysis.tables import make_console, print_symbolic_model
     from dvrk_drake.dynamics import export
     from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
     from dvrk_drake.models.arm import load_arm
@@ -45,7 +45,7 @@ def _model(options: argparse.Namespace) -> None:
     gravity = derive_gravity(_mounted(load_arm(options.arm), options.gravity), options.frames, options.serial)
     writers = {"latex": export.to_latex, "python": export.to_python, "c": export.to_c}
     if options.format is None:
-        print_symbolic_model(Console(), gravity)
+        print_symbolic_model(make_console(), gravity)
         return
     text = writers[options.format](gravity)
     if options.output is None:
@@ -58,7 +58,7 @@ def _model(options: argparse.Namespace) -> None:
 def _identify(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_identification
     from dvrk_drake.analysis.static_identification import identify_static
-    from dvrk_drake.analysis.tables import print_doubts, print_model
+    from dvrk_drake.analysis.tables import make_console, print_doubts, print_model
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.recording import read_recording
 
@@ -69,7 +69,7 @@ def _identify(options: argparse.Namespace) -> None:
         result = identify_static(
             recording, arm, options.method, lambda share: progress.update(task, completed=100 * share)
         )
-    console = Console()
+    console = make_console()
     print_doubts(console, result.doubts)
     print_model(console, result.model)
     if options.plots is not None:
@@ -81,7 +81,7 @@ def _identify(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_validation
-    from dvrk_drake.analysis.tables import print_doubts, print_validation
+    from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
     from dvrk_drake.analysis.validation import validate
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.atomic_file import atomic_write
@@ -93,7 +93,7 @@ def _validate(options: argparse.Namespace) -> None:
     if options.json is not None:
         _check_folder(options.json)
     validation = validate(model, recording)
-    console = Console()
+    console = make_console()
     print_doubts(console, validation.doubts)
     print_validation(console, validation)
     if options.plots is not None:

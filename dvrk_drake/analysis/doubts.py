@@ -45,9 +45,11 @@ def find_doubts(recording: Recording, arm: Arm) -> list[Doubt]:
         reason = f"{names[limit]} at {values[row, limit]:.3f} rests on its stop ({stop:.3f})"
         doubts.append(Doubt(int(row), joints, recording.where(int(row)), reason))
     tau = recording.measured_effort()
-    for row, joint in np.argwhere(np.abs(tau) > arm.effort_limits):
-        reason = f"{arm.joint_names[joint]} effort {tau[row, joint]:.2f} exceeds its limit {arm.effort_limits[joint]:.2f}"
+    doubted = ~usable_measurements(tau.shape, doubts)
+    for row, joint in np.argwhere((np.abs(tau) > arm.effort_limits) & ~doubted):
+        reason = f"{arm.joint_names[joint]} effort {tau[row, joint]:.3g} exceeds its limit {arm.effort_limits[joint]:.3g}"
         doubts.append(Doubt(int(row), (int(joint),), recording.where(int(row)), reason))
+    doubts.sort(key=lambda doubt: doubt.row)
     return doubts
 
 
@@ -60,7 +62,7 @@ def outlier_doubts(
             int(row),
             (int(joint),),
             recording.where(int(row)),
-            f"{arm.joint_names[joint]} effort is {residuals[row, joint]:+.3f} away from what all other poses say",
+            f"{arm.joint_names[joint]} effort is {residuals[row, joint]:+.2g} away from what all other poses say",
         )
         for row, joint in np.argwhere(outliers)
     ]

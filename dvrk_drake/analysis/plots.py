@@ -28,19 +28,19 @@ def plot_torque_error(
     path: Path, names: tuple[str, ...], rms_zero: NDArray[np.float64], rms_model: dict[str, NDArray[np.float64]], title: str
 ) -> None:
     """Bars of RMS torque error per joint (n,) [N m]: zero torque beside each model; logarithmic, joints differ by decades."""
-    figure, axes = plt.subplots(figsize=(9, 4.5), layout="constrained")
+    figure, axes = plt.subplots(figsize=(11, 5), layout="constrained")
     bars = {"zero torque": rms_zero, **rms_model}
     colours = [ZERO_COLOUR, MODEL_COLOUR, MEASURED_COLOUR, "#edae49"]
     width = 0.8 / len(bars)
     for i, (label, values) in enumerate(bars.items()):
         x = np.arange(len(names)) + (i - (len(bars) - 1) / 2) * width
         drawn = axes.bar(x, values, width, label=label, color=colours[i % len(colours)])
-        axes.bar_label(drawn, [f"{v:.2g}" for v in values], fontsize=7, padding=2)
+        axes.bar_label(drawn, [f"{v:.2g}" for v in values], fontsize=7, padding=2, rotation=90)
     axes.set_yscale("log")
     axes.set_xticks(range(len(names)), _labels(names), fontsize=8)
     axes.set_ylabel("RMS torque error [N m]")
     axes.set_title(title)
-    axes.margins(y=0.15)
+    axes.margins(y=0.25)
     axes.legend(fontsize=8)
     _save(figure, path)
 

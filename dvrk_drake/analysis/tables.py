@@ -13,65 +13,73 @@ from dvrk_drake.analysis.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity
 
+TABLE_WIDTH = 112
+
+
+def make_console() -> Console:
+    """A console on stdout at least as wide as the tables are: a narrow terminal wraps them rather than losing digits."""
+    console = Console(highlight=False)
+    return console if console.width >= TABLE_WIDTH else Console(highlight=False, width=TABLE_WIDTH)
+
 
 def print_model(console: Console, model: IdentifiedModel) -> None:
     """Parameters with their standard errors, then how each joint was fitted."""
     provenance = model.provenance
     console.print(
         f"{model.arm.upper()}, {provenance.poses} poses, method {provenance.method}, rank {provenance.rank} of "
-        f"{len(model.base_parameters)}, condition number {provenance.condition_number:.3g}"
+        f"{len(model.base_parameters)}, condition number {provenance.condition_number:.3g}\n"
     )
-    table = _table("Base parameters [kg m]", "parameter", "value", "standard error", "")
+    table = _table("Base parameters [kg m]", "", "value", "standard error", "|value| < 2 se")
     for p in model.base_parameters:
-        table.add_row(escape(p.name), f"{p.value:+.5f}", f"{p.standard_error:.5f}", _verdict(p.distinguishable))
+        table.add_row(escape(p.name), f"{p.value:+.5f}", f"{p.standard_error:.5f}", "" if p.distinguishable else "zero?")
     console.print(table)
     if model.joint_effects:
-        table = _table("Joint effects [N m; N if prismatic]", "effect", "value", "standard error", "")
+        table = _table("Joint effects [N m; N if prismatic]", "", "value", "standard error", "|value| < 2 se")
         for e in model.joint_effects:
             name = f"{e.joint} {e.kind}"
-            table.add_row(name, f"{e.value:+.5f}", f"{e.standard_error:.5f}", _verdict(e.distinguishable))
+            table.add_row(name, f"{e.value:+.5f}", f"{e.standard_error:.5f}", "" if e.distinguishable else "zero?")
         console.print(table)
-    table = _table(
-        "RMS torque error [N m] without doubted measurements; all poses in brackets",
-        "joint",
-        "zero torque",
-        "fit",
-        "leave-one-out",
-        "ten-fold*",
-        "trust",
-        "doubted",
-        "poses cover",
-    )
-    for j in model.joints:
-        table.add_row(
+    rows = [
+        (
             j.name,
-            f"{j.rms_zero_torque_undoubted:.4f} ({j.rms_zero_torque:.4f})",
-            f"{j.rms_fit_undoubted:.4f} ({j.rms_fit:.4f})",
-            f"{j.rms_leave_one_out_undoubted:.4f} ({j.rms_leave_one_out:.4f})",
-            f"{j.rms_cross_validation_undoubted:.4f}",
-            f"{j.trust:.2f}",
-            str(j.num_doubted),
-            f"{j.position_lower:+.2f}..{j.position_upper:+.2f} ({100 * j.coverage:.0f} %)",
+            j.rms_zero_torque_undoubted,
+            j.rms_fit_undoubted,
+            j.rms_leave_one_out_undoubted,
+            j.rms_cross_validation_undoubted,
         )
+        for j in model.joints
+    ]
+    title = "RMS torque error [N m; N if prismatic], doubted measurements left out"
+    table = _table(title, "", "zero torque", "fit", "leave-one-out", "ten-fold*", "doubted", "trust", "poses cover")
+    for j, (name, *errors) in zip(model.joints, rows, strict=True):
+        cover = f"{j.position_lower:+.2f}..{j.position_upper:+.2f} ({100 * j.coverage:.0f} %)"
+        table.add_row(name, *(f"{e:.4f}" for e in errors), str(j.num_doubted), f"{j.trust:.2f}", cover)
     console.print(table)
-    console.print("* joint effects and trust chosen anew in every fold", style="dim")
+    console.print("* each tenth of the poses predicted from the rest, joint effects and trust chosen anew\n", style="dim")
+    if any(j.num_doubted for j in model.joints):
+        table = _table("The same with the doubted measurements", "", "zero torque", "fit", "leave-one-out")
+        for j in model.joints:
+            errors = (j.rms_zero_torque, j.rms_fit, j.rms_leave_one_out)
+            table.add_row(j.name, *(f"{e:.4f}" for e in errors))
+        console.print(table)
     for j in model.joints:
         if j.trust == 0.0:
             console.print(
-                f"{j.name}: no torque will be commanded, because the measured torque is too small to tell a model from "
-                "friction, or leave-one-out shows no gain over zero torque",
+                f"{j.name}: no torque will be commanded; what was measured is too small, or too well explained by zero, "
+                "to tell gravity from friction",
                 style="yellow",
+                soft_wrap=True,
             )
 
 
 def print_symbolic_model(console: Console, gravity: SymbolicGravity) -> None:
     """The base parameters of an arm with the values that its SDF gives them, and its joints' limits."""
     arm = gravity.arm
-    table = _table(f"{arm.name}: base parameters of gravity [kg m]", "parameter", "nominal value")
+    table = _table(f"{arm.name}: base parameters of gravity [kg m]", "", "nominal value")
     for name, value in zip(gravity.base.names, gravity.base_values, strict=True):
         table.add_row(escape(name), f"{value:+.5f}")
     console.print(table)
-    table = _table("Joints [rad, N m; m, N if prismatic]", "joint", "position", "effort limit")
+    table = _table("Joints [rad, N m; m, N if prismatic]", "", "position", "effort limit")
     for i, name in enumerate(arm.joint_names):
         position = f"{arm.position_lower[i]:+.4f}..{arm.position_upper[i]:+.4f}"
         table.add_row(f"q{i + 1} {name}", position, f"{arm.effort_limits[i]:.4g}")
@@ -95,8 +103,8 @@ def print_doubts(console: Console, doubts: Sequence[Doubt], most: int = 30) -> N
 def print_validation(console: Console, validation: Validation) -> None:
     """Error beside zero torque, joint by joint."""
     table = _table(
-        f"RMS over {validation.poses} poses [N m]; without doubted measurements in brackets",
-        "joint",
+        f"RMS over {validation.poses} poses [N m; N if prismatic]; without doubted measurements in brackets",
+        "",
         "zero torque",
         "model",
         "ratio",
@@ -116,11 +124,7 @@ def print_validation(console: Console, validation: Validation) -> None:
 
 
 def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, expand=False)
     for i, column in enumerate(columns):
         table.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
     return table
-
-
-def _verdict(distinguishable: bool) -> str:
-    return "" if distinguishable else "not distinguishable from zero"

@@ -11,7 +11,7 @@ import sympy
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, RigidBody, SpatialInertia_, UnitInertia_
+from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody, SpatialInertia_, UnitInertia_
 
 from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParameter, reduce_to_base
 from dvrk_drake.dynamics.trigonometry import simplify_trigonometry
@@ -100,12 +100,19 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
             skip_validity_check=True,
         )
         plant.get_body(body.index()).SetSpatialInertiaInBodyFrame(context, M_BBo)
-        if body.default_mass() > 0 and (label.isdigit() or not serial):
+        if label.isdigit() or not serial:
             unknowns.append((m, c_F))
             parameters += [StandardParameter(label), *(StandardParameter(label, axis) for axis in "xyz")]
-            com_F = R_BF.T @ (body.default_com() - X_BF.translation())
-            values += [body.default_mass(), *(body.default_mass() * com_F)]
+            mass, moment_B = _mass_and_moment(numeric, body)
+            values += [mass, *(R_BF.T @ (moment_B - mass * X_BF.translation()))]
 
+    for index in plant.GetBodyIndices(_arm_instance(plant)):
+        if not any(index == body.index() for body, _ in labels.values()) and not numeric.IsAnchored(numeric.get_body(index)):
+            # A rotor: counted with its link, see _mass_and_moment. Mass 0 would divide by zero in newer versions of Drake.
+            M_rotor = SpatialInertia_[symbolic.Expression](
+                symbolic.Variable("m_rotor"), [0, 0, 0], UnitInertia_[symbolic.Expression](1, 1, 1), skip_validity_check=True
+            )
+            plant.get_body(index).SetSpatialInertiaInBodyFrame(context, M_rotor)
     P = plant.CalcPotentialEnergy(context)
     energies: list[symbolic.Expression] = []  # P per unit of each standard parameter
     for m, c_F in unknowns:
@@ -146,22 +153,42 @@ def _tree_positions(arm: Arm, q: list[symbolic.Variable]) -> list[symbolic.Expre
 
 
 def _labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[RigidBody, RigidTransform]]:
-    """Moving bodies by label with the frame F that their parameters are written in, X_BF; numbered links first."""
-    found = {}
+    """Bodies by label with the frame F that their parameters are written in, X_BF; numbered links first.
+
+    The links are those with a frame <frames>_<number>, the base's 0 left out, or dh_<name> for links of a linkage.
+    """
+    bodies = {}
     for index in plant.GetFrameIndices(_arm_instance(plant)):
         frame = plant.get_frame(index)
         prefix, _, label = frame.name().partition("_")
-        if prefix == frames or (prefix == "dh" and not label.isdigit()):
-            found[frame.body().index()] = (label, frame.GetFixedPoseInBodyFrame())
-    if not any(label.isdigit() for label, _ in found.values()):
+        if (prefix == frames or (prefix == "dh" and not label.isdigit())) and not plant.IsAnchored(frame.body()):
+            bodies[label] = (frame.body(), frame.GetFixedPoseInBodyFrame())
+    if not any(label.isdigit() for label in bodies):
         raise ArmError(f'the SDF has no frames "{frames}_1", "{frames}_2", ...; try "dh"')
-    bodies = {}
-    for index in plant.GetBodyIndices(_arm_instance(plant)):
-        body = plant.get_body(index)
-        if not plant.IsAnchored(body):
-            label, X_BF = found.get(index, (body.name().removesuffix("_link"), RigidTransform()))
-            bodies[label] = (body, X_BF)
     return dict(sorted(bodies.items(), key=lambda item: (not item[0].isdigit(), item[0])))
+
+
+def _mass_and_moment(plant: MultibodyPlant, body: RigidBody) -> tuple[float, NDArray[np.float64]]:
+    """Mass and first moment about Bo in B of a link and the rotors on it: child bodies centred on their own axis.
+
+    Turning such a rotor moves no mass, so for gravity it is part of the link.
+    """
+    mass, moment_B = body.default_mass(), body.default_mass() * body.default_com()
+    for joint in map(plant.get_joint, plant.GetJointIndices(body.model_instance())):
+        child = joint.child_body()
+        if joint.parent_body() == body and not any(f.body() == child for f in _named_frames(plant)):
+            context = plant.CreateDefaultContext()
+            p_FmCcm = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse() @ child.default_com()
+            if np.linalg.norm(np.cross(p_FmCcm, joint.revolute_axis())) > 1e-9:
+                raise ArmError(f"{child.name()} needs a frame dh_<name>: its centre of mass is off its joint's axis")
+            p_BCcm = child.body_frame().CalcPose(context, body.body_frame()) @ child.default_com()
+            mass, moment_B = mass + child.default_mass(), moment_B + child.default_mass() * p_BCcm
+    return mass, moment_B
+
+
+def _named_frames(plant: MultibodyPlant) -> list[Frame]:
+    frames = map(plant.get_frame, plant.GetFrameIndices(_arm_instance(plant)))
+    return [frame for frame in frames if frame.name().startswith("dh_")]
 
 
 def _arm_instance(plant: MultibodyPlant) -> ModelInstanceIndex:

@@ -1,0 +1,266 @@
+"""The MTM's SDF against the dVRK's DH table, the paper's Table I, and mechanics."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.tree import SpatialInertia, UnitInertia
+from pydrake.systems.analysis import Simulator
+
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm import known_arms, load_arm
+from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, tree_selector
+
+PI = np.pi
+#: sawIntuitiveResearchKit share/kinematic/mtm.json, standard DH: theta offset, d, a, alpha.
+DVRK_TABLE = [
+    (-PI / 2, 0, 0, PI / 2),
+    (-PI / 2, 0, 0.2794, 0),
+    (PI / 2, 0, 0.3645, -PI / 2),
+    (0, 0.1506, 0, PI / 2),
+    (0, 0, 0, -PI / 2),
+    (-PI / 2, 0, 0, PI / 2),
+    (PI / 2, 0, 0, 0),
+]
+#: Table I of the paper with L1 = 0: sign of q in theta, theta offset, d, a, alpha.
+PAPER_TABLE = [
+    (1, 0, 0, 0, -PI / 2),
+    (-1, PI / 2, 0, 0.2794, 0),
+    (-1, -PI / 2, 0, 0.3645, PI / 2),
+    (1, 0, 0.1506, 0, -PI / 2),
+    (-1, PI, 0, 0, -PI / 2),
+    (1, -PI / 2, 0, 0, PI / 2),
+    (-1, 0, 0, 0, 0),
+]
+
+
+def dh_transform(theta, d, a, alpha):
+    ct, st, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
+    return np.array([[ct, -st * ca, st * sa, a * ct], [st, ct * ca, -ct * sa, a * st], [0, sa, ca, d], [0, 0, 0, 1]])
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return load_arm("mtml")
+
+
+@pytest.fixture(scope="module")
+def plant(arm):
+    return make_arm_plant(arm)
+
+
+def poses(arm, count=30, seed=1):
+    return arm.sample_poses(count, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("prefix", ["dh", "paper"])
+def test_forward_kinematics_equals_both_published_tables(arm, plant, prefix):
+    table = [(1, *row) for row in DVRK_TABLE] if prefix == "dh" else PAPER_TABLE
+    context = plant.CreateDefaultContext()
+    for q in np.random.default_rng(0).uniform(-PI, PI, (50, 7)):
+        set_arm_positions(plant, context, arm, q)
+        X_0 = np.eye(4)
+        for i, (sign, offset, d, a, alpha) in enumerate(table):
+            X_0 = X_0 @ dh_transform(sign * q[i] + offset, d, a, alpha)
+            X = plant.GetFrameByName(f"{prefix}_{i + 1}").CalcPose(context, plant.GetFrameByName(f"{prefix}_0"))
+            np.testing.assert_allclose(X.GetAsMatrix4(), X_0, rtol=0, atol=1e-12)
+
+
+def test_paper_base_is_the_dvrk_base_turned_by_a_quarter(plant):
+    X = plant.GetFrameByName("dh_0").CalcPose(plant.CreateDefaultContext(), plant.GetFrameByName("paper_0"))
+    assert X.IsNearlyEqualTo(RigidTransform(RotationMatrix.MakeZRotation(PI / 2)), 1e-12)
+
+
+def test_parallelogram_stays_closed_over_the_joint_box(arm, plant):
+    context = plant.CreateDefaultContext()
+    corners = np.array(np.meshgrid(*zip(arm.position_lower[:3], arm.position_upper[:3], strict=True))).reshape(3, -1).T
+    box = np.random.default_rng(2).uniform(arm.position_lower, arm.position_upper, (200, 7))
+    box[: len(corners), :3] = corners
+    (loop,) = arm.loop_closures
+    for q in box:
+        set_arm_positions(plant, context, arm, q)
+        gap = plant.GetFrameByName(loop.frame_a).CalcPose(context, plant.GetFrameByName(loop.frame_b)).translation()
+        assert np.linalg.norm(gap) < 1e-9
+
+
+def test_crank_follows_the_forearm_and_coupler_the_upper_arm(arm, plant):
+    context = plant.CreateDefaultContext()
+    set_arm_positions(plant, context, arm, [0.2, 0.5, -0.3, 0.1, 0.2, 0.3, 0.4])
+
+    def rotation(name):
+        return plant.GetBodyByName(name).EvalPoseInWorld(context).rotation().matrix()
+
+    np.testing.assert_allclose(rotation("crank_link"), rotation("forearm_link"), atol=1e-12)
+    np.testing.assert_allclose(rotation("coupler_link"), rotation("upper_arm_link"), atol=1e-12)
+
+
+def test_inertias_are_possible_and_centres_of_mass_are_not_at_the_joints(plant):
+    for index in plant.GetBodyIndices(plant.GetBodyByName("base_link").model_instance()):
+        body = plant.get_body(index)
+        if body.name() == "base_link":
+            continue
+        # A rotor is centred on its axis, and has to be.
+        assert (np.linalg.norm(body.default_com()) > 1e-3) == (body.name() != "motor_4_link")
+        M = body.default_spatial_inertia()
+        assert M.IsPhysicallyValid()
+        # The pseudo-inertia of a real body is positive definite (Wensing, Kim, Slotine 2018).
+        I_o = M.CalcRotationalInertia().CopyToFullMatrix3()
+        pseudo = np.zeros((4, 4))
+        pseudo[:3, :3] = 0.5 * np.trace(I_o) * np.eye(3) - I_o
+        pseudo[:3, 3] = pseudo[3, :3] = body.default_mass() * body.default_com()
+        pseudo[3, 3] = body.default_mass()
+        assert np.linalg.eigvalsh(pseudo).min() > 1e-7, body.name()
+
+
+def test_motor_4_couples_elbow_and_platform(arm, plant):
+    """Rotor 4 turns with 0.6697 q3 + q4: its inertia about its axis enters G' M G as J_4' I J_4, off-diagonal included."""
+    context = plant.CreateDefaultContext()
+    G = np.zeros((plant.num_velocities(), 7))
+    G[tree_selector(plant, arm)] = arm.linkage.matrix
+    body = plant.GetBodyByName("motor_4_link")
+    for q in poses(arm, 5):
+        context = plant.CreateDefaultContext()
+        set_arm_positions(plant, context, arm, q)
+        full = G.T @ plant.CalcMassMatrix(context) @ G
+        M = body.default_spatial_inertia()
+        I = M.CalcRotationalInertia().CopyToFullMatrix3()
+        less = SpatialInertia(M.get_mass(), M.get_com(), UnitInertia(*np.diag(I / M.get_mass()) * [1, 1, 0.5]))
+        body.SetSpatialInertiaInBodyFrame(context, less)
+        difference = full - G.T @ plant.CalcMassMatrix(context) @ G
+        J_4 = arm.transmission.matrix[3]
+        np.testing.assert_allclose(difference[1:4, 1:4], 0.5 * I[2, 2] * np.outer(J_4, J_4)[1:4, 1:4], atol=1e-15)
+        assert np.linalg.eigvalsh(full).min() > 0
+    assert I[2, 2] == pytest.approx(10.53**2 * 1e-6, rel=1e-4)
+
+
+def test_holding_torque_is_the_gradient_of_potential_energy(arm, plant):
+    context = plant.CreateDefaultContext()
+
+    def energy(q):
+        set_arm_positions(plant, context, arm, q)
+        return plant.CalcPotentialEnergy(context)
+
+    h = 1e-5
+    for q in poses(arm):
+        gradient = [(energy(q + h * e) - energy(q - h * e)) / (2 * h) for e in np.eye(7)]
+        set_arm_positions(plant, context, arm, q)
+        np.testing.assert_allclose(holding_torque(plant, context, arm), gradient, atol=1e-8)
+
+
+def test_loop_closed_by_a_pin_needs_the_same_holding_torque(arm, plant):
+    """The variant without mimics on the loop: statics by the null space of its numerical constraint Jacobian."""
+    loop_plant = make_arm_plant(arm, closure="ball")
+    assert loop_plant.num_constraints() == plant.num_constraints() - 1  # two mimics less, one pin more
+    (loop,) = arm.loop_closures
+    A, B = (loop_plant.GetFrameByName(name) for name in (loop.frame_a, loop.frame_b))
+    context, loop_context = plant.CreateDefaultContext(), loop_plant.CreateDefaultContext()
+    select = tree_selector(loop_plant, arm)
+    names = list(arm.tree_joint_names)
+    motor = select[names.index("motor_4")]
+    for q in poses(arm):
+        set_arm_positions(loop_plant, loop_context, arm, q)
+        q_full = loop_plant.GetPositions(loop_context)
+        jacobian = np.zeros((3, len(q_full)))
+        h = 1e-6
+        for k in range(len(q_full)):
+            gaps = []
+            for sign in (1, -1):
+                loop_plant.SetPositions(loop_context, q_full + sign * h * np.eye(len(q_full))[k])
+                gaps.append(A.CalcPoseInWorld(loop_context).translation() - B.CalcPoseInWorld(loop_context).translation())
+            jacobian[:, k] = (gaps[0] - gaps[1]) / (2 * h)
+        loop_plant.SetPositions(loop_context, q_full)
+        tau_g = loop_plant.CalcGravityGeneralizedForces(loop_context)
+        independent = select[:7]
+        dependent = [i for i in range(len(q_full)) if i not in independent and i != motor]
+        # J_d qd_d = -J_i qd_i defines how crank and coupler follow.
+        follow = -np.linalg.pinv(jacobian[:, dependent]) @ jacobian[:, independent]
+        tau = -(tau_g[independent] + follow.T @ tau_g[dependent])
+        set_arm_positions(plant, context, arm, q)
+        np.testing.assert_allclose(tau, holding_torque(plant, context, arm), atol=1e-8)
+
+
+@pytest.mark.parametrize("closure", ["mimic", "ball"])
+def test_holding_torque_holds_the_simulated_linkage(arm, closure):
+    plant = make_arm_plant(arm, closure=closure)
+    simulator = Simulator(plant)
+    context = simulator.get_mutable_context()
+    q = np.array([0.2, 0.3, -0.2, 0.5, 0.6, 0.2, 0.4])
+    set_arm_positions(plant, context, arm, q)
+    tau = holding_torque(plant, context, arm)
+    u = np.zeros(plant.num_actuated_dofs())
+    for name, effort in zip(arm.joint_names, tau, strict=True):
+        u[plant.GetJointActuatorByName(name).input_start()] = effort
+    plant.get_actuation_input_port().FixValue(context, u)
+    start = plant.GetPositions(context)
+    simulator.AdvanceTo(1.0)
+    assert np.abs(plant.GetPositions(context) - start).max() < 1e-5
+    (loop,) = arm.loop_closures
+    gap = plant.GetFrameByName(loop.frame_a).CalcPose(context, plant.GetFrameByName(loop.frame_b)).translation()
+    assert np.linalg.norm(gap) < 1e-6
+
+
+def test_transmission_keeps_power(arm):
+    generator = np.random.default_rng(5)
+    qd, tau_actuator = generator.normal(size=7), generator.normal(size=7)
+    tau_joint = arm.transmission.pull_back_effort(tau_actuator)
+    assert arm.transmission.velocity(qd) @ tau_actuator == pytest.approx(qd @ tau_joint, rel=1e-13)
+    a = arm.transmission.position([0, 0.3, 0.2, 0.1, 0, 0, 0])
+    np.testing.assert_allclose(a, [0, 0.3, 0.5, 0.6697 * 0.2 + 0.1, 0, 0, 0], atol=1e-15)
+
+
+def test_left_and_right_share_the_mechanism_and_differ_in_limits():
+    left, right = load_arm("MTML"), load_arm("mtmr")
+    assert known_arms() == ["mtml", "mtmr"]
+    assert left.sdf == right.sdf
+    np.testing.assert_allclose([left.position_lower[0], left.position_upper[0]], [-0.698132, 1.13446])
+    np.testing.assert_allclose([right.position_lower[3], right.position_upper[3]], [-1.6580, 3.5779])
+    np.testing.assert_allclose(left.effort_limits, [1.86083, 3.21662, 1.95978, 0.309013, 0.0968438, 0.0968438, 0.0228759])
+
+
+@pytest.mark.parametrize("name", ["mtml", "mtmr"])
+def test_arm_limits_lie_inside_what_the_sdf_allows(name):
+    arm = load_arm(name)
+    plant = make_arm_plant(arm)
+    from pydrake.multibody.parsing import Parser
+    from pydrake.multibody.plant import MultibodyPlant
+
+    from dvrk_drake.models.arm import MODELS_FOLDER
+
+    bare = MultibodyPlant(1e-3)
+    parser = Parser(bare)
+    parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))
+    parser.AddModelsFromUrl(arm.sdf)
+    for i, joint in enumerate(arm.joint_names):
+        mechanism, own = bare.GetJointByName(joint), plant.GetJointByName(joint)
+        assert mechanism.position_lower_limits()[0] <= arm.position_lower[i] == own.position_lower_limits()[0]
+        assert mechanism.position_upper_limits()[0] >= arm.position_upper[i] == own.position_upper_limits()[0]
+
+
+def test_sampled_poses_respect_all_limits(arm):
+    samples = arm.sample_poses(500, np.random.default_rng(0), margin=0.05)
+    assert all(not arm.limit_violations(q) for q in samples)
+    assert np.abs(samples[:, 1] + samples[:, 2]).max() < 0.68
+    assert arm.limit_violations([0, 1.0, 0.5, 0, 0, 0, 0]) == ["parallelogram = 1.5 is outside -0.33..0.68"]
+
+
+def test_unknown_arm_lists_the_known_ones():
+    with pytest.raises(ArmError, match='unknown arm "mtm"; known arms: mtml, mtmr'):
+        load_arm("mtm")
+
+
+def test_friction_tag_is_forbidden(tmp_path):
+    from dvrk_drake.models.sdf_facts import read_sdf_facts
+
+    path = tmp_path / "a.sdf"
+    path.write_text(
+        '<sdf version="1.9"><model name="a"><joint name="j" type="revolute"><axis><xyz>0 0 1</xyz>'
+        "<dynamics><friction>1</friction></dynamics></axis></joint></model></sdf>"
+    )
+    with pytest.raises(ArmError, match="joint j has <friction>, which Drake drops silently"):
+        read_sdf_facts(path)
+
+
+def test_arm_file_with_a_typo_is_refused(tmp_path):
+    path = tmp_path / "arm.yaml"
+    path.write_text("name: X\nmechanism: mtm\nposition_limit: {}\n")
+    with pytest.raises(ArmError, match="position_limit"):
+        load_arm(str(path))
