@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -14,10 +13,11 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.csv_rows import is_number, parse_finite, read_rows
 
 Coordinates = Literal["joint", "actuator"]
 
-#: A pose further than this outside the arm's limits is refused [rad or m]; nearer ones are real: stops give way.
+#: A pose further than this outside the limits is refused [rad or m]; nearer ones are real: stops give way.
 LIMIT_TOLERANCE = 0.2
 
 
@@ -50,7 +50,8 @@ class Recording:
 
     def where(self, row: int) -> str:
         """`file:line` of a row, or the row's number where there is no file."""
-        return f"{self.source}:{self.lines[row]}" if self.lines is not None else f"{self.source or 'row'} {row + 1}"
+        source = self.source or "recording"
+        return f"{source}:{self.lines[row]}" if self.lines is not None else f"{source}: row {row + 1}"
 
     def measured_effort(self) -> NDArray[np.float64]:
         """tau (m, n).
@@ -59,11 +60,18 @@ class Recording:
             RecordingError: the recording has none.
         """
         if self.tau is None:
-            raise RecordingError(f"{self.source}: has no efforts; needs columns tau1..tau{self.q.shape[1]}")
+            raise RecordingError(
+                f"{self.source or 'recording'}: has no efforts; needs columns tau1..tau{self.q.shape[1]}"
+            )
         return self.tau
 
     def in_joint_coordinates(self, arm: Arm) -> Recording:
-        """The same recording with q, qd and tau of the arm's joints."""
+        """The same recording with q, qd and tau of the arm's joints.
+
+        Raises:
+            RecordingError: wrong number of joints.
+        """
+        self._check_joint_count(arm)
         if self.coordinates == "joint":
             return self
         to_joint = arm.transmission.inverse()
@@ -81,8 +89,6 @@ class Recording:
         Raises:
             RecordingError: wrong number of joints, degrees suspected, or a pose far outside the limits.
         """
-        if self.q.shape[1] != arm.num_joints:
-            raise RecordingError(f"{self.source}: has {self.q.shape[1]} joints, {arm.name} has {arm.num_joints}")
         q = self.in_joint_coordinates(arm).q
         excess = np.maximum(arm.position_lower - q, q - arm.position_upper)
         row, joint = np.unravel_index(np.argmax(excess), excess.shape)
@@ -90,44 +96,45 @@ class Recording:
             return
         lower, upper = arm.position_lower[joint], arm.position_upper[joint]
         message = (
-            f"{self.where(int(row))}: {arm.joint_names[joint]} (q{joint + 1}) = {q[row, joint]:.4g} is outside "
-            f"{lower:.4g}..{upper:.4g} of {arm.name}"
+            f"{self.where(int(row))}: {arm.joint_names[joint]} (q{joint + 1}) = {q[row, joint]:.4g} "
+            f"is outside {lower:.4g}..{upper:.4g} of {arm.name}"
         )
         outside = np.mean(np.any(excess > LIMIT_TOLERANCE, axis=1))
-        if outside > 0.3 and np.all(np.abs(np.radians(q)) <= 1.2 * np.maximum(-arm.position_lower, arm.position_upper)):
+        share = np.max(np.abs(q) / np.maximum(-arm.position_lower, arm.position_upper))
+        # Another arm or other coordinates exceed the limits by a factor of 2 or 3, degrees by up to 57.
+        if outside > 0.3 and share > 4 and np.radians(share) <= 1.2:
             message += "; are these degrees? Positions must be in radians (m on a prismatic joint)"
         else:
             message += "; is this the right arm, and are the coordinates (joint or actuator) right?"
         raise RecordingError(message)
 
+    def _check_joint_count(self, arm: Arm) -> None:
+        if self.q.shape[1] != arm.num_joints:
+            source = self.source or "recording"
+            raise RecordingError(f"{source}: has {self.q.shape[1]} joints, {arm.name} has {arm.num_joints}")
+
 
 def read_recording(path: str | Path, num_joints: int = 7, coordinates: Coordinates = "joint") -> Recording:
-    """Reads a CSV with a header: q1..qn, and optionally t, qd1..qdn and tau1..taun, in any order; others are ignored.
+    """Reads a CSV with a header: q1..qn, optionally t, qd1..qdn and tau1..taun, in any order; ignores others.
 
     Raises:
         RecordingError: names the file, the line and the column of what is wrong.
     """
     if coordinates not in get_args(Coordinates):
-        raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
+        raise RecordingError(
+            f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}'
+        )
     path = Path(path)
-    if not path.is_file():
-        raise RecordingError(f"{path}: no such file")
-    content = path.read_bytes()
-    try:
-        rows = list(csv.reader(content.decode("utf-8-sig").splitlines()))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise RecordingError(f"{path}: not a CSV text file: {error}") from error
-    numbered = [(i + 1, [cell.strip() for cell in row]) for i, row in enumerate(rows) if any(c.strip() for c in row)]
+    numbered, sha256 = read_rows(path)
     if not numbered:
         raise RecordingError(f"{path}: is empty; needs a header with {_wanted(num_joints)}")
     header_line, header = numbered[0]
-    if all(_is_number(cell) for cell in header):
+    if all(is_number(cell) for cell in header):
         raise RecordingError(
-            f"{path}:{header_line}: has no header; the first line must name the columns, {_wanted(num_joints)} "
-            "(dvrk-drake convert reads headerless public formats)"
+            f"{path}:{header_line}: has no header; the first line must name the columns, "
+            f"{_wanted(num_joints)} (dvrk-drake convert reads headerless public formats)"
         )
-    if len(set(header)) < len(header):
-        twice = next(name for name in header if header.count(name) > 1)
+    if twice := next((name for name in header if name and header.count(name) > 1), ""):
         raise RecordingError(f"{path}:{header_line}: column {twice} is named twice")
     blocks = {}
     for prefix, needed in (("q", True), ("qd", False), ("tau", False)):
@@ -141,7 +148,9 @@ def read_recording(path: str | Path, num_joints: int = 7, coordinates: Coordinat
                 f"needs {_wanted(num_joints)}"
             )
         if f"{prefix}{num_joints + 1}" in header:
-            raise RecordingError(f"{path}:{header_line}: has {prefix}{num_joints + 1}, but the arm has {num_joints} joints")
+            raise RecordingError(
+                f"{path}:{header_line}: has {prefix}{num_joints + 1}, but the arm has {num_joints} joints"
+            )
         blocks[prefix] = [header.index(name) for name in names]
     if len(numbered) == 1:
         raise RecordingError(f"{path}: has a header but no rows")
@@ -151,9 +160,11 @@ def read_recording(path: str | Path, num_joints: int = 7, coordinates: Coordinat
     values = np.empty((len(numbered) - 1, len(header)))
     for row, (line, cells) in enumerate(numbered[1:]):
         if len(cells) != len(header):
-            raise RecordingError(f"{path}:{line}: has {len(cells)} cells, the header names {len(header)} columns")
+            raise RecordingError(
+                f"{path}:{line}: has {len(cells)} cells, the header names {len(header)} columns"
+            )
         for column in wanted:
-            values[row, column] = _number(cells[column], f"{path}:{line}: {header[column]}")
+            values[row, column] = parse_finite(cells[column], f"{path}:{line}: {header[column]}")
     return Recording(
         q=values[:, blocks["q"]],
         tau=values[:, blocks["tau"]] if "tau" in blocks else None,
@@ -162,7 +173,7 @@ def read_recording(path: str | Path, num_joints: int = 7, coordinates: Coordinat
         coordinates=coordinates,
         source=str(path),
         lines=np.array([line for line, _ in numbered[1:]]),
-        sha256=hashlib.sha256(content).hexdigest(),
+        sha256=sha256,
     )
 
 
@@ -170,7 +181,12 @@ def write_recording(recording: Recording, path: str | Path) -> None:
     """Writes the CSV that `read_recording` reads, at once or not at all, with every digit of every number."""
     n = recording.q.shape[1]
     columns, header = [], []
-    for prefix, block in (("t", recording.t), ("q", recording.q), ("qd", recording.qd), ("tau", recording.tau)):
+    for prefix, block in (
+        ("t", recording.t),
+        ("q", recording.q),
+        ("qd", recording.qd),
+        ("tau", recording.tau),
+    ):
         if block is not None:
             columns.append(block.reshape(len(recording), -1))
             header += [prefix] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(n)]
@@ -191,21 +207,3 @@ def write_csv(path: str | Path, header: list[str], values: NDArray[np.float64]) 
 
 def _wanted(num_joints: int) -> str:
     return f"q1..q{num_joints} and tau1..tau{num_joints} (t and qd1..qd{num_joints} optional)"
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _number(cell: str, where: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        raise RecordingError(f'{where} is not a number: "{cell[:30]}"') from None
-    if not np.isfinite(value):
-        raise RecordingError(f"{where} is {cell}; only finite numbers are allowed")
-    return value
