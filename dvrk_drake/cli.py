@@ -116,6 +116,24 @@ def _predict(options: argparse.Namespace) -> None:
     write_csv(options.output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
 
 
+def _convert(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.convert import convert
+    from dvrk_drake.analysis.tables import make_console
+
+    console = make_console()
+    recording, notes = convert(
+        options.input,
+        options.output,
+        format=options.format,
+        variable=options.variable,
+        rate=options.rate,
+        skip_invalid=options.skip_invalid,
+    )
+    for note in notes:
+        console.print(note, soft_wrap=True)
+    console.print(f"{options.output}: {len(recording)} rows, {recording.coordinates} coordinates", soft_wrap=True)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="dvrk-drake", description="Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."
@@ -155,10 +173,22 @@ def _parser() -> argparse.ArgumentParser:
     _add_recording(verb)
     verb.add_argument("--output", required=True, metavar="FILE.csv", help="columns tau1.., one row a row")
     verb.set_defaults(run=_predict)
+    verb = verbs.add_parser("convert", help="turn a public recording (team .mat, WPI 21-column CSV) into our CSV")
+    verb.add_argument("input", metavar="INPUT")
+    verb.add_argument("output", metavar="OUTPUT.csv")
+    verb.add_argument("--format", choices=("team-mat", "wpi-csv"), help="default: detected")
+    verb.add_argument("--variable", metavar="NAME", help="the .mat's variable, where several fit")
+    verb.add_argument(
+        "--rate", type=float, default=200.0, metavar="HZ", help="samples a second of the CSV; default: 200"
+    )
+    verb.add_argument("--skip-invalid", action="store_true", help="leave out rows that are not numbers, and count them")
+    verb.set_defaults(run=_convert)
     return parser
 
 
-_model_help = "Prints the base parameters; with --latex, --python or --c the gravity torque and its regressor as source."
+_model_help = (
+    "Prints the base parameters; with --latex, --python or --c the gravity torque and its regressor as source."
+)
 
 
 def _add_recording(verb: argparse.ArgumentParser) -> None:
@@ -178,7 +208,7 @@ def _add_gravity(verb: argparse.ArgumentParser) -> None:
     )
 
 
-def _mounted(arm, gravity):  # noqa: ANN001, ANN202 - Arm, imported late
+def _mounted(arm, gravity):
     import numpy as np
 
     if gravity is None:
@@ -217,7 +247,7 @@ class _progress:
         )
         self._task = self._progress.add_task(what, total=100)
 
-    def __enter__(self):  # noqa: ANN204
+    def __enter__(self):
         self._progress.start()
         return self._progress, self._task
 

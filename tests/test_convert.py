@@ -87,18 +87,14 @@ def test_team_mat_of_matlab_4_has_no_signature_but_its_name(tmp_path):
 
 def test_team_mat_with_several_candidates_lists_them_and_takes_a_choice(tmp_path):
     path = write_mat(tmp_path, data=team_array(10), saved_data=team_array(3), n=10)
-    assert_refused(
-        r"poses\.mat: several variables fit: data, saved_data; .*--variable NAME", read_team_mat, path
-    )
+    assert_refused(r"poses\.mat: several variables fit: data, saved_data; .*--variable NAME", read_team_mat, path)
     assert len(read_team_mat(path, variable="saved_data")) == 3
 
 
 def test_team_mat_refuses_a_variable_that_is_absent_or_does_not_fit(tmp_path):
     path = write_mat(tmp_path, a=team_array(), b=np.ones((8, 10, 4)))
     assert_refused(r"has no variable c; it has: a \(8 x 2 x 5 double\)", read_team_mat, path, variable="c")
-    assert_refused(
-        r"variable b must be 8 x 2 x N .* b \(8 x 10 x 4 double\)", read_team_mat, path, variable="b"
-    )
+    assert_refused(r"variable b must be 8 x 2 x N .* b \(8 x 10 x 4 double\)", read_team_mat, path, variable="b")
 
 
 @pytest.mark.parametrize(
@@ -256,9 +252,7 @@ def test_wpi_csv_errors_name_file_line_and_column(tmp_path, case):
 
 @pytest.mark.parametrize("rate", [0, -200, np.nan, np.inf])
 def test_wpi_csv_refuses_other_rates(tmp_path, rate):
-    assert_refused(
-        "rate must be a positive number of Hz", read_wpi_csv, write_wpi(tmp_path, wpi_rows()), rate=rate
-    )
+    assert_refused("rate must be a positive number of Hz", read_wpi_csv, write_wpi(tmp_path, wpi_rows()), rate=rate)
 
 
 def test_wpi_csv_skips_invalid_rows_and_keeps_the_time_of_the_others(tmp_path):
@@ -333,9 +327,7 @@ def test_convert_refuses_options_that_do_not_apply_and_unknown_formats(tmp_path)
     )
     assert_refused("--rate does not apply to team-mat", convert, mat, output, rate=100)
     assert_refused("--variable does not apply to wpi-csv", convert, text, output, variable="a")
-    assert_refused(
-        'unknown format "rosbag"; known formats: team-mat, wpi-csv', convert, text, output, format="rosbag"
-    )
+    assert_refused('unknown format "rosbag"; known formats: team-mat, wpi-csv', convert, text, output, format="rosbag")
     assert not output.exists()
 
 

@@ -165,7 +165,9 @@ def test_loop_closed_by_a_pin_needs_the_same_holding_torque(arm, plant):
             gaps = []
             for sign in (1, -1):
                 loop_plant.SetPositions(loop_context, q_full + sign * h * np.eye(len(q_full))[k])
-                gaps.append(A.CalcPoseInWorld(loop_context).translation() - B.CalcPoseInWorld(loop_context).translation())
+                gaps.append(
+                    A.CalcPoseInWorld(loop_context).translation() - B.CalcPoseInWorld(loop_context).translation()
+                )
             jacobian[:, k] = (gaps[0] - gaps[1]) / (2 * h)
         loop_plant.SetPositions(loop_context, q_full)
         tau_g = loop_plant.CalcGravityGeneralizedForces(loop_context)
@@ -213,7 +215,9 @@ def test_left_and_right_share_the_mechanism_and_differ_in_limits():
     assert left.sdf == right.sdf
     np.testing.assert_allclose([left.position_lower[0], left.position_upper[0]], [-0.698132, 1.13446])
     np.testing.assert_allclose([right.position_lower[3], right.position_upper[3]], [-1.6580, 3.5779])
-    np.testing.assert_allclose(left.effort_limits, [1.86083, 3.21662, 1.95978, 0.309013, 0.0968438, 0.0968438, 0.0228759])
+    np.testing.assert_allclose(
+        left.effort_limits, [1.86083, 3.21662, 1.95978, 0.309013, 0.0968438, 0.0968438, 0.0228759]
+    )
 
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr"])

@@ -203,9 +203,7 @@ def test_a_right_arm_is_not_a_left_arm():
     q = np.zeros((3, 7))
     q[:, 3] = 3.4
     Recording(q=q).check_fits(load_arm("mtmr"))
-    with pytest.raises(
-        RecordingError, match=r"wrist_platform \(q4\) = 3\.4 .* of MTML; is this the right arm"
-    ):
+    with pytest.raises(RecordingError, match=r"wrist_platform \(q4\) = 3\.4 .* of MTML; is this the right arm"):
         Recording(q=q).check_fits(load_arm("mtml"))
 
 

@@ -50,9 +50,7 @@ def base_link(_: Lengths) -> Body:
     corners = [(x, y, 16) for x in (-74, 74) for y in (-74, 74)]
     return [
         *of("casting", plate("z", 318, 330, corners, 3), disc("z", 291, 320, 76, edge=4)),
-        *of(
-            "cover", disc("z", 287, 292, 70), disc("z", 330, 388, 33, edge=9), disc("z", 330, 336, 45, edge=2)
-        ),
+        *of("cover", disc("z", 287, 292, 70), disc("z", 330, 388, 33, edge=9), disc("z", 330, 336, 45, edge=2)),
         *of("steel", bolts("z", 329, 334, 92, 4, 6)),
         *of("steel", bolts("z", 335, 338, 39, 6, 2.5)),
     ]
@@ -65,9 +63,7 @@ def outer_yaw_link(_: Lengths) -> Body:
     half = swept(arch.wire(), (-1, 0, 0), (44, 16, 7), (66, 17, 7), (92, 18, 7))
     yoke = half.fuse(half.mirror(cad.Plane.YZ))
     ends = [disc("x", low, low + 20, 37, edge=5) for low in (-76, 56)]
-    neck = cad.Pos(0, 0, 240) * cad.Cone(
-        50, 76, 20, align=(cad.Align.CENTER, cad.Align.CENTER, cad.Align.MIN)
-    )
+    neck = cad.Pos(0, 0, 240) * cad.Cone(50, 76, 20, align=(cad.Align.CENTER, cad.Align.CENTER, cad.Align.MIN))
     covers = [disc("x", -88, -74, 29, edge=5), disc("x", 74, 92, 29, edge=6)]
     return [
         *fused("casting", yoke, *ends, neck, disc("z", 258, 286, 76, edge=4)),
@@ -131,9 +127,7 @@ def coupler_link(lengths: Lengths) -> Body:
     foot = -lengths.upper_arm
     bar = plate("x", 40, 46, [(0, 0, 6.5), (0, foot, 6.5)], 1.5)
     eyes = [disc("x", 39, 47, 12, (0, z), 1.5) for z in (0, foot)]
-    necks = [
-        plate("x", 39.5, 46.5, [(0, z, 10), (0, z + sign * 34, 6.5)], 1.5) for z, sign in ((0, -1), (foot, 1))
-    ]
+    necks = [plate("x", 39.5, 46.5, [(0, z, 10), (0, z + sign * 34, 6.5)], 1.5) for z, sign in ((0, -1), (foot, 1))]
     return fused("aluminium", bar, *eyes, *necks)
 
 

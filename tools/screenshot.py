@@ -52,9 +52,7 @@ def joint_angles(sdf: Path, pose: Sequence[float]) -> dict[str, float]:
     return angles
 
 
-def scene(
-    pose: Sequence[float], camera: Sequence[float], target: Sequence[float], zoom: float, role: Role
-) -> Meshcat:
+def scene(pose: Sequence[float], camera: Sequence[float], target: Sequence[float], zoom: float, role: Role) -> Meshcat:
     """Meshcat that shows the arm at a pose on a light ground."""
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     builder = DiagramBuilder()
@@ -102,20 +100,12 @@ def main() -> None:
     """Read the options and write the picture."""
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path, help="PNG to write")
-    parser.add_argument(
-        "--pose", nargs=7, type=float, default=[0.0] * 7, metavar="q", help="driven joints, rad"
-    )
-    parser.add_argument(
-        "--camera", nargs=3, type=float, default=[1.1, 0.9, 0.35], metavar="m", help="its place"
-    )
-    parser.add_argument(
-        "--target", nargs=3, type=float, default=[0, -0.09, 0.045], metavar="m", help="seen point"
-    )
+    parser.add_argument("--pose", nargs=7, type=float, default=[0.0] * 7, metavar="q", help="driven joints, rad")
+    parser.add_argument("--camera", nargs=3, type=float, default=[1.1, 0.9, 0.35], metavar="m", help="its place")
+    parser.add_argument("--target", nargs=3, type=float, default=[0, -0.09, 0.045], metavar="m", help="seen point")
     parser.add_argument("--zoom", type=float, default=2.8, help="magnification of Meshcat's 75 degree view")
     parser.add_argument("--collision", action="store_true", help="show the collision shapes instead")
-    parser.add_argument(
-        "--size", nargs=2, type=int, default=[1200, 900], metavar="pixels", help="width, height"
-    )
+    parser.add_argument("--size", nargs=2, type=int, default=[1200, 900], metavar="pixels", help="width, height")
     parser.add_argument("--chromium", default=shutil.which("chromium") or "chromium", help="the browser")
     options = parser.parse_args()
     role = Role.kProximity if options.collision else Role.kIllustration

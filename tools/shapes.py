@@ -40,9 +40,7 @@ def across(axis: str, height: float) -> cad.Plane:
     return cad.Plane(origin=tuple(unit * height), x_dir=tuple(np.roll(unit, 1)), z_dir=tuple(unit))
 
 
-def disc(
-    axis: str, low: float, high: float, radius: float, at: Sequence[float] = (0, 0), edge: float = 0
-) -> cad.Part:
+def disc(axis: str, low: float, high: float, radius: float, at: Sequence[float] = (0, 0), edge: float = 0) -> cad.Part:
     """Cylinder between two heights on an axis, its rims rounded by `edge`."""
     align = (cad.Align.CENTER, cad.Align.CENTER, cad.Align.MIN)
     solid = across(axis, low) * cad.Pos(*at) * cad.Cylinder(radius, high - low, align=align)
@@ -75,18 +73,14 @@ def swept(path: cad.Edge | cad.Wire, outward: Point, *sections: tuple[float, flo
         sideways = np.cross(direction, tuple(tangent))
         plane = cad.Plane(origin=where.position, x_dir=tuple(sideways), z_dir=tangent)
         profiles.append(plane * cad.RectangleRounded(width, thickness, corner))
-    return cad.sweep(
-        profiles if len(profiles) > 1 else profiles[0], path=path, multisection=len(profiles) > 1
-    )
+    return cad.sweep(profiles if len(profiles) > 1 else profiles[0], path=path, multisection=len(profiles) > 1)
 
 
 def turn_with(start: cad.Vector, end: cad.Vector, direction: np.ndarray) -> np.ndarray:
     """The direction after the smallest rotation that takes one tangent to the other."""
     a, b = (np.asarray(tuple(vector)) / np.linalg.norm(tuple(vector)) for vector in (start, end))
     normal = np.cross(a, b)
-    return (
-        direction + np.cross(normal, direction) + np.cross(normal, np.cross(normal, direction)) / (1 + a @ b)
-    )
+    return direction + np.cross(normal, direction) + np.cross(normal, np.cross(normal, direction)) / (1 + a @ b)
 
 
 def bolts(

@@ -179,8 +179,7 @@ def _team_array(path: Path, content: bytes, variable: str | None) -> tuple[str, 
     """The chosen variable and its name, always as (8, 2, N)."""
     if content[:8] == _HDF5_MAGIC or content[124:128] in _MATLAB_73:
         raise RecordingError(
-            f"{path}: is a MATLAB v7.3 (HDF5) file, which is not supported; "
-            "load it in MATLAB and save it with '-v7'"
+            f"{path}: is a MATLAB v7.3 (HDF5) file, which is not supported; load it in MATLAB and save it with '-v7'"
         )
     listed = _matlab(path, lambda: scipy.io.whosmat(io.BytesIO(content)))
     found = ", ".join(f"{n} ({' x '.join(map(str, s))} {kind})" for n, s, kind in listed) or "no variables"
@@ -251,24 +250,17 @@ def _read_wpi_csv(path: Path, rate: float, skip_invalid: bool) -> Conversion:
     lines = np.array([line for line, _ in rows])
     kept = values[valid]
     if len(kept) < 2:
-        raise RecordingError(
-            f"{path}: has {len(kept)} valid row{'s' * (len(kept) != 1)}; a motion needs at least 2"
-        )
+        raise RecordingError(f"{path}: has {len(kept)} valid row{'s' * (len(kept) != 1)}; a motion needs at least 2")
     repeats = int(np.sum(np.all(np.diff(kept, axis=0) == 0, axis=1)))
     notes = [
         f"{len(kept)} samples; the file has no time stamps, so t = row / {rate:g} Hz",
-        "in actuator coordinates, which a CSV cannot say: "
-        "pass --coordinates actuator to every command that reads it",
+        "in actuator coordinates, which a CSV cannot say: pass --coordinates actuator to every command that reads it",
     ]
     if len(kept) < len(values):
         skipped = _listed(lines[~valid])
-        notes.append(
-            f"{len(values) - len(kept)} of {len(values)} rows skipped (NaN or infinite): lines {skipped}"
-        )
+        notes.append(f"{len(values) - len(kept)} of {len(values)} rows skipped (NaN or infinite): lines {skipped}")
     if repeats:
-        notes.append(
-            f"{repeats} of {len(kept)} rows repeat the row before them (polled too fast); they are kept"
-        )
+        notes.append(f"{repeats} of {len(kept)} rows repeat the row before them (polled too fast); they are kept")
     q, qd, tau = np.split(kept, 3, axis=1)
     recording = Recording(
         q=q,

@@ -47,7 +47,9 @@ def find_doubts(recording: Recording, arm: Arm) -> list[Doubt]:
     tau = recording.measured_effort()
     doubted = ~usable_measurements(tau.shape, doubts)
     for row, joint in np.argwhere((np.abs(tau) > arm.effort_limits) & ~doubted):
-        reason = f"{arm.joint_names[joint]} effort {tau[row, joint]:.3g} exceeds its limit {arm.effort_limits[joint]:.3g}"
+        reason = (
+            f"{arm.joint_names[joint]} effort {tau[row, joint]:.3g} exceeds its limit {arm.effort_limits[joint]:.3g}"
+        )
         doubts.append(Doubt(int(row), (int(joint),), recording.where(int(row)), reason))
     doubts.sort(key=lambda doubt: doubt.row)
     return doubts

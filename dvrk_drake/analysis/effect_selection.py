@@ -111,7 +111,7 @@ def _largest_base_parameters(model: StaticModel) -> NDArray[np.float64]:
 
 
 @cache
-def _numeric(kind: str):  # noqa: ANN202 - a function of an array
+def _numeric(kind: str):
     q = sympy.Symbol("q")
     function = sympy.lambdify(q, EFFECT_KINDS[kind](q), modules="numpy")
     return lambda values: np.broadcast_to(function(values), values.shape)

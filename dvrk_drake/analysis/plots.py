@@ -25,7 +25,11 @@ def _labels(names: tuple[str, ...]) -> list[str]:
 
 
 def plot_torque_error(
-    path: Path, names: tuple[str, ...], rms_zero: NDArray[np.float64], rms_model: dict[str, NDArray[np.float64]], title: str
+    path: Path,
+    names: tuple[str, ...],
+    rms_zero: NDArray[np.float64],
+    rms_model: dict[str, NDArray[np.float64]],
+    title: str,
 ) -> None:
     """Bars of RMS torque error per joint (n,) [N m]: zero torque beside each model; logarithmic, joints differ by decades."""
     figure, axes = plt.subplots(figsize=(11, 5), layout="constrained")
@@ -51,7 +55,9 @@ def plot_measured_against_predicted(path: Path, model: IdentifiedModel, recordin
     measured, predicted = recording.measured_effort(), model.holding_torque(recording.q)
     figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained")
     for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
-        span = np.array([min(measured[:, j].min(), predicted[:, j].min()), max(measured[:, j].max(), predicted[:, j].max())])
+        span = np.array(
+            [min(measured[:, j].min(), predicted[:, j].min()), max(measured[:, j].max(), predicted[:, j].max())]
+        )
         ax.plot(span, span, color="black", linewidth=0.8, label="measured = predicted")
         ax.plot(measured[:, j], predicted[:, j], ".", color=MODEL_COLOUR, label="one pose")
         ax.set_title(f"J{j + 1} {name}", fontsize=10)

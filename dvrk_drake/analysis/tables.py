@@ -31,7 +31,9 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
     )
     table = _table("Base parameters [kg m]", "", "value", "standard error", "|value| < 2 se")
     for p in model.base_parameters:
-        table.add_row(escape(p.name), f"{p.value:+.5f}", f"{p.standard_error:.5f}", "" if p.distinguishable else "zero?")
+        table.add_row(
+            escape(p.name), f"{p.value:+.5f}", f"{p.standard_error:.5f}", "" if p.distinguishable else "zero?"
+        )
     console.print(table)
     if model.joint_effects:
         table = _table("Joint effects [N m; N if prismatic]", "", "value", "standard error", "|value| < 2 se")
@@ -55,7 +57,9 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
         cover = f"{j.position_lower:+.2f}..{j.position_upper:+.2f} ({100 * j.coverage:.0f} %)"
         table.add_row(name, *(f"{e:.4f}" for e in errors), str(j.num_doubted), f"{j.trust:.2f}", cover)
     console.print(table)
-    console.print("* each tenth of the poses predicted from the rest, joint effects and trust chosen anew\n", style="dim")
+    console.print(
+        "* each tenth of the poses predicted from the rest, joint effects and trust chosen anew\n", style="dim"
+    )
     if any(j.num_doubted for j in model.joints):
         table = _table("The same with the doubted measurements", "", "zero torque", "fit", "leave-one-out")
         for j in model.joints:

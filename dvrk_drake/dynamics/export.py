@@ -28,11 +28,7 @@ def to_latex(gravity: SymbolicGravity) -> str:
         r"\begin{align*}",
     ]
     for j in range(Y.rows):
-        terms = [
-            rf"\beta_{{{k + 1}}} {_factor(Y[j, k] / GRAVITY)}"
-            for k in range(Y.cols)
-            if Y[j, k] != 0
-        ]
+        terms = [rf"\beta_{{{k + 1}}} {_factor(Y[j, k] / GRAVITY)}" for k in range(Y.cols) if Y[j, k] != 0]
         lines.append(rf"\tau_{{{j + 1}}} &= " + (rf"g \left({' + '.join(terms)}\right) \\" if terms else r"0 \\"))
     lines.append(r"\end{align*}")
     lines.append(r"\begin{align*}")
@@ -67,7 +63,9 @@ def to_c(gravity: SymbolicGravity) -> str:
         f" * size of gravity, beta [kg m] the base parameters; nominal values:\n{table}\n */\n"
     )
     body = codegen.c_source(f"{prefix}_gravity_torque", [*arguments, beta_argument], torque)
-    body += "\n" + codegen.c_source(f"{prefix}_gravity_regressor", arguments, regressor).replace("#include <math.h>\n\n", "")
+    body += "\n" + codegen.c_source(f"{prefix}_gravity_regressor", arguments, regressor).replace(
+        "#include <math.h>\n\n", ""
+    )
     return header + body
 
 

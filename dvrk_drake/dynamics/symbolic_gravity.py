@@ -107,10 +107,15 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
             values += [mass, *(R_BF.T @ (moment_B - mass * X_BF.translation()))]
 
     for index in plant.GetBodyIndices(_arm_instance(plant)):
-        if not any(index == body.index() for body, _ in labels.values()) and not numeric.IsAnchored(numeric.get_body(index)):
+        if not any(index == body.index() for body, _ in labels.values()) and not numeric.IsAnchored(
+            numeric.get_body(index)
+        ):
             # A rotor: counted with its link, see _mass_and_moment. Mass 0 would divide by zero in newer versions of Drake.
             M_rotor = SpatialInertia_[symbolic.Expression](
-                symbolic.Variable("m_rotor"), [0, 0, 0], UnitInertia_[symbolic.Expression](1, 1, 1), skip_validity_check=True
+                symbolic.Variable("m_rotor"),
+                [0, 0, 0],
+                UnitInertia_[symbolic.Expression](1, 1, 1),
+                skip_validity_check=True,
             )
             plant.get_body(index).SetSpatialInertiaInBodyFrame(context, M_rotor)
     P = plant.CalcPotentialEnergy(context)
@@ -136,7 +141,9 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
     chosen = standard.extract(list(range(arm.num_joints)), list(base.columns))
     parallel = _parallel_pairs(numeric, arm)
     regressor = chosen.applyfunc(lambda e: GRAVITY * simplify_trigonometry(e, symbols, parallel))
-    return SymbolicGravity(arm, symbols, tuple(parameters), np.array(values), base, sympy.ImmutableDenseMatrix(regressor))
+    return SymbolicGravity(
+        arm, symbols, tuple(parameters), np.array(values), base, sympy.ImmutableDenseMatrix(regressor)
+    )
 
 
 def _exact(R: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -147,8 +154,7 @@ def _exact(R: NDArray[np.float64]) -> NDArray[np.float64]:
 def _tree_positions(arm: Arm, q: list[symbolic.Variable]) -> list[symbolic.Expression]:
     G, c = arm.linkage.matrix, arm.linkage.offset
     return [
-        sum((G[row, j] * q[j] for j in np.flatnonzero(G[row])), symbolic.Expression(c[row]))
-        for row in range(len(c))
+        sum((G[row, j] * q[j] for j in np.flatnonzero(G[row])), symbolic.Expression(c[row])) for row in range(len(c))
     ]
 
 
@@ -219,6 +225,7 @@ def _named_lengths(plant: MultibodyPlant, frames: str, labels: dict) -> dict[str
 
 def _readable_preference(parameters: list[StandardParameter]) -> list[int]:
     """First moments of numbered links from the hand inward, then those of the linkage, masses last."""
+
     def key(index: int) -> tuple:
         p = parameters[index]
         number = int(p.label) if p.label.isdigit() else 0
@@ -233,9 +240,11 @@ def _evaluate_at_random_poses(
     poses = np.random.default_rng(0).uniform(-2, 2, (columns.shape[1] + 10, arm.num_joints))
     function = sympy.lambdify(symbols, columns.T.tolist(), modules="numpy", cse=True)
     values = function(*poses.T)
-    return np.array([[np.broadcast_to(e, len(poses)) for e in column] for column in values]).reshape(
-        columns.shape[1], -1
-    ).T
+    return (
+        np.array([[np.broadcast_to(e, len(poses)) for e in column] for column in values])
+        .reshape(columns.shape[1], -1)
+        .T
+    )
 
 
 def _parallel_pairs(plant: MultibodyPlant, arm: Arm) -> list[tuple[int, int]]:

@@ -20,9 +20,7 @@ def simplify_trigonometry(
     c = [sympy.Symbol(f"c{i}") for i in range(len(q))]
     whole = {x: sympy.Integer(int(x)) for x in expression.atoms(sympy.Float) if float(x).is_integer()}
     result = expression.xreplace(whole)
-    names = {sympy.sin(x): y for x, y in zip(q, s, strict=True)} | {
-        sympy.cos(x): y for x, y in zip(q, c, strict=True)
-    }
+    names = {sympy.sin(x): y for x, y in zip(q, s, strict=True)} | {sympy.cos(x): y for x, y in zip(q, c, strict=True)}
     result = sympy.expand(result.xreplace(names))
     back: dict[sympy.Symbol, sympy.Expr] = dict(zip([*s, *c], [*map(sympy.sin, q), *map(sympy.cos, q)], strict=True))
     for i, j in parallel:

@@ -75,9 +75,7 @@ class Arm:
         bad = np.flatnonzero((value < lower - tolerance) | (value > upper + tolerance))
         return [f"{names[i]} = {value[i]:.4g} is outside {lower[i]:.4g}..{upper[i]:.4g}" for i in bad]
 
-    def sample_poses(
-        self, count: int, generator: np.random.Generator, margin: float = 0.0
-    ) -> NDArray[np.float64]:
+    def sample_poses(self, count: int, generator: np.random.Generator, margin: float = 0.0) -> NDArray[np.float64]:
         """`count` random poses (count, n), uniform in the joint box and inside the coupled limits.
 
         Args:

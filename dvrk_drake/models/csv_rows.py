@@ -39,9 +39,7 @@ def read_rows(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise RecordingError(
-            f"{path}: not a CSV text file in UTF-8: {error.reason} at byte {error.start}"
-        ) from error
+        raise RecordingError(f"{path}: not a CSV text file in UTF-8: {error.reason} at byte {error.start}") from error
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: list[tuple[int, list[str]]] = []
     try:

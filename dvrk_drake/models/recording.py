@@ -121,9 +121,7 @@ def read_recording(path: str | Path, num_joints: int = 7, coordinates: Coordinat
         RecordingError: names the file, the line and the column of what is wrong.
     """
     if coordinates not in get_args(Coordinates):
-        raise RecordingError(
-            f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}'
-        )
+        raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
     path = Path(path)
     numbered, sha256 = read_rows(path)
     if not numbered:
@@ -160,9 +158,7 @@ def read_recording(path: str | Path, num_joints: int = 7, coordinates: Coordinat
     values = np.empty((len(numbered) - 1, len(header)))
     for row, (line, cells) in enumerate(numbered[1:]):
         if len(cells) != len(header):
-            raise RecordingError(
-                f"{path}:{line}: has {len(cells)} cells, the header names {len(header)} columns"
-            )
+            raise RecordingError(f"{path}:{line}: has {len(cells)} cells, the header names {len(header)} columns")
         for column in wanted:
             values[row, column] = parse_finite(cells[column], f"{path}:{line}: {header[column]}")
     return Recording(
