@@ -65,7 +65,7 @@ def _identify(options: argparse.Namespace) -> None:
     arm = _mounted(load_arm(options.arm), options.gravity)
     recording = read_recording(options.recording, arm.num_joints, options.coordinates)
     _check_folder(options.output)
-    with _progress("identifying") as (progress, task):
+    with _ProgressBar("identifying") as (progress, task):
         result = identify_static(
             recording, arm, options.method, lambda share: progress.update(task, completed=100 * share)
         )
@@ -233,7 +233,7 @@ def _made_folder(path: str) -> Path:
     return Path(path)
 
 
-class _progress:
+class _ProgressBar:
     """A progress bar of 0..100 on stderr, gone when the work is done; silent where stderr is no terminal."""
 
     def __init__(self, what: str):

@@ -112,7 +112,7 @@ def test_inertias_are_possible_and_centres_of_mass_are_not_at_the_joints(plant):
 
 
 def test_motor_4_couples_elbow_and_platform(arm, plant):
-    """Rotor 4 turns with 0.6697 q3 + q4: its inertia about its axis enters G' M G as J_4' I J_4, off-diagonal included."""
+    """Rotor 4 turns with 0.6697 q3 + q4: its inertia enters G' M G as J_4' I J_4, off-diagonal included."""
     context = plant.CreateDefaultContext()
     G = np.zeros((plant.num_velocities(), 7))
     G[tree_selector(plant, arm)] = arm.linkage.matrix
@@ -122,14 +122,14 @@ def test_motor_4_couples_elbow_and_platform(arm, plant):
         set_arm_positions(plant, context, arm, q)
         full = G.T @ plant.CalcMassMatrix(context) @ G
         M = body.default_spatial_inertia()
-        I = M.CalcRotationalInertia().CopyToFullMatrix3()
-        less = SpatialInertia(M.get_mass(), M.get_com(), UnitInertia(*np.diag(I / M.get_mass()) * [1, 1, 0.5]))
+        I_Bo = M.CalcRotationalInertia().CopyToFullMatrix3()
+        less = SpatialInertia(M.get_mass(), M.get_com(), UnitInertia(*np.diag(I_Bo / M.get_mass()) * [1, 1, 0.5]))
         body.SetSpatialInertiaInBodyFrame(context, less)
         difference = full - G.T @ plant.CalcMassMatrix(context) @ G
         J_4 = arm.transmission.matrix[3]
-        np.testing.assert_allclose(difference[1:4, 1:4], 0.5 * I[2, 2] * np.outer(J_4, J_4)[1:4, 1:4], atol=1e-15)
+        np.testing.assert_allclose(difference[1:4, 1:4], 0.5 * I_Bo[2, 2] * np.outer(J_4, J_4)[1:4, 1:4], atol=1e-15)
         assert np.linalg.eigvalsh(full).min() > 0
-    assert I[2, 2] == pytest.approx(10.53**2 * 1e-6, rel=1e-4)
+    assert I_Bo[2, 2] == pytest.approx(10.53**2 * 1e-6, rel=1e-4)
 
 
 def test_holding_torque_is_the_gradient_of_potential_energy(arm, plant):

@@ -16,14 +16,14 @@ from dvrk_drake.models.arm import Arm
 
 #: Prior standard deviation of a base parameter, as a share of what would use up some joint's effort limit by itself.
 BASE_PRIOR = 0.25
-#: Prior standard deviation of a joint effect, as a share of the joint's effort limit. Offsets are kept small: over a narrow
-#: range a large one would take the place of gravity, and mislead outside of it.
+#: Prior standard deviation of a joint effect, as a share of the joint's effort limit. Offsets are kept small: over a
+#: narrow range a large one would take the place of gravity, and mislead outside of it.
 EFFECT_PRIOR = {"offset": 0.03, "spring": 0.3}
 #: Least standard deviation of a torque measurement, as a share of the effort limit.
 SIGMA_FLOOR = 2e-3
-#: An effect must lower the sum of squared left-out residuals (in sigma) by this much a coefficient: about log(poses), BIC's.
+#: An effect must lower the sum of squared left-out residuals (in sigma) by this much a coefficient: about log(poses).
 LEAST_GAIN = 4.0
-#: A position-dependent effect is considered if the joint moved by this much [rad or m]; else it would only fit servo error.
+#: A position-dependent effect is considered if the joint moved by this much [rad or m]; else it would fit servo error.
 LEAST_SPAN = 0.25
 
 
@@ -68,8 +68,8 @@ class StaticProblem:
 def select_effects(problem: StaticProblem) -> tuple[JointEffect, ...]:
     """Adds the effect (or all of one joint's) that lowers the leave-one-out error most, until none clearly does.
 
-    "Clearly": by more than `LEAST_GAIN` per coefficient and by more than the gain's own standard error over poses. Squared
-    errors are capped at nine variances so that no single pose decides.
+    "Clearly": by more than `LEAST_GAIN` per coefficient and by more than the gain's own standard error over poses.
+    Squared errors are capped at nine variances so that no single pose decides.
     """
     chosen: tuple[JointEffect, ...] = ()
     current = problem.fit(chosen)

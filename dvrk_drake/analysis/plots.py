@@ -31,7 +31,7 @@ def plot_torque_error(
     rms_model: dict[str, NDArray[np.float64]],
     title: str,
 ) -> None:
-    """Bars of RMS torque error per joint (n,) [N m]: zero torque beside each model; logarithmic, joints differ by decades."""
+    """Bars of RMS torque error per joint (n,) [N m], zero torque beside each model; logarithmic: joints differ by decades."""
     figure, axes = plt.subplots(figsize=(11, 5), layout="constrained")
     bars = {"zero torque": rms_zero, **rms_model}
     colours = [ZERO_COLOUR, MODEL_COLOUR, MEASURED_COLOUR, "#edae49"]
@@ -82,7 +82,7 @@ def plot_identification(folder: Path, result: StaticIdentification, recording: R
             "leave-one-out": np.array([j.rms_leave_one_out_undoubted for j in joints]),
             "ten-fold, effects chosen anew": np.array([j.rms_cross_validation_undoubted for j in joints]),
         },
-        f"{result.model.arm.upper()}: poses not used for fitting ({Path(recording.source).name}, doubted ones left out)",
+        f"{result.model.arm.upper()}: poses not used for fitting ({Path(recording.source).name}, without doubted ones)",
     )
     plot_measured_against_predicted(folder / "predicted.png", result.model, recording)
 

@@ -1,4 +1,4 @@
-"""Parameters of the static model from recorded poses and holding torques (paper, III.I, and a method that goes further)."""
+"""Parameters of the static model from recorded poses and holding torques (paper, III.I, and further)."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def _check_poses(recording: Recording) -> None:
 def _trust(
     tau: NDArray[np.float64], left_out: NDArray[np.float64], usable: NDArray[np.bool_], arm: Arm
 ) -> NDArray[np.float64]:
-    """(n,) the scale of each joint's torque that leave-one-out supports: 1 unless it does no better than zero torque."""
+    """(n,) scale of each joint's torque that leave-one-out supports: 1 unless it is no better than zero torque."""
     trust = np.ones(arm.num_joints)
     for j in range(arm.num_joints):
         measured, predicted = tau[usable[:, j], j], (tau - left_out)[usable[:, j], j]
@@ -162,7 +162,7 @@ def _trust(
 
 
 def _cross_validate(problem: StaticProblem, progress: Callable[[float], None]) -> NDArray[np.float64]:
-    """(m, n) residuals of ten-fold cross-validation in which the effects and the trust are chosen anew in every fold."""
+    """(m, n) residuals of ten-fold cross-validation, effects and trust chosen anew in every fold."""
     poses = len(problem.q)
     folds = np.random.default_rng(0).permutation(poses) % min(FOLDS, poses)
     residuals = np.empty_like(problem.tau)

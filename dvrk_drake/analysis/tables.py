@@ -17,7 +17,7 @@ TABLE_WIDTH = 112
 
 
 def make_console() -> Console:
-    """A console on stdout at least as wide as the tables are: a narrow terminal wraps them rather than losing digits."""
+    """A console on stdout at least as wide as the tables: a narrow terminal wraps them rather than losing digits."""
     console = Console(highlight=False)
     return console if console.width >= TABLE_WIDTH else Console(highlight=False, width=TABLE_WIDTH)
 
@@ -69,8 +69,8 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
     for j in model.joints:
         if j.trust == 0.0:
             console.print(
-                f"{j.name}: no torque will be commanded; what was measured is too small, or too well explained by zero, "
-                "to tell gravity from friction",
+                f"{j.name}: no torque will be commanded; what was measured is too small, or too well explained by "
+                "zero, to tell gravity from friction",
                 style="yellow",
                 soft_wrap=True,
             )

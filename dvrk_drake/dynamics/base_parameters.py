@@ -1,4 +1,4 @@
-"""Base parameters: the smallest set of combinations of link parameters that a regressor can tell apart, readably named."""
+"""Base parameters: the combinations of link parameters that a regressor can tell apart, readably named."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ def to_latex(gravity: SymbolicGravity) -> str:
     Y = sympy.Matrix(gravity.regressor).xreplace(short)
     name = gravity.arm.name
     lines = [
-        f"% {name}: torque that holds the arm against gravity, tau = Y(q) beta, |g| = {gravity.gravity_magnitude:g} m/s^2.",
+        f"% {name}: torque that holds it against gravity, tau = Y(q) beta, |g| = {gravity.gravity_magnitude:g} m/s^2.",
         "% s_i = sin q_i, c_i = cos q_i, s_{ij} = sin(q_i + q_j); beta in kg m, m_i c_i in link frame i.",
         r"\begin{align*}",
         *(
@@ -43,9 +43,10 @@ def to_python(gravity: SymbolicGravity) -> str:
     names = "".join(f"    ({value!r}, {name!r}),\n" for name, value in _named_values(gravity))
     return (
         f'"""{gravity.arm.name}: torque that holds the arm against gravity, tau = Y(q) beta [N m; N if prismatic].\n\n'
-        "Made by dvrk-drake from its Drake model. q [rad; m if prismatic] in the dVRK's order and signs, g [m/s^2] the size of\n"
-        'gravity, beta [kg m] the base parameters below; out is filled: out[j], or out[j, k] for the regressor (numpy).\n"""\n\n'
-        f"import math\n\n#: (value of the nominal model [kg m], meaning) of each base parameter.\nBASE_PARAMETERS = [\n{names}]\n\n\n"
+        "Made by dvrk-drake from its Drake model. q [rad; m if prismatic] in the dVRK's order and signs, g [m/s^2]\n"
+        "the size of gravity, beta [kg m] the base parameters below; out is filled: out[j], or out[j, k] for the\n"
+        'regressor (numpy).\n"""\n\nimport math\n\n'
+        f"#: (nominal value [kg m], meaning) of each base parameter.\nBASE_PARAMETERS = [\n{names}]\n\n\n"
         + codegen.python_source("gravity_torque", [*arguments, beta_argument], torque, "Fills out (n) with Y(q) beta.")
         + "\n\n"
         + codegen.python_source("gravity_regressor", arguments, regressor, "Fills out (n, b) with Y(q).")
@@ -59,8 +60,8 @@ def to_c(gravity: SymbolicGravity) -> str:
     table = "\n".join(f" *   beta[{i}] = {v!r}: {name}" for i, (name, v) in enumerate(_named_values(gravity)))
     header = (
         f"/* {gravity.arm.name}: torque that holds the arm against gravity, tau = Y(q) beta [N m; N if prismatic].\n"
-        " * Made by dvrk-drake from its Drake model. q [rad; m if prismatic] in the dVRK's order and signs, g [m/s^2] the\n"
-        f" * size of gravity, beta [kg m] the base parameters; nominal values:\n{table}\n */\n"
+        " * Made by dvrk-drake from its Drake model. q [rad; m if prismatic] in the dVRK's order and signs, g [m/s^2]\n"
+        f" * the size of gravity, beta [kg m] the base parameters; nominal values:\n{table}\n */\n"
     )
     body = codegen.c_source(f"{prefix}_gravity_torque", [*arguments, beta_argument], torque)
     body += "\n" + codegen.c_source(f"{prefix}_gravity_regressor", arguments, regressor).replace(

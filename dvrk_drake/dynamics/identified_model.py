@@ -42,11 +42,11 @@ class EffectEstimate:
 class JointStatistics:
     """How one joint was fitted. Torques are RMS in N m (N if prismatic), angles in rad (m).
 
-    `rms_zero_torque` is the error of commanding nothing: the RMS of the measured torque. `rms_leave_one_out` predicts each
-    pose from all others; `rms_cross_validation` chooses the effects anew as well (ten folds). `_undoubted` leaves out the
-    measurements that were doubted (`num_doubted` of them). `trust` scales the joint's torque: 1, or less where the data
-    do not support the model. `position_lower`, `position_upper`: the range that the poses covered; `coverage`: its share
-    of the arm's range.
+    `rms_zero_torque` is the error of commanding nothing: the RMS of the measured torque. `rms_leave_one_out` predicts
+    each pose from all others; `rms_cross_validation` chooses the effects anew as well (ten folds). `_undoubted` leaves
+    out the measurements that were doubted (`num_doubted` of them). `trust` scales the joint's torque: 1, or less where
+    the data do not support the model. `position_lower`, `position_upper`: the range that the poses covered;
+    `coverage`: its share of the arm's range.
     """
 
     name: str = ""

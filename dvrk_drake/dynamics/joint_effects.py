@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import sympy
 
-#: kind -> torque per unit of coefficient as a function of the joint's own position. Bounded on purpose: a polynomial that
-#: fits a narrow sweep runs away outside of it.
+#: kind -> torque per unit of coefficient as a function of the joint's own position. Bounded on purpose: a polynomial
+#: that fits a narrow sweep runs away outside of it.
 EFFECT_KINDS: dict[str, Callable[[sympy.Symbol], sympy.Expr]] = {
     "offset": lambda q: sympy.Integer(1),  # constant: cable preload, current offset [N m]
-    "spring": lambda q: sympy.sin(q),  # spring or cable hooked on off the axis, slack at zero [N m]
+    "spring": sympy.sin,  # spring or cable hooked on off the axis, slack at zero [N m]
 }
 
 

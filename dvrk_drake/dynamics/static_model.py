@@ -25,7 +25,7 @@ class StaticModel:
     Attributes:
         gravity: the symbolic derivation.
         effects: the joint effects, in the order of theta.
-        torque_into: compiled f(q, theta, out), float64 C-contiguous (n,), (b + e,), (n,); no allocation, for control loops.
+        torque_into: compiled f(q, theta, out), float64 C-contiguous (n,), (b + e,), (n,); for control loops.
     """
 
     gravity: SymbolicGravity

@@ -1,4 +1,4 @@
-"""Gravity torque and its regressor, derived symbolically from the arm's own MultibodyPlant (paper, III.B-D and III.H)."""
+"""Gravity torque and its regressor, derived symbolically from the arm's own MultibodyPlant (paper, III.B-D, H)."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
     """Derives the gravity torque of `arm` from its plant.
 
     The plant gives its potential energy P(q, m, c) with every link's mass m and centre of mass c as symbols
-    (`MultibodyPlant.CalcPotentialEnergy` on `ToSymbolic()`); tau = G' dP/dq_tree falls out by making the tree a function
-    of the independent joints first. P is linear in m and m c, so the columns of the regressor are its derivatives.
+    (`MultibodyPlant.CalcPotentialEnergy` on `ToSymbolic()`); tau = G' dP/dq_tree falls out by making the tree a
+    function of the independent joints first. P is linear in m and m c, so the columns of the regressor are its derivatives.
 
     Args:
         arm: the arm; its gravity vector sets the mounting.
@@ -110,7 +110,7 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
         if not any(index == body.index() for body, _ in labels.values()) and not numeric.IsAnchored(
             numeric.get_body(index)
         ):
-            # A rotor: counted with its link, see _mass_and_moment. Mass 0 would divide by zero in newer versions of Drake.
+            # A rotor: counted with its link (_mass_and_moment). Mass 0 would divide by zero in newer Drake.
             M_rotor = SpatialInertia_[symbolic.Expression](
                 symbolic.Variable("m_rotor"),
                 [0, 0, 0],

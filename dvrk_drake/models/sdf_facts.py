@@ -1,4 +1,4 @@
-"""The few facts of an SDF that Drake parses but does not give back: mimic tags, and what has to be known before parsing."""
+"""The few facts of an SDF that Drake parses but does not give back, or that are needed before parsing."""
 
 from __future__ import annotations
 
