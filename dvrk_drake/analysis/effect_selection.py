@@ -76,11 +76,12 @@ def select_effects(problem: StaticProblem) -> tuple[JointEffect, ...]:
     span = np.ptp(problem.q, axis=0)
     while True:
         loss = _loss(problem, current, current.sigma)
-        best_gain, best = 0.0, ()
+        best_gain = 0.0
+        best: tuple[JointEffect, ...] = ()
         for joint, name in enumerate(problem.arm.joint_names):
             kinds = [k for k in EFFECT_KINDS if k == "offset" or span[joint] >= LEAST_SPAN]
             new = [e for e in (JointEffect(name, k) for k in kinds) if e not in chosen]
-            candidates = [(e,) for e in new] + ([tuple(new)] if len(new) > 1 else [])
+            candidates: list[tuple[JointEffect, ...]] = [(e,) for e in new] + ([tuple(new)] if len(new) > 1 else [])
             for candidate in candidates:
                 trial = problem.fit((*chosen, *candidate), iterations=3, start=current.sigma)
                 gains = loss - _loss(problem, trial, current.sigma)

@@ -31,7 +31,7 @@ def plot_torque_error(
     rms_model: dict[str, NDArray[np.float64]],
     title: str,
 ) -> None:
-    """Bars of RMS torque error per joint (n,) [N m], zero torque beside each model; logarithmic: joints differ by decades."""
+    """RMS torque error per joint (n,) [N m], zero torque beside each model; log scale, as joints differ by decades."""
     figure, axes = plt.subplots(figsize=(11, 5), layout="constrained")
     bars = {"zero torque": rms_zero, **rms_model}
     colours = [ZERO_COLOUR, MODEL_COLOUR, MEASURED_COLOUR, "#edae49"]

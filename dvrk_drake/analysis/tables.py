@@ -63,7 +63,7 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
     if any(j.num_doubted for j in model.joints):
         table = _table("The same with the doubted measurements", "", "zero torque", "fit", "leave-one-out")
         for j in model.joints:
-            errors = (j.rms_zero_torque, j.rms_fit, j.rms_leave_one_out)
+            errors = [j.rms_zero_torque, j.rms_fit, j.rms_leave_one_out]
             table.add_row(j.name, *(f"{e:.4f}" for e in errors))
         console.print(table)
     for j in model.joints:

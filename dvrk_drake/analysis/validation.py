@@ -18,7 +18,7 @@ class JointError:
     """One joint's error over a recording: RMS in N m (N if prismatic) in the coordinates that the recording is in.
 
     `rms_torque` is what commanding zero torque would err by; `relative_error` = rms_error / rms_torque. `_undoubted`
-    leaves out `num_doubted` measurements of poses that rest on a stop or exceed the effort limit (joint coordinates only).
+    leaves out `num_doubted` measurements of poses that rest on a stop or exceed the effort limit.
     """
 
     name: str

@@ -71,8 +71,8 @@ def reduce_to_base(
             columns.append(column)
             basis = np.column_stack([basis, residual / norm])
     columns.sort()
-    combination = np.linalg.lstsq(regressor[:, columns], regressor, rcond=None)[0]
-    combination = _snap(combination, lengths)
+    solution = np.linalg.lstsq(regressor[:, columns], regressor, rcond=None)[0]
+    combination = _snap(np.asarray(solution, dtype=np.float64), lengths)
     names = tuple(_readable(row, parameters, lengths) for row in combination)
     return BaseParameters(tuple(columns), combination, names)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -79,7 +80,7 @@ def compile_function(
     name: str, arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms
 ) -> Callable[..., None]:
     """The function of `python_source`, compiled with numba for float64; vectors and `out` must be C-contiguous."""
-    namespace: dict[str, object] = {"math": math}
+    namespace: dict[str, Any] = {"math": math}
     exec(python_source(name, arguments, terms), namespace)
     kinds = [numba.float64 if _is_scalar(n, s) else numba.float64[::1] for n, s in arguments]
     out = (numba.float64[::1], numba.float64[:, ::1])[len(terms.shape) - 1]
@@ -99,7 +100,7 @@ def compile_batch(function: Callable[..., None], num_arguments: int, shape: tupl
         "    for i in range(rows.shape[0]):\n"
         f"        function({call})\n"
     )
-    namespace: dict[str, object] = {"function": function}
+    namespace: dict[str, Any] = {"function": function}
     exec(source, namespace)
     loop = numba.njit(namespace["batch"])
 

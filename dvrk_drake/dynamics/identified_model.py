@@ -155,7 +155,7 @@ class IdentifiedModel:
     @property
     def theta(self) -> NDArray[np.float64]:
         """(b + e,) base parameters, then coefficients of the joint effects, as `StaticModel` wants them."""
-        return np.array([p.value for p in [*self.base_parameters, *self.joint_effects]])
+        return np.array([p.value for p in self.base_parameters] + [e.value for e in self.joint_effects])
 
     @property
     def trust(self) -> NDArray[np.float64]:

@@ -59,7 +59,7 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
 
     The plant gives its potential energy P(q, m, c) with every link's mass m and centre of mass c as symbols
     (`MultibodyPlant.CalcPotentialEnergy` on `ToSymbolic()`); tau = G' dP/dq_tree falls out by making the tree a
-    function of the independent joints first. P is linear in m and m c, so the columns of the regressor are its derivatives.
+    function of the independent joints first. P is linear in m and m c: the regressor's columns are its derivatives.
 
     Args:
         arm: the arm; its gravity vector sets the mounting.
@@ -256,6 +256,6 @@ def _parallel_pairs(plant: MultibodyPlant, arm: Arm) -> list[tuple[int, int]]:
         a, b = joints[i], joints[i + 1]
         if a.type_name() == b.type_name() == "revolute" and b.parent_body() == a.child_body():
             axes = [j.frame_on_parent().CalcPoseInWorld(context).rotation() @ j.revolute_axis() for j in (a, b)]
-            if np.allclose(*axes, atol=1e-12):
+            if np.allclose(axes[0], axes[1], atol=1e-12):
                 pairs.append((i, i + 1))
     return pairs

@@ -142,8 +142,8 @@ def _build_arm(path: Path, description: ArmDescription, mechanism: Mechanism) ->
         if len(values) != len(joints):
             raise ArmError(f"{path}: gains.{which} has {len(values)} numbers, one a joint is {len(joints)}")
     J = np.eye(len(joints))
-    for actuator, row in mechanism.transmission.items():
-        J[joints.index(actuator)] = [row.get(j, 0.0) for j in joints]
+    for actuator, terms in mechanism.transmission.items():
+        J[joints.index(actuator)] = [terms.get(j, 0.0) for j in joints]
     G = np.zeros((len(facts.joint_names), len(joints)))
     c = np.zeros(len(facts.joint_names))
     for row, name in enumerate(facts.joint_names):

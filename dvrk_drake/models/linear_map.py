@@ -38,5 +38,5 @@ class LinearMap:
         Raises:
             numpy.linalg.LinAlgError: if the matrix is singular or not square.
         """
-        matrix = np.linalg.inv(self.matrix)
+        matrix = np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
         return LinearMap(matrix, -matrix @ self.offset)

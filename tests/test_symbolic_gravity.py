@@ -1,0 +1,221 @@
+"""The symbolic gravity torque against the paper's regressor, the dVRK's mapping and the numeric plant."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
+
+#: Section III.H of the paper, in its own order.
+PAPER_PARAMETERS = {
+    "L2 (m2+...+m7) + m2 c2x",
+    "m2 c2y",
+    "L3 (m3+...+m7) + m3 c3x",
+    "-L4 (m4+...+m7) - m3 c3z + m4 c4y",
+    "m5 c5z + m6 c6y",
+    "m6 c6z + m7 c7z",
+    "m4 c4x",
+    "-m4 c4z + m5 c5y",
+    "m5 c5x",
+    "m6 c6x",
+    "m7 c7x",
+    "m7 c7y",
+}
+
+
+def paper_regressor(q, g=9.81):
+    """The 7 x 12 regressor of the paper (facts/paper.md section 2), columns in the paper's order."""
+    s2, s4, s5, s6, s7 = np.sin(q[[1, 3, 4, 5, 6]])
+    c2, c4, c5, c6, c7 = np.cos(q[[1, 3, 4, 5, 6]])
+    S, C = np.sin(q[1] + q[2]), np.cos(q[1] + q[2])
+    B, A = C * s5 + S * c4 * c5, C * c5 - S * c4 * s5
+    D, F = S * s4 * c6 + B * s6, B * c6 - S * s4 * s6
+    w = [
+        C,
+        S,
+        -(C * c4 * s5 + S * c5),
+        C * (c4 * c5 * c6 - s4 * s6) - S * s5 * c6,
+        C * c4,
+        C * s4,
+        S * s5 - C * c4 * c5,
+        S * s5 * s6 - C * (s4 * c6 + c4 * c5 * s6),
+        S * (c5 * s7 + s5 * s6 * c7) + C * (c4 * s5 * s7 - s4 * c6 * c7 - c4 * c5 * s6 * c7),
+        S * (s5 * s6 * s7 - c5 * c7) - C * (c4 * s5 * c7 + s4 * c6 * s7 + c4 * c5 * s6 * s7),
+    ]
+    Y = np.zeros((7, 12))
+    Y[1] = [s2, -c2, *w]
+    Y[2, 2:] = w
+    Y[3, 4:] = S * np.array(
+        [
+            s4 * s5,
+            -(c4 * s6 + c5 * c6 * s4),
+            -s4,
+            c4,
+            c5 * s4,
+            -(c4 * c6 - c5 * s4 * s6),
+            -(s4 * s5 * s7 + c4 * c6 * c7 - c5 * c7 * s4 * s6),
+            c7 * s4 * s5 - c4 * c6 * s7 + c5 * s4 * s6 * s7,
+        ]
+    )
+    Y[4, [4, 5, 8, 9, 10, 11]] = [-B, c6 * A, -A, -s6 * A, s7 * B - c7 * s6 * A, -(c7 * B + s6 * s7 * A)]
+    Y[5, [5, 9, 10, 11]] = [-D, -F, -c7 * F, -s7 * F]
+    Y[6, [10, 11]] = [s7 * D - c7 * A, -(s7 * A + c7 * D)]
+    return g * Y
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return load_arm("mtmr")
+
+
+@pytest.fixture(scope="module")
+def random_q():
+    return np.random.default_rng(3).uniform(-np.pi, np.pi, (40, 7))
+
+
+def evaluate(gravity, q):
+    """The symbolic regressor by sympy's own evaluation, independent of our code generator."""
+    import sympy
+
+    from dvrk_drake.dynamics.symbolic_gravity import GRAVITY
+
+    function = sympy.lambdify([*gravity.q, GRAVITY], gravity.regressor, modules="numpy")
+    return np.array([np.array(function(*pose, 9.81), dtype=float) for pose in q])
+
+
+def test_serial_arm_has_exactly_the_papers_parameters_and_regressor(arm, random_q):
+    gravity = derive_gravity(arm, "paper", serial=True)
+    assert set(gravity.base.names) == PAPER_PARAMETERS
+    ours = evaluate(gravity, random_q)
+    papers = np.array([paper_regressor(q) for q in random_q])
+    # The same parameters, so the same columns, in another order.
+    for column in range(12):
+        distance = np.abs(ours - papers[:, :, [column]]).max(axis=(0, 1))
+        assert distance.min() < 1e-12, column
+
+
+def test_linkage_changes_names_only(arm, random_q):
+    serial, whole = derive_gravity(arm, "dh", serial=True), derive_gravity(arm, "dh")
+    assert serial.regressor == whole.regressor
+    assert "L3 (m3+...+m7) + L_crank m_coupler + m3 c3x + m_crank c_crank_x" in whole.base.names
+    assert len(whole.base.names) == 12
+
+
+def test_frames_are_a_change_of_base(arm, random_q):
+    dvrk, paper = evaluate(derive_gravity(arm, "dh"), random_q), evaluate(derive_gravity(arm, "paper"), random_q)
+    T = np.linalg.lstsq(dvrk.reshape(-1, 12), paper.reshape(-1, 12), rcond=None)[0]
+    np.testing.assert_allclose(dvrk @ T, paper, atol=1e-12)
+    np.testing.assert_allclose(np.abs(np.linalg.det(T)), 1, atol=1e-12)
+    np.testing.assert_allclose(T @ derive_gravity(arm, "paper").base_values, derive_gravity(arm, "dh").base_values, atol=1e-15)
+
+
+def test_dvrk_controller_mapping(arm):
+    """Columns 0..9 of the dVRK's gravity-compensation regressor (facts/dvrk.md section 4, checked mapping)."""
+    gravity = derive_gravity(arm)
+    numbers = dict(zip(gravity.base.names, gravity.base_values, strict=True))
+    q = np.random.default_rng(0).uniform(-1, 1, (20, 7))
+    s2, c2, s4, s5, s6 = np.sin(q[:, 1]), np.cos(q[:, 1]), np.sin(q[:, 3]), np.sin(q[:, 4]), np.sin(q[:, 5])
+    c4, c5, c6 = np.cos(q[:, 3]), np.cos(q[:, 4]), np.cos(q[:, 5])
+    S, C = np.sin(q[:, 1] + q[:, 2]), np.cos(q[:, 1] + q[:, 2])
+    p = {
+        "L2 (m2+...+m7) + m2 c2x + m_coupler c_coupler_x": s2,
+        "m2 c2y + m_coupler c_coupler_y": c2,
+        "L3 (m3+...+m7) + L_crank m_coupler + m3 c3x + m_crank c_crank_x": C,
+        "L4 (m4+...+m7) + m3 c3z + m4 c4y + m_crank c_crank_y": -S,
+        "m4 c4x": C * c4,
+        "-m4 c4z + m5 c5y": -C * s4,
+        "m5 c5z + m6 c6y": -(S * c5 + C * c4 * s5),
+        "m5 c5x": C * c4 * c5 - S * s5,
+        "m6 c6z + m7 c7z": C * s4 * s6 + S * c6 * s5 - C * c4 * c5 * c6,
+        "m6 c6x": C * c6 * s4 - S * s5 * s6 + C * c4 * c5 * s6,
+    }
+    tau2 = 9.81 * sum(numbers[name] * column for name, column in p.items())
+    model = compile_static_model(arm)
+    theta = gravity.base_values.copy()
+    for name in ("m7 c7x", "m7 c7y"):
+        theta[gravity.base.names.index(name)] = 0.0
+    np.testing.assert_allclose(model.torque(q, theta)[:, 1], tau2, atol=1e-13)
+
+
+@pytest.mark.parametrize("direction", [(0, 0, -9.81), (0, 9.81, 0), (3.0, -2.0, -9.0)])
+def test_regressor_times_parameters_is_the_plants_holding_torque(arm, random_q, direction):
+    mounted = arm.with_gravity(direction)
+    model = compile_static_model(mounted)
+    plant = make_arm_plant(mounted)
+    context = plant.CreateDefaultContext()
+    expected = []
+    for q in random_q:
+        set_arm_positions(plant, context, mounted, q)
+        expected.append(holding_torque(plant, context, mounted))
+    beta = model.gravity.base_values
+    np.testing.assert_allclose(model.regressor(random_q) @ beta, expected, atol=1e-12)
+    np.testing.assert_allclose(model.torque(random_q, beta), expected, atol=1e-12)
+    np.testing.assert_allclose(model.torque(random_q[0], beta), expected[0], atol=1e-12)
+    stacked = model.regressor(random_q).reshape(-1, len(beta))
+    assert np.linalg.matrix_rank(stacked) == len(beta)
+
+
+def test_base_set_is_complete_when_masses_change(arm, random_q):
+    """The combination formulas hold for any masses, not only the SDF's: perturb every link and compare."""
+    gravity = derive_gravity(arm)
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    generator = np.random.default_rng(8)
+    values = gravity.standard_values.copy()
+    labels = [p.label for p in gravity.standard_parameters if not p.axis]
+    bodies = {
+        "2": "upper_arm_link",
+        "3": "forearm_link",
+        "5": "wrist_pitch_link",
+        "crank": "crank_link",
+        "coupler": "coupler_link",
+    }
+    for label, name in bodies.items():
+        k = 4 * labels.index(label)
+        factor = generator.uniform(0.5, 1.5)
+        body = plant.GetBodyByName(name)
+        body.SetMass(context, body.default_mass() * factor)
+        values[k : k + 4] *= factor
+    model = compile_static_model(arm)
+    for q in random_q:
+        set_arm_positions(plant, context, arm, q)
+        tau = model.torque(q, gravity.base.combination @ values)
+        np.testing.assert_allclose(tau, holding_torque(plant, context, arm), atol=1e-12)
+
+
+def test_joint_effects_add_their_own_torque(arm):
+    effects = (JointEffect("wrist_platform", "spring"), JointEffect("outer_yaw", "offset"))
+    plain, model = compile_static_model(arm), compile_static_model(arm, effects)
+    q = np.random.default_rng(0).normal(size=(5, 7))
+    beta = plain.gravity.base_values
+    extra = model.torque(q, [*beta, 0.3, -0.2]) - plain.torque(q, beta)
+    expected = np.zeros((5, 7))
+    expected[:, 3], expected[:, 0] = 0.3 * np.sin(q[:, 3]), -0.2
+    np.testing.assert_allclose(extra, expected, atol=1e-15)
+
+
+def test_unknown_frames_are_refused(arm):
+    with pytest.raises(ArmError, match='no frames "craig_1"'):
+        derive_gravity(arm, "craig")
+
+
+def test_derivation_takes_under_a_second_after_import():
+    """In a process of its own, against a fixed piece of sympy work in the same run, so that a slow machine is no excuse."""
+    code = (
+        "import time, sympy\n"
+        "from dvrk_drake.models.arm import load_arm\n"
+        "from dvrk_drake.dynamics.symbolic_gravity import derive_gravity\n"
+        "arm = load_arm('mtml')\n"
+        "t = time.perf_counter(); derive_gravity(arm); print(time.perf_counter() - t)\n"
+        "x = sympy.symbols('x:4'); t = time.perf_counter(); sympy.expand((sum(x) + 1) ** 14); print(time.perf_counter() - t)"
+    )
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    derivation, reference = map(float, output)
+    assert derivation < max(1.0, 20 * reference), (derivation, reference)
