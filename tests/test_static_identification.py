@@ -1,0 +1,247 @@
+"""Identification: exact on exact data, honest on noisy data, and the paper's numbers on the paper's data."""
+
+import csv
+import dataclasses
+
+import numpy as np
+import pytest
+
+from dvrk_drake.analysis.doubts import find_doubts
+from dvrk_drake.analysis.linear_fit import robust_fit, weighted_fit
+from dvrk_drake.analysis.static_identification import identify_static
+from dvrk_drake.analysis.validation import predict, validate
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.errors import IdentificationError, ModelError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.recording import Recording, read_recording
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return load_arm("mtmr")
+
+
+def simulated(arm, poses=60, seed=0, noise=0.0, effects=(), coefficients=(), scale=1.0):
+    """Poses inside the limits with exact holding torques plus noise, a share of each joint's effort limit."""
+    generator = np.random.default_rng(seed)
+    model = compile_static_model(arm, tuple(effects))
+    theta = np.array([*(scale * model.gravity.base_values), *coefficients])
+    q = arm.sample_poses(poses, generator, margin=0.05)
+    tau = model.torque(q, theta) + noise * arm.effort_limits * generator.normal(size=q.shape)
+    return Recording(q=q, tau=tau, source="simulated"), theta
+
+
+def column(model, attribute):
+    return np.array([getattr(joint, attribute) for joint in model.joints])
+
+
+def test_least_squares_recovers_exact_parameters(arm):
+    recording, theta = simulated(arm)
+    model = identify_static(recording, arm, "paper").model
+    np.testing.assert_allclose(model.theta, theta, atol=1e-12)
+    assert column(model, "rms_fit").max() < 1e-13
+    assert model.provenance.rank == 12
+
+
+def test_robust_method_recovers_parameters_and_finds_the_effects(arm):
+    effects = (JointEffect("wrist_platform", "spring"), JointEffect("wrist_pitch", "spring"))
+    recording, theta = simulated(arm, noise=0.005, effects=effects, coefficients=(0.05, -0.05), seed=4)
+    model = identify_static(recording, arm).model
+    found = {(e.joint, e.kind): e.value for e in model.joint_effects}
+    assert found["wrist_platform", "spring"] == pytest.approx(0.05, abs=0.004)
+    assert found["wrist_pitch", "spring"] == pytest.approx(-0.05, abs=0.002)
+    fresh, _ = simulated(arm, poses=200, seed=9, effects=effects, coefficients=(0.05, -0.05))
+    errors = validate(model, fresh).joints
+    for error, limit in zip(errors[1:6], arm.effort_limits[1:6], strict=True):
+        assert error.rms_error < 0.005 * limit, error
+    assert all(error.rms_error <= error.rms_torque for error in errors)
+
+
+def test_standard_errors_cover_the_truth_at_the_nominal_rate(arm):
+    """The 95 % intervals of 40 noisy recordings, over all parameters that the noise lets be seen."""
+    inside = []
+    for seed in range(40):
+        recording, theta = simulated(arm, noise=0.02, seed=seed)
+        usable = np.ones(recording.q.shape, dtype=bool)
+        from dvrk_drake.analysis.effect_selection import StaticProblem
+
+        fit = StaticProblem(arm, recording.q, recording.tau, usable).fit(()).fit
+        inside.append(np.abs(fit.theta - theta) < 1.96 * np.sqrt(np.diag(fit.covariance)))
+    assert 0.90 < np.mean(inside) <= 0.99
+
+
+def test_left_out_residuals_are_those_of_a_fit_without_the_pose():
+    generator = np.random.default_rng(0)
+    X, tau = generator.normal(size=(12, 3, 4)), generator.normal(size=(12, 3))
+    weights, prior = generator.uniform(0.5, 2, (12, 3)), np.array([0.0, 0.1, 1.0, 0.0])
+    fit = weighted_fit(X, tau, weights, prior)
+    for i in range(12):
+        rest = np.arange(12) != i
+        other = weighted_fit(X[rest], tau[rest], weights[rest], prior)
+        np.testing.assert_allclose(fit.left_out_residuals[i], tau[i] - X[i] @ other.theta, atol=1e-12)
+
+
+def test_gross_outliers_do_not_move_the_robust_fit():
+    generator = np.random.default_rng(1)
+    X = generator.normal(size=(60, 2, 3))
+    theta = np.array([1.0, -2.0, 0.5])
+    tau = X @ theta + 0.01 * generator.normal(size=(60, 2))
+    tau[5:9, 1] += 10.0
+    fit = robust_fit(X, tau, np.ones((60, 2), bool), np.zeros(3), np.full(2, 1e-6))
+    np.testing.assert_allclose(fit.fit.theta, theta, atol=0.01)
+    assert fit.outliers.sum() == 4
+    assert fit.outliers[5:9, 1].all()
+
+
+def test_poses_on_a_stop_are_doubted_and_named(arm):
+    recording, _ = simulated(arm, poses=40, noise=0.002)
+    q, tau = recording.q.copy(), recording.tau.copy()
+    q[3, 1:3] = [-0.15, -0.2]  # the sum is below -0.33
+    tau[3, 1:3] -= 5.0
+    q[7, 5] = arm.position_upper[5]
+    tau[7, 5] += 0.05
+    tau[11, 3] = 2.0  # eight times what the motor can give
+    dirty = dataclasses.replace(recording, q=q, tau=tau)
+    reasons = {(d.row, d.joints): d.reason for d in find_doubts(dirty, arm)}
+    assert "parallelogram at -0.350 rests on its stop" in reasons[3, (1, 2)]
+    assert "wrist_yaw at 0.785 rests on its stop" in reasons[7, (5,)]
+    assert "wrist_platform effort 2 exceeds its limit 0.309" in reasons[11, (3,)]
+    clean_rows = np.ones(40, bool)
+    clean_rows[[3, 7, 11]] = False
+    clean = dataclasses.replace(recording, q=q[clean_rows], tau=tau[clean_rows])
+    with_dirt, without = identify_static(dirty, arm).model, identify_static(clean, arm).model
+    np.testing.assert_allclose(with_dirt.theta[:3], without.theta[:3], rtol=0.05)
+
+
+def test_a_joint_that_measures_nothing_gets_no_torque(arm):
+    recording, _ = simulated(arm, noise=0.002)
+    tau = recording.tau.copy()
+    tau[:, 6] = 1e-5
+    model = identify_static(dataclasses.replace(recording, tau=tau), arm).model
+    assert model.joints[6].trust == 0.0
+    assert np.all(model.holding_torque(recording.q)[:, 6] == 0.0)
+
+
+def test_pure_friction_never_makes_a_joint_worse_than_zero_torque(arm):
+    """Wrist torques that have nothing to do with the pose: held-out error must not exceed commanding nothing."""
+    recording, _ = simulated(arm, noise=0.002)
+    generator = np.random.default_rng(2)
+    tau = recording.tau.copy()
+    tau[:, 4:] = generator.uniform(-0.1, 0.1, (len(tau), 3)) * arm.effort_limits[4:]
+    model = identify_static(dataclasses.replace(recording, tau=tau), arm).model
+    fresh = tau.copy()
+    fresh[:, 4:] = generator.uniform(-0.1, 0.1, (len(tau), 3)) * arm.effort_limits[4:]
+    for error in validate(model, dataclasses.replace(recording, tau=fresh)).joints:
+        assert error.rms_error <= 1.05 * error.rms_torque, error
+
+
+def test_actuator_coordinates_give_the_same_model(arm):
+    recording, _ = simulated(arm, noise=0.002)
+    actuator = Recording(
+        q=arm.transmission.position(recording.q),
+        tau=arm.transmission.inverse().pull_back_effort(recording.tau),
+        coordinates="actuator",
+        source="simulated",
+    )
+    model = identify_static(recording, arm, "paper").model
+    np.testing.assert_allclose(identify_static(actuator, arm, "paper").model.theta, model.theta, atol=1e-12)
+    np.testing.assert_allclose(
+        arm.transmission.pull_back_effort(predict(model, actuator)), model.holding_torque(recording.q), atol=1e-13
+    )
+
+
+def test_too_few_poses_and_too_low_a_rank_are_refused(arm):
+    recording, _ = simulated(arm, poses=4)
+    with pytest.raises(IdentificationError, match="has 4 poses, too few"):
+        identify_static(recording, arm)
+    same, _ = simulated(arm, poses=10)
+    same = dataclasses.replace(same, q=np.tile(same.q[:1], (10, 1)), tau=np.tile(same.tau[:1], (10, 1)))
+    with pytest.raises(IdentificationError, match="determine only . of 12 base parameters"):
+        identify_static(same, arm, "paper")
+
+
+def test_moving_recording_is_refused(arm):
+    recording, _ = simulated(arm)
+    moving = dataclasses.replace(recording, qd=np.full_like(recording.q, 0.2))
+    with pytest.raises(IdentificationError, match="the arm moves"):
+        identify_static(moving, arm)
+
+
+def test_model_file_round_trip_and_refusals(arm, tmp_path):
+    recording, _ = simulated(arm, noise=0.002, effects=(JointEffect("wrist_pitch", "spring"),), coefficients=(-0.05,))
+    model = identify_static(recording, arm).model
+    model.save(tmp_path / "m.yaml")
+    again = IdentifiedModel.load(tmp_path / "m.yaml")
+    assert again == model
+    np.testing.assert_array_equal(again.holding_torque(recording.q), model.holding_torque(recording.q))
+    text = (tmp_path / "m.yaml").read_text()
+    for bad, message in (
+        (text.replace("arm: mtmr", "arm: psm9"), 'unknown arm "psm9"'),
+        (text.replace("kind: spring", "kind: sprung"), "unknown joint effect"),
+        (text.replace("trust: 1.0", "trust: 2.0"), "trust between 0 and 1"),
+        (text.replace("arm: mtmr", "arms: mtmr"), "not a model file"),
+        ("]", "not a model file"),
+    ):
+        assert bad != text
+        (tmp_path / "bad.yaml").write_text(bad)
+        with pytest.raises(ModelError, match=message):
+            IdentifiedModel.load(tmp_path / "bad.yaml")
+
+
+# The paper's own recording.
+
+
+def test_paper_method_reproduces_the_papers_figure_4(arm, shared_data):
+    recording = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
+    result = identify_static(recording, arm, "paper")
+    with open(shared_data / "mtm_static/paper_fig4_squared_errors.csv") as stream:
+        rows = list(csv.reader(stream))[1:]
+    published = np.array(rows, dtype=float)[:, 1:]
+    np.testing.assert_allclose(result.residuals[:, 1:] ** 2, published, atol=1e-8)
+    model = result.model
+    np.testing.assert_allclose(
+        column(model, "rms_fit"), [0.0472, 0.0902, 0.0892, 0.0443, 0.0215, 0.0063, 0.0044], atol=6e-5
+    )
+    np.testing.assert_allclose(
+        column(model, "rms_leave_one_out"), [0.0472, 0.0977, 0.0956, 0.0444, 0.0217, 0.0069, 0.0044], atol=6e-5
+    )
+    np.testing.assert_allclose(
+        column(model, "rms_zero_torque"), [0.0472, 0.5317, 0.3258, 0.0396, 0.0083, 0.0063, 0.0019], atol=6e-5
+    )
+    assert model.provenance.condition_number == pytest.approx(13.5, abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["mtm_2015_good72", "mtm_2015_apr18_all80", "mtmr_2017_sweep40", "mtmr_2017_coupled12_may10"])
+def test_default_method_is_never_worse_than_zero_torque_on_left_out_poses(arm, shared_data, name):
+    model = identify_static(read_recording(shared_data / f"mtm_static/{name}.csv"), arm).model
+    for joint in model.joints:
+        assert joint.rms_leave_one_out_undoubted <= joint.rms_zero_torque_undoubted, joint
+        assert joint.rms_cross_validation_undoubted <= 1.02 * joint.rms_zero_torque_undoubted, joint
+
+
+def test_default_method_beats_the_paper_on_left_out_poses(arm, shared_data):
+    recording = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
+    ours, paper = identify_static(recording, arm), identify_static(recording, arm, "paper")
+    doubted = np.zeros(recording.q.shape, bool)
+    for doubt in ours.doubts:
+        doubted[doubt.row, list(doubt.joints)] = True
+    for j in range(7):
+        use = ~doubted[:, j]
+        rms = [np.sqrt(np.mean(r.left_out_residuals[use, j] ** 2)) for r in (ours, paper)]
+        assert rms[0] < rms[1], arm.joint_names[j]
+
+
+def test_another_day_of_the_same_arm_is_predicted_better_than_by_zero_torque(arm, shared_data):
+    model = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_good72.csv"), arm).model
+    other = validate(model, read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"))
+    for joint in other.joints:
+        assert joint.rms_error_undoubted <= joint.rms_torque_undoubted, joint
+
+
+def test_dirty_recording_names_the_poses_that_press_on_a_stop(arm, shared_data):
+    result = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"), arm)
+    on_stop = {d.row + 1 for d in result.doubts if "parallelogram" in d.reason}
+    assert {61, 63, 67, 71, 73, 77} <= on_stop
+    assert {46} <= {d.row + 1 for d in result.doubts}
