@@ -54,11 +54,11 @@ class GravityPidController(LeafSystem):
     is therefore one period late, as it is on hardware. A forced discrete update is the same step, for loops
     that are driven by messages.
 
-    **Saturation.** `effort` is clamped to the effort limits. Anti-windup is by conditional integration (Astrom
-    and Hagglund, Advanced PID Control, 2006, chapter 3): a joint's integrator stands still while its command is
-    beyond the limit and the error would push it further, and while Kp e alone exceeds the limit, so that a long
-    way to go does not fill it. The integral is kept as an effort, so changing Ki causes no step; Ki = 0 empties
-    it.
+    **Saturation.** `effort` is clamped to the effort limits. Anti-windup is by conditional integration
+    (Astrom and Hagglund, Advanced PID Control, 2006, chapter 3): a joint's integrator stands still while its
+    command is beyond the limit and the error would push it further, and while Kp e alone exceeds the limit,
+    so that a long way to go does not fill it. The integral is kept as an effort, so changing Ki causes no
+    step; Ki = 0 empties it.
 
     **Fault.** A running Diagram is not stopped by an exception. While an input is not finite, the command is
     the gravity effort of the last finite pose, without PID: the arm is neither dropped nor driven anywhere.
