@@ -19,3 +19,11 @@ class ModelError(DvrkDrakeError):
 
 class IdentificationError(DvrkDrakeError):
     """A recording that does not determine what was asked of it."""
+
+
+class ControllerError(DvrkDrakeError):
+    """A controller that was given gains, limits or a period that it cannot run with."""
+
+
+class StationError(DvrkDrakeError):
+    """A station that cannot be built or used as asked."""

@@ -1,0 +1,185 @@
+"""Time of one simulated millisecond under control: our GravityPidController against Drake's own C++ blocks.
+
+    python benchmarks/control_step.py [--json FILE] [--repetitions N] [--seconds S]
+
+All rows simulate the same ArmStation (10 joints, 3 of them coupled; 1 ms SAP steps), publish nothing and run as
+fast as they can. Each repetition starts from the same pose and steps all joints by 0.1 rad, so that the solver has
+the same work in all rows: at rest it stops early, and at a joint limit it works longer. Repetitions are interleaved:
+a busy machine slows all rows alike. Times are CPU time of this process, medians over the repetitions.
+
+Rows:
+    python      GravityPidController: Python LeafSystem, one compiled update per millisecond.
+    cpp         Drake's InverseDynamics (gravity compensation) on a controller plant, PidController and Adder.
+                InverseDynamics ignores couplers, so it runs on the whole tree and a MatrixGain projects with G':
+                the only way in which stock blocks give this arm's true gravity. The goal is set against this row.
+    cpp_serial  The same on a plant of the seven independent joints alone, without projection. Its gravity is wrong
+                here (the counterweight is on the linkage), but it is what stock blocks cost without a linkage: a
+                lower bound.
+    none        No control: the constant effort that balances the start pose.
+
+PidController's integral is a continuous state: the cpp rows run with the cheapest integrator for it, explicit Euler
+at 1 ms. Both its blocks feed through, so the cpp rows act without the period of delay that the python row has.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+import xml.etree.ElementTree as ElementTree
+from importlib.metadata import version
+
+import numpy as np
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
+from pydrake.systems.controllers import InverseDynamics, PidController
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
+from pydrake.systems.primitives import Adder, ConstantVectorSource, MatrixGain
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.arm import MODELS_FOLDER, PACKAGE_URL, Arm, load_arm
+from dvrk_drake.models.plant import make_arm_plant, tree_selector
+from dvrk_drake.models.sdf_facts import DRAKE
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+
+START = np.array([0.2, 0.3, -0.1, 0.5, 0.6, 0.1, -0.4])
+GOAL = START + 0.1
+
+
+def serial_plant(arm: Arm) -> MultibodyPlant:
+    root = ElementTree.parse(MODELS_FOLDER / arm.sdf.removeprefix(PACKAGE_URL)).getroot()
+    model = root.find("model")
+    names = arm.joint_names
+    ElementTree.register_namespace("drake", DRAKE.strip("{}"))
+    dependent = [j for j in model.findall("joint") if j.get("name") not in names and j.get("type") != "fixed"]
+    gone = {joint.findtext("child") for joint in dependent}
+    for element in [*dependent, *model.findall("link"), *model.findall("frame")]:
+        if element in dependent or element.get("name") in gone or element.get("attached_to") in gone:
+            model.remove(element)
+    for group in model.findall(f"{DRAKE}collision_filter_group"):
+        model.remove(group)
+    plant = MultibodyPlant(1e-3)
+    Parser(plant).AddModelsFromString(ElementTree.tostring(root, encoding="unicode"), "sdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link"))
+    plant.mutable_gravity_field().set_gravity_vector(arm.gravity)
+    plant.Finalize()
+    return plant
+
+
+def tree_state_order(station: ArmStation, plant: MultibodyPlant) -> bool:
+    """Whether the station's plant and the controller's have their joints in the same order."""
+    return np.array_equal(tree_selector(station.plant, station.arm), tree_selector(plant, station.arm))
+
+
+def build(row: str, arm: Arm) -> tuple[Diagram, ArmStation, System, list[object]]:
+    """The diagram, its station, what puts out the command, and objects that must outlive it."""
+    builder = DiagramBuilder()
+    station = builder.AddSystem(ArmStation(arm))
+    state = station.GetOutputPort("mtml.state_estimated")
+    command = station.GetInputPort("mtml.effort_commanded")
+    if row == "none":
+        balance = IdentifiedModel.from_arm(arm).holding_torque(START)
+        source = builder.AddSystem(ConstantVectorSource(balance))
+        builder.Connect(source.get_output_port(), command)
+        return builder.Build(), station, source, []
+    desired = builder.AddSystem(ConstantVectorSource(np.concatenate([GOAL, np.zeros(arm.num_joints)])))
+    if row == "python":
+        controller = builder.AddSystem(GravityPidController(IdentifiedModel.from_arm(arm)))
+        builder.Connect(state, controller.GetInputPort("state_estimated"))
+        builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
+        builder.Connect(controller.GetOutputPort("effort"), command)
+        return builder.Build(), station, controller, []
+    plant = make_arm_plant(arm) if row == "cpp" else serial_plant(arm)
+    gravity_only = InverseDynamics.InverseDynamicsMode.kGravityCompensation
+    gravity = builder.AddSystem(InverseDynamics(plant, gravity_only))
+    pid = builder.AddSystem(PidController(kp=arm.gains.kp, ki=arm.gains.ki, kd=arm.gains.kd))
+    total = builder.AddSystem(Adder(num_inputs=2, size=arm.num_joints))
+    if row == "cpp":
+        assert tree_state_order(station, plant)
+        G = np.zeros((plant.num_positions(), arm.num_joints))
+        G[tree_selector(plant, arm)] = arm.linkage.matrix
+        project = builder.AddSystem(MatrixGain(D=G.T))
+        builder.Connect(station.GetOutputPort("plant_state"), gravity.get_input_port_estimated_state())
+        builder.Connect(gravity.get_output_port(), project.get_input_port())
+        builder.Connect(project.get_output_port(), total.get_input_port(0))
+    else:
+        builder.Connect(state, gravity.get_input_port_estimated_state())
+        builder.Connect(gravity.get_output_port(), total.get_input_port(0))
+    builder.Connect(state, pid.get_input_port_estimated_state())
+    builder.Connect(desired.get_output_port(), pid.get_input_port_desired_state())
+    builder.Connect(pid.get_output_port(), total.get_input_port(1))
+    builder.Connect(total.get_output_port(), command)
+    return builder.Build(), station, total, [plant]
+
+
+def start(row: str, arm: Arm) -> tuple[Simulator, ArmStation, System, list[object]]:
+    diagram, station, source, keep = build(row, arm)
+    simulator = Simulator(diagram)
+    simulator.set_target_realtime_rate(0.0)
+    if row.startswith("cpp"):
+        ResetIntegratorFromFlags(simulator, "explicit_euler", 1e-3)
+    restart(simulator, station)
+    return simulator, station, source, keep
+
+
+def restart(simulator: Simulator, station: ArmStation) -> None:
+    context = simulator.get_mutable_context()
+    context.SetTime(0.0)
+    simulator.get_system().SetDefaultContext(context)
+    station.set_positions(station.GetMyMutableContextFromRoot(context), START)
+    simulator.Initialize()
+
+
+def effort(source: System, context: Context) -> np.ndarray:
+    return source.get_output_port(0).Eval(source.GetMyContextFromRoot(context))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", metavar="FILE", help="write the numbers there too")
+    parser.add_argument("--repetitions", type=int, default=15)
+    parser.add_argument("--seconds", type=float, default=0.5, help="simulated time of one repetition")
+    arguments = parser.parse_args()
+    arm = load_arm("mtml")
+    rows = {row: start(row, arm) for row in ("python", "cpp", "cpp_serial", "none")}
+
+    # The comparison is only fair if both compute the same: compare the first commands, as they reach the motors.
+    ours, theirs = (effort(rows[row][2], rows[row][0].get_context()) for row in ("python", "cpp"))
+    difference = np.abs(ours - np.clip(theirs, -arm.effort_limits, arm.effort_limits)).max()
+    assert difference < 1e-9, f"efforts differ by {difference} N m"
+
+    times: dict[str, list[float]] = {row: [] for row in rows}
+    for repetition in range(arguments.repetitions + 1):
+        for row, (simulator, station, *_) in rows.items():
+            restart(simulator, station)
+            before = time.process_time()
+            simulator.AdvanceTo(arguments.seconds)
+            if repetition > 0:  # the first warms caches
+                times[row].append((time.process_time() - before) / arguments.seconds * 1e3)
+    for row in ("python", "cpp"):
+        simulator, station = rows[row][:2]
+        q = station.get_positions(station.GetMyContextFromRoot(simulator.get_context()))
+        assert np.abs(q - GOAL).max() < 0.02, f"{row} is not where it should be: {q}"
+
+    median = {row: float(np.median(values)) for row, values in times.items()}
+    # Ratios within each repetition: what slows a moment slows both.
+    peers = ("cpp", "cpp_serial")
+    ratio = {peer: float(np.median(np.divide(times["python"], times[peer]))) for peer in peers}
+    print(f"drake {version('drake')}; CPU time per simulated ms, median of {arguments.repetitions} [us]")
+    for row, value in median.items():
+        low, high = np.percentile(times[row], [25, 75])
+        control = value - median["none"]
+        print(f"  {row:11} {value:7.1f}   (quartiles {low:.1f}..{high:.1f}; control {control:+.1f})")
+    print(f"  python / cpp        {ratio['cpp']:.3f}")
+    print(f"  python / cpp_serial {ratio['cpp_serial']:.3f}")
+    if arguments.json:
+        with open(arguments.json, "w", encoding="utf-8") as stream:
+            result = {"drake": version("drake"), "us_per_simulated_ms": median, "ratio_python_to": ratio}
+            json.dump(result, stream, indent=2)
+            stream.write("\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,261 @@
+"""One arm behind the ports that its driver has: in simulation now, the same names on hardware."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.geometry import Meshcat, MeshcatVisualizer
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import MatrixGain, PassThrough, Saturation
+
+from dvrk_drake.errors import StationError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import Closure, add_arm, set_arm_positions, tree_selector
+
+
+@dataclass(frozen=True)
+class StationPorts:
+    """Name -> size of the ports that a station of one arm has, in simulation and on hardware alike."""
+
+    inputs: dict[str, int]
+    outputs: dict[str, int]
+
+
+def station_ports(arm: Arm) -> StationPorts:
+    """The ports of `arm`'s station, named like the fields of the iiwa's driver in Drake.
+
+    Prefixed with the arm's lower-case name; n numbers in the arm's order of joints [rad, rad/s, N m; m, m/s,
+    N].
+    """
+    n, name = arm.num_joints, arm.name.lower()
+    return StationPorts(
+        inputs={f"{name}.effort_commanded": n},
+        outputs={
+            f"{name}.position_measured": n,
+            f"{name}.velocity_estimated": n,
+            f"{name}.state_estimated": 2 * n,
+            f"{name}.effort_measured": n,
+        },
+    )
+
+
+class ArmStation(Diagram):
+    """A simulated arm with the ports of its driver.
+
+    .. pydrake_system::
+
+        name: ArmStation
+        input_ports:
+        - mtml.effort_commanded (optional)
+        - mtml.effort_disturbance (optional)
+        output_ports:
+        - mtml.position_measured
+        - mtml.velocity_estimated
+        - mtml.state_estimated
+        - mtml.effort_measured
+        - plant_state
+        - body_poses
+        - query_object
+
+    `mtml` stands for the arm's lower-case name. The arm's ports have n numbers (`state_estimated` 2n: q, then
+    v) for the independent joints, in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]; the
+    linkage follows them.
+
+    - `effort_commanded`: clamped to the plant's effort limits. Unconnected: zero, a limp arm.
+    - `effort_disturbance`: added behind the motors and not clamped: friction, cables, a hand. Unconnected:
+      zero.
+    - `effort_measured`: what the motors apply, the command after the clamp.
+    - `plant_state`, `body_poses`, `query_object`: the plant's own, of the whole tree. Simulation only, as is
+      `effort_disturbance`; all others are those of `station_ports`.
+
+    Everything but the plant's step is C++ without state of its own. Measured values are exact and undelayed.
+    The arm meets each joint's position limits (Drake's discrete plants enforce them) but not the coupled
+    limits of its linkage.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        *,
+        hardware: bool = False,
+        time_step: float = 1e-3,
+        meshcat: Meshcat | None = None,
+        closure: Closure = "mimic",
+        plant_arm: Arm | None = None,
+        modify_plant: Callable[[MultibodyPlant], None] | None = None,
+    ) -> None:
+        """Builds the station; the arm starts at zero, or at the nearest pose inside its limits.
+
+        Args:
+            arm: names the ports, and is the arm that controllers of this station know.
+            hardware: the arm itself instead of its simulation.
+            time_step: of the plant [s].
+            meshcat: draws the arm there.
+            closure: how the linkage's loops are held, see `add_arm`.
+            plant_arm: the arm that is simulated, `arm` by default: another mounting or SDF with the same
+            joints.
+            modify_plant: called with the plant before it is finalized, e.g. to add a payload, damping or
+            other effort limits.
+                Drake can change the inertia of links that are already there only in a Context:
+                `set_link_inertias`.
+
+        Raises:
+            StationError: hardware is asked for, the time step is not positive, or `plant_arm` has other
+            joints.
+        """
+        super().__init__()
+        if hardware:
+            raise StationError(
+                "hardware=True is not there yet: it comes with the LCM interface. Use hardware=False"
+            )
+        if not (np.isfinite(time_step) and time_step > 0):
+            raise StationError(
+                f"time_step must be a positive number of seconds (the linkage needs it); got {time_step}"
+            )
+        true_arm = plant_arm or arm
+        if true_arm.joint_names != arm.joint_names:
+            raise StationError(
+                f"plant_arm must have the joints of {arm.name}: {', '.join(arm.joint_names)}; "
+                f"{true_arm.name} has {', '.join(true_arm.joint_names)}"
+            )
+        self._arm = arm
+        self._true_arm = true_arm
+
+        builder = DiagramBuilder()
+        self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=time_step)
+        self._instance = add_arm(self._plant, true_arm, closure)
+        if modify_plant is not None:
+            modify_plant(self._plant)
+        self._plant.Finalize()
+        self._set_default_pose()
+        if meshcat is not None:
+            MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat)
+        self._export_inputs(builder)
+        self._export_outputs(builder)
+        builder.BuildInto(self)
+        self.set_name(f"{arm.name.lower()}_station")
+
+    @property
+    def arm(self) -> Arm:
+        """The arm that the ports are named and ordered after."""
+        return self._arm
+
+    @property
+    def plant(self) -> MultibodyPlant:
+        """The simulated plant."""
+        return self._plant
+
+    def set_positions(self, context: Context, q: ArrayLike) -> None:
+        """Puts the arm at the pose q (n,) of its independent joints, linkage included, at rest.
+
+        Args:
+            context: of this station, not of a Diagram around it.
+            q: pose; it need not be inside the limits.
+
+        Raises:
+            StationError: q is not n finite numbers.
+        """
+        q = np.asarray(q, float)
+        if q.shape != (self._arm.num_joints,) or not np.all(np.isfinite(q)):
+            raise StationError(
+                f"a pose of {self._arm.name} is {self._arm.num_joints} finite numbers; got {q.tolist()}"
+            )
+        plant_context = self.GetMutableSubsystemContext(self._plant, context)
+        set_arm_positions(self._plant, plant_context, self._true_arm, q)
+        self._plant.SetVelocities(plant_context, np.zeros(self._plant.num_velocities()))
+
+    def get_positions(self, context: Context) -> NDArray[np.float64]:
+        """Pose (n,) of the independent joints in this station's context."""
+        q_plant = self._plant.GetPositions(self.GetSubsystemContext(self._plant, context))
+        return q_plant[self._independent()]
+
+    def set_link_inertias(self, context: Context, inertias: Mapping[str, SpatialInertia]) -> None:
+        """Gives links another inertia in this station's context: an arm that differs from its model.
+
+        Args:
+            context: of this station.
+            inertias: link name -> spatial inertia M_LLo_L about the link's origin, in its frame [kg, m, kg
+            m^2].
+
+        Raises:
+            StationError: a link that the arm does not have.
+        """
+        plant_context = self.GetMutableSubsystemContext(self._plant, context)
+        bodies = {self._plant.get_body(i).name(): i for i in self._plant.GetBodyIndices(self._instance)}
+        if unknown := sorted(set(inertias) - set(bodies)):
+            raise StationError(f"unknown link {', '.join(unknown)}; links: {', '.join(bodies)}")
+        for name, M_LLo_L in inertias.items():
+            self._plant.get_body(bodies[name]).SetSpatialInertiaInBodyFrame(plant_context, M_LLo_L)
+
+    def _independent(self) -> NDArray[np.int_]:
+        """Index into the plant's q and v of each independent joint."""
+        names = list(self._true_arm.tree_joint_names)
+        tree = tree_selector(self._plant, self._true_arm, self._instance)
+        return tree[[names.index(joint) for joint in self._arm.joint_names]]
+
+    def _set_default_pose(self) -> None:
+        home = np.clip(0.0, self._true_arm.position_lower, self._true_arm.position_upper)
+        q_plant = self._plant.GetDefaultPositions()
+        tree = tree_selector(self._plant, self._true_arm, self._instance)
+        q_plant[tree] = self._true_arm.linkage.position(home)
+        self._plant.SetDefaultPositions(q_plant)
+
+    def _export_inputs(self, builder: DiagramBuilder) -> None:
+        plant, name, n = self._plant, self._arm.name.lower(), self._arm.num_joints
+        # The plant clamps as well, but silently: clamp here, at the plant's limits, to know what is applied.
+        actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(self._instance)]
+        driven = [actuator.joint().name() for actuator in actuators]
+        if undriven := [joint for joint in self._arm.joint_names if joint not in driven]:
+            raise StationError(
+                f"{self._true_arm.sdf}: joint {', '.join(undriven)} has no <effort>, so no motor"
+            )
+        columns = [driven.index(joint) for joint in self._arm.joint_names]
+        limits = np.array([actuators[i].effort_limit() for i in columns])
+        # Motors of other joints (massless rotors that ride on a linkage) get zero: their inertia is all they
+        # are for.
+        B = np.zeros((len(actuators), n))
+        B[columns, range(n)] = 1.0
+        commanded = builder.AddNamedSystem("effort_commanded", PassThrough(n))
+        clamp = builder.AddNamedSystem("effort_clamp", Saturation(min_value=-limits, max_value=limits))
+        to_actuators = builder.AddNamedSystem("to_actuators", MatrixGain(D=B))
+        builder.Connect(commanded.get_output_port(), clamp.get_input_port())
+        builder.Connect(clamp.get_output_port(), to_actuators.get_input_port())
+        builder.Connect(to_actuators.get_output_port(), plant.get_actuation_input_port(self._instance))
+        builder.ExportInput(commanded.get_input_port(), f"{name}.effort_commanded")
+        builder.ExportOutput(clamp.get_output_port(), f"{name}.effort_measured")
+
+        disturbance = builder.AddNamedSystem("effort_disturbance", PassThrough(n))
+        to_tree = builder.AddNamedSystem("to_tree", MatrixGain(D=self._tree_selection()))
+        builder.Connect(disturbance.get_output_port(), to_tree.get_input_port())
+        builder.Connect(to_tree.get_output_port(), plant.get_applied_generalized_force_input_port())
+        builder.ExportInput(disturbance.get_input_port(), f"{name}.effort_disturbance")
+
+    def _export_outputs(self, builder: DiagramBuilder) -> None:
+        plant, name = self._plant, self._arm.name.lower()
+        S = self._tree_selection().T
+        zero = np.zeros_like(S)
+        for port, D in {
+            "position_measured": np.hstack([S, zero]),
+            "velocity_estimated": np.hstack([zero, S]),
+            "state_estimated": np.block([[S, zero], [zero, S]]),
+        }.items():
+            select = builder.AddNamedSystem(port, MatrixGain(D=D))
+            builder.Connect(plant.get_state_output_port(), select.get_input_port())
+            builder.ExportOutput(select.get_output_port(), f"{name}.{port}")
+        builder.ExportOutput(plant.get_state_output_port(), "plant_state")
+        builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
+        builder.ExportOutput(self._scene_graph.get_query_output_port(), "query_object")
+
+    def _tree_selection(self) -> NDArray[np.float64]:
+        """(nv, n): efforts on the independent joints to efforts on the plant; its transpose picks their
+        positions."""
+        if self._plant.num_positions() != self._plant.num_velocities():
+            raise StationError("modify_plant must not add floating bodies: weld them to the arm")
+        selection = np.zeros((self._plant.num_velocities(), self._arm.num_joints))
+        selection[self._independent(), range(self._arm.num_joints)] = 1.0
+        return selection

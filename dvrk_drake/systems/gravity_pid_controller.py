@@ -1,0 +1,295 @@
+"""Gravity compensation and PID control of one arm, compiled: equation 11 of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Literal, get_args
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.models.arm_schema import Gains
+
+#: "hold" regulates a pose, "gravity" only carries the arm's weight and leaves it free to move.
+Mode = Literal["hold", "gravity"]
+
+_MODES: tuple[Mode, ...] = get_args(Mode)
+
+
+class GravityPidController(LeafSystem):
+    """Carries an arm's weight and, in "hold" mode, regulates its pose.
+
+    The law is tau = G(q) + Kp e + Kd de + integral(Ki e dt), the paper's equation 11, with e = q_d - q and
+    de = v_d - v for every joint: no position ever enters the damping term. G(q) is the model's static torque
+    (gravity and joint effects, scaled by each joint's trust). Gains are diagonal.
+
+    .. pydrake_system::
+
+        name: GravityPidController
+        input_ports:
+        - state_estimated
+        - desired_state (optional)
+        output_ports:
+        - effort
+        - gravity_effort
+        - fault
+
+    Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
+
+    - `state_estimated` (2n): q, then v.
+    - `desired_state` (2n): q_d, then v_d. Not read in "gravity" mode. Unconnected, "hold" mode holds the
+      latched pose: the one at initialization, or at the last change from "gravity" to "hold", or when a fault
+      ended; so it never jumps.
+    - `effort` (n): the command, inside the effort limits.
+    - `gravity_effort` (n): G(q) alone, before the limits.
+    - `fault` (1): 1 while `state_estimated` (or a `desired_state` that is read) is not finite, else 0.
+
+    **Time.** Inputs are sampled and the outputs change every `period` seconds, and at initialization, which
+    also empties the integrator and latches the pose. Beside a discrete plant of the same period the command
+    is therefore one period late, as it is on hardware. A forced discrete update is the same step, for loops
+    that are driven by messages.
+
+    **Saturation.** `effort` is clamped to the effort limits. Anti-windup is by conditional integration
+    (Astrom and Hagglund, Advanced PID Control, 2006, chapter 3): a joint's integrator stands still while its
+    command is beyond the limit and the error would push it further, and while Kp e alone exceeds the limit,
+    so that a long way to go does not fill it. The integral is kept as an effort, so changing Ki causes no
+    step; Ki = 0 empties it.
+
+    **Fault.** A running Diagram is not stopped by an exception. While an input is not finite, the command is
+    the gravity effort of the last finite pose, without PID: the arm is neither dropped nor driven anywhere.
+    Before any finite pose was seen it is zero. Regulation resumes by itself, with an empty integrator, when
+    the inputs are finite again.
+
+    To compensate with a plant's own gravity, nothing identified, use the model that the arm's SDF states::
+
+        GravityPidController(IdentifiedModel.from_arm(load_arm("mtml")))
+    """
+
+    def __init__(
+        self,
+        model: IdentifiedModel,
+        *,
+        period: float = 1e-3,
+        gains: Gains | None = None,
+        mode: Mode = "hold",
+        effort_limits: ArrayLike | None = None,
+    ) -> None:
+        """Compiles the controller for the model's arm; the first time takes seconds, later ones are quick.
+
+        Args:
+            model: what G(q) is; its parameters are copied.
+            period: of the update [s].
+            gains: n numbers each; the arm's own by default.
+            mode: "hold" or "gravity", at first; see `SetMode`.
+            effort_limits: (n,) largest magnitude of each joint's effort; the arm's own by default.
+
+        Raises:
+            ModelError: the model does not fit its arm.
+            ControllerError: a period, gain, mode or limit that is none.
+        """
+        super().__init__()
+        model.check()
+        arm = model.load_arm()
+        self._joint_names = arm.joint_names
+        n = arm.num_joints
+        limits = np.asarray(arm.effort_limits if effort_limits is None else effort_limits, float)
+        if limits.shape != (n,) or not np.all(limits > 0):
+            raise ControllerError(f"effort_limits must be {n} positive numbers; got {limits.tolist()}")
+        if not (np.isfinite(period) and period > 0):
+            raise ControllerError(f"period must be a positive number of seconds; got {period}")
+        self._period = float(period)
+
+        self.DeclareVectorInputPort(name="state_estimated", size=2 * n)
+        self.DeclareVectorInputPort(name="desired_state", size=2 * n)
+        # One array each for gains and memory: fetching an array from a Context costs more than the control
+        # law.
+        parameters = np.concatenate([self._checked(gains or arm.gains), [self._mode_number(mode)]])
+        self.DeclareNumericParameter(model_vector=BasicVector(parameters))
+        effort = self.DeclareDiscreteState(num_state_variables=n)
+        memory = self.DeclareDiscreteState(num_state_variables=4 * n + 3)
+        self.DeclareStateOutputPort(name="effort", state_index=effort)
+        ticket = self.discrete_state_ticket(memory)
+        self.DeclareVectorOutputPort(
+            name="gravity_effort", size=n, calc=self._calc_gravity_effort, prerequisites_of_calc={ticket}
+        )
+        self.DeclareVectorOutputPort(
+            name="fault", size=1, calc=self._calc_fault, prerequisites_of_calc={ticket}
+        )
+        constants = (np.ascontiguousarray(model.theta), np.concatenate([model.trust, limits]), self._period)
+        step = _compile_step(model.static_model.torque_into)
+        update = self._make_update(step, *constants, restart=False)
+        restart = self._make_update(step, *constants, restart=True)
+        self.DeclareInitializationDiscreteUpdateEvent(update=restart)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_sec=self._period, offset_sec=0.0, update=update)
+        self.DeclareForcedDiscreteUpdateEvent(update=update)
+
+    @property
+    def period(self) -> float:
+        """Period of the update [s]."""
+        return self._period
+
+    def SetGains(self, context: Context, gains: Gains) -> None:
+        """Changes the gains from the next update on.
+
+        Raises:
+            ControllerError: not n finite numbers >= 0 each.
+        """
+        values = self._checked(gains)
+        context.get_mutable_numeric_parameter(0).get_mutable_value()[: values.size] = values
+
+    def GetGains(self, context: Context) -> Gains:
+        """The gains in use."""
+        kp, kd, ki = context.get_numeric_parameter(0).get_value()[:-1].reshape(3, -1).tolist()
+        return Gains(kp=kp, kd=kd, ki=ki)
+
+    def SetMode(self, context: Context, mode: Mode) -> None:
+        """Changes the mode from the next update on.
+
+        Raises:
+            ControllerError: neither "hold" nor "gravity".
+        """
+        context.get_mutable_numeric_parameter(0).get_mutable_value()[-1] = self._mode_number(mode)
+
+    def GetMode(self, context: Context) -> Mode:
+        """The mode in use."""
+        return _MODES[int(context.get_numeric_parameter(0).get_value()[-1])]
+
+    def _checked(self, gains: Gains) -> NDArray[np.float64]:
+        n = len(self._joint_names)
+        for name in ("kp", "kd", "ki"):
+            values = np.asarray(getattr(gains, name), float)
+            if values.shape != (n,) or not np.all(np.isfinite(values) & (values >= 0)):
+                raise ControllerError(
+                    f"gains.{name} must be {n} finite numbers >= 0, one for each of "
+                    f"{', '.join(self._joint_names)}; got {values.tolist()}"
+                )
+        return np.concatenate([gains.kp, gains.kd, gains.ki])
+
+    @staticmethod
+    def _mode_number(mode: Mode) -> float:
+        if mode not in _MODES:
+            raise ControllerError(f'unknown mode "{mode}"; known modes: {", ".join(_MODES)}')
+        return float(_MODES.index(mode))
+
+    def _make_update(
+        self,
+        step: Callable[..., None],
+        theta: NDArray[np.float64],
+        constants: NDArray[np.float64],
+        period: float,
+        restart: bool,
+    ) -> Callable[[Context, DiscreteValues], None]:
+        """The handler of an update event.
+
+        It runs between two steps of the plant, which leave nothing of Python in the processor's caches: what costs
+        is each different thing that it touches. So its names are local, and vectors are read in place, all the same
+        way.
+        """
+        eval_vector_input = self.EvalVectorInput
+
+        def update(context: Context, discrete_state: DiscreteValues) -> None:
+            state = eval_vector_input(context, 0).get_value()
+            desired = eval_vector_input(context, 1)
+            step(
+                state,
+                state if desired is None else desired.get_value(),
+                desired is not None,
+                context.get_numeric_parameter(0).get_value(),
+                theta,
+                constants,
+                period,
+                restart,
+                discrete_state.get_mutable_value(0),
+                discrete_state.get_mutable_value(1),
+            )
+
+        return update
+
+    def _calc_gravity_effort(self, context: Context, output: BasicVector) -> None:
+        n = output.size()
+        output.SetFromVector(context.get_discrete_state(_MEMORY).get_value()[3 * n : 4 * n])
+
+    def _calc_fault(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, context.get_discrete_state(_MEMORY).get_value()[-1])
+
+
+_MEMORY = DiscreteStateIndex(1)
+
+
+@cache
+def _compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
+    """One update of the controller as one compiled function without allocation; constants are its arguments.
+
+    Arrays: state, desired (2n); parameters: kp, kd, ki (n each), mode; constants: trust, effort limits (n
+    each); in place: effort (n) and memory: integral, latched pose, last finite pose, gravity effort (n each),
+    then three flags: a pose is latched, a finite pose was seen, fault.
+    """
+
+    def step(state, desired, has_desired, parameters, theta, constants, period, restart, effort, memory):
+        n = effort.size
+        kp, kd, ki = parameters[:n], parameters[n : 2 * n], parameters[2 * n : 3 * n]
+        trust, limit = constants[:n], constants[n:]
+        integral, latched_q = memory[:n], memory[n : 2 * n]
+        last_q, gravity = memory[2 * n : 3 * n], memory[3 * n : 4 * n]
+        LATCHED, SEEN, FAULT = 4 * n, 4 * n + 1, 4 * n + 2
+        hold = parameters[3 * n] == 0.0
+
+        if restart:
+            memory[LATCHED] = 0.0
+            memory[SEEN] = 0.0
+            integral[:] = 0.0
+        fault = False
+        for i in range(2 * n):
+            fault |= not np.isfinite(state[i])
+        if not fault:
+            last_q[:] = state[:n]
+            memory[SEEN] = 1.0
+        if hold and has_desired:
+            for i in range(2 * n):
+                fault |= not np.isfinite(desired[i])
+        memory[FAULT] = 1.0 if fault else 0.0
+
+        if memory[SEEN] == 0.0:
+            gravity[:] = 0.0
+        else:
+            torque_into(last_q, theta, gravity)
+            for i in range(n):
+                gravity[i] *= trust[i]
+        if fault or not hold:
+            memory[LATCHED] = 0.0
+            for i in range(n):
+                integral[i] = 0.0
+                effort[i] = min(max(gravity[i], -limit[i]), limit[i])
+            return
+
+        if memory[LATCHED] == 0.0:
+            latched_q[:] = last_q
+            memory[LATCHED] = 1.0
+        for i in range(n):
+            e = (desired[i] if has_desired else latched_q[i]) - state[i]
+            de = (desired[n + i] if has_desired else 0.0) - state[n + i]
+            without_integral = gravity[i] + kp[i] * e + kd[i] * de
+            increment = 0.0 if restart else ki[i] * e * period
+            if ki[i] == 0.0:
+                integral[i] = 0.0
+            command = without_integral + integral[i] + increment
+            far = abs(kp[i] * e) > limit[i]
+            winds_up = (command > limit[i] and increment > 0.0) or (command < -limit[i] and increment < 0.0)
+            if not (far or winds_up):
+                integral[i] += increment
+            effort[i] = min(max(without_integral + integral[i], -limit[i]), limit[i])
+
+    array = numba.float64[::1]
+    view = numba.types.Array(
+        numba.float64, 1, "C", readonly=True
+    )  # what Drake gives of inputs and parameters
+    flag = numba.boolean
+    signature = numba.void(view, view, flag, view, array, array, numba.float64, flag, array, array)
+    dispatcher = numba.njit(signature)(step)
+    # The one compiled signature itself, without the choice between signatures that costs 4 us a call.
+    return dispatcher.overloads[signature.args].entry_point
