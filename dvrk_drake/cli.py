@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -21,6 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one verb; returns the exit code: 0, or 2 for bad input."""
     options = _parser().parse_args(arguments)
     try:
+        logging.getLogger("drake").setLevel(logging.WARNING)
         options.run(options)
     except DvrkDrakeError as error:
         print(f"dvrk-drake: error: {error}", file=sys.stderr)
@@ -134,6 +136,40 @@ def _convert(options: argparse.Namespace) -> None:
     console.print(f"{options.output}: {len(recording)} rows, {recording.coordinates} coordinates", soft_wrap=True)
 
 
+def _view(options: argparse.Namespace) -> None:
+    import time
+
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.systems.arm_view import ArmView, start_meshcat
+
+    arm = load_arm(options.arm)
+    meshcat = start_meshcat(port=options.port)
+    view = ArmView(arm, meshcat)
+    view.add_sliders()
+    meshcat.AddButton("Stop", "Escape")
+    print(
+        f"{arm.name} at {meshcat.web_url()}; sliders under Open Controls; end with Stop, Escape or Ctrl-C", flush=True
+    )
+    while meshcat.GetButtonClicks("Stop") == 0:
+        view.follow_sliders()
+        time.sleep(0.03)
+
+
+def _demo(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.demo import run_demo
+    from dvrk_drake.analysis.tables import make_console, print_demo
+
+    output = _made_folder(options.output)
+    with _ProgressBar("") as (progress, task):
+        result = run_demo(
+            output,
+            options.arm,
+            options.seed,
+            lambda what, share: progress.update(task, description=what, completed=100 * share),
+        )
+    print_demo(make_console(), result, options.output)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="dvrk-drake", description="Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."
@@ -183,6 +219,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     verb.add_argument("--skip-invalid", action="store_true", help="leave out rows that are not numbers, and count them")
     verb.set_defaults(run=_convert)
+    verb = verbs.add_parser("view", help="show an arm in a browser, with sliders that keep its linkage together")
+    verb.add_argument("arm", help="mtml, mtmr, or the path of an arm's YAML file")
+    verb.add_argument("--port", type=int, help="of the page; default: a free one")
+    verb.set_defaults(run=_view)
+
+    verb = verbs.add_parser("demo", help="simulate an arm, identify it, compensate it, hold it; writes a folder")
+    verb.add_argument("--output", default="demo_output", metavar="DIR", help="default: demo_output")
+    verb.add_argument("--arm", default="mtml", help="default: mtml")
+    verb.add_argument("--seed", type=int, default=0, help="of the simulated arm, its poses and noise; default: 0")
+    verb.set_defaults(run=_demo)
     return parser
 
 
@@ -238,7 +284,7 @@ class _ProgressBar:
 
     def __init__(self, what: str):
         self._progress = Progress(
-            TextColumn(what),
+            TextColumn("{task.description}"),
             BarColumn(),
             TaskProgressColumn(),
             TimeElapsedColumn(),

@@ -15,9 +15,7 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 ARM = load_arm("mtml")
 NOMINAL = IdentifiedModel.from_arm(ARM)
-FIG7_START = np.array(
-    [0, -0.22, -0.79, 0, 3.13, 0, 0]
-)  # q2 + q3 is beyond the real linkage's stop: as the paper did
+FIG7_START = np.array([0, -0.22, -0.79, 0, 3.13, 0, 0])  # q2 + q3 is beyond the real linkage's stop: as the paper did
 
 
 def scaled_model(factor):

@@ -213,7 +213,9 @@ def test_paper_method_reproduces_the_papers_figure_4(arm, shared_data):
     assert model.provenance.condition_number == pytest.approx(13.5, abs=0.05)
 
 
-@pytest.mark.parametrize("name", ["mtm_2015_good72", "mtm_2015_apr18_all80", "mtmr_2017_sweep40", "mtmr_2017_coupled12_may10"])
+@pytest.mark.parametrize(
+    "name", ["mtm_2015_good72", "mtm_2015_apr18_all80", "mtmr_2017_sweep40", "mtmr_2017_coupled12_may10"]
+)
 def test_default_method_is_never_worse_than_zero_torque_on_left_out_poses(arm, shared_data, name):
     model = identify_static(read_recording(shared_data / f"mtm_static/{name}.csv"), arm).model
     for joint in model.joints:

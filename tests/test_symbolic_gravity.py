@@ -113,7 +113,9 @@ def test_frames_are_a_change_of_base(arm, random_q):
     T = np.linalg.lstsq(dvrk.reshape(-1, 12), paper.reshape(-1, 12), rcond=None)[0]
     np.testing.assert_allclose(dvrk @ T, paper, atol=1e-12)
     np.testing.assert_allclose(np.abs(np.linalg.det(T)), 1, atol=1e-12)
-    np.testing.assert_allclose(T @ derive_gravity(arm, "paper").base_values, derive_gravity(arm, "dh").base_values, atol=1e-15)
+    np.testing.assert_allclose(
+        T @ derive_gravity(arm, "paper").base_values, derive_gravity(arm, "dh").base_values, atol=1e-15
+    )
 
 
 def test_dvrk_controller_mapping(arm):

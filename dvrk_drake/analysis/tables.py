@@ -8,12 +8,24 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from dvrk_drake.analysis.demo import DemoResult
 from dvrk_drake.analysis.doubts import Doubt
 from dvrk_drake.analysis.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity
 
 TABLE_WIDTH = 112
+
+NEXT_STEPS = """
+Open {folder}/arm.html in a browser: the arm is held, released, and driven home.
+
+With a real arm:
+  1. Record poses at rest: move it by hand to 40 or more varied poses inside its limits, let position control hold each,
+     and write q1..q7, tau1..tau7 [rad, N m] of each settled pose into a CSV (docs/public_recordings.md has the lines).
+  2. dvrk-drake identify poses.csv --arm mtml --output model.yaml --plots plots
+  3. Record some more on another day:  dvrk-drake validate model.yaml other.csv
+  4. Only when every joint is better than zero torque there, let GravityPidController(model) near the arm, with a hand on
+     the stop button. Switch the controller's own gravity compensation off first, or it is compensated twice."""
 
 
 def make_console() -> Console:
@@ -76,6 +88,27 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
             )
 
 
+def print_demo(console: Console, result: DemoResult, folder: str) -> None:
+    """What the demo measured, what it wrote, and what a person would do next."""
+    print_model(console, result.identification.model)
+    fresh = list(zip(result.fresh.joints, result.fresh_paper.joints, strict=True))
+    table = _table(
+        f"RMS torque error on {result.fresh.poses} fresh poses [N m]", "", "zero torque", "identified", "paper's method"
+    )
+    for ours, paper in fresh:
+        table.add_row(ours.name, f"{ours.rms_torque:.4f}", f"{ours.rms_error:.4f}", f"{paper.rms_error:.4f}")
+    console.print(table)
+    table = _table(
+        "Released for 4 s, then a step to zero [rad]", "", *(f"drift, {k}" for k in result.drift), "step error"
+    )
+    for i, (ours, _) in enumerate(fresh):
+        drifts = [f"{values[i]:.4f}" for values in result.drift.values()]
+        table.add_row(ours.name, *drifts, f"{result.step_error[i]:.5f}")
+    console.print(table)
+    console.print(f"written to {folder}: {', '.join(path.name for path in result.files)}", soft_wrap=True)
+    console.print(NEXT_STEPS.format(folder=folder), markup=False, soft_wrap=True)
+
+
 def print_symbolic_model(console: Console, gravity: SymbolicGravity) -> None:
     """The base parameters of an arm with the values that its SDF gives them, and its joints' limits."""
     arm = gravity.arm
@@ -99,7 +132,7 @@ def print_doubts(console: Console, doubts: Sequence[Doubt], most: int = 30) -> N
         return
     console.print(f"{len({d.where for d in doubts})} poses doubted; the torques named are left out:", style="yellow")
     for doubt in doubts[:most]:
-        console.print(f"  {doubt.where}: {doubt.reason}", style="yellow", highlight=False, soft_wrap=True)
+        console.print(f"  {doubt.where}: {doubt.reason}", style="yellow", markup=False, soft_wrap=True)
     if len(doubts) > most:
         console.print(f"  and {len(doubts) - most} more", style="yellow")
 
@@ -128,7 +161,7 @@ def print_validation(console: Console, validation: Validation) -> None:
 
 
 def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, expand=False)
+    table = Table(title=escape(title), title_justify="left", title_style="bold", box=None, pad_edge=False, expand=False)
     for i, column in enumerate(columns):
         table.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
     return table

@@ -110,9 +110,7 @@ class ArmStation(Diagram):
         """
         super().__init__()
         if hardware:
-            raise StationError(
-                "hardware=True is not there yet: it comes with the LCM interface. Use hardware=False"
-            )
+            raise StationError("hardware=True is not there yet: it comes with the LCM interface. Use hardware=False")
         if not (np.isfinite(time_step) and time_step > 0):
             raise StationError(
                 f"time_step must be a positive number of seconds (the linkage needs it); got {time_step}"
@@ -162,9 +160,7 @@ class ArmStation(Diagram):
         """
         q = np.asarray(q, float)
         if q.shape != (self._arm.num_joints,) or not np.all(np.isfinite(q)):
-            raise StationError(
-                f"a pose of {self._arm.name} is {self._arm.num_joints} finite numbers; got {q.tolist()}"
-            )
+            raise StationError(f"a pose of {self._arm.name} is {self._arm.num_joints} finite numbers; got {q.tolist()}")
         plant_context = self.GetMutableSubsystemContext(self._plant, context)
         set_arm_positions(self._plant, plant_context, self._true_arm, q)
         self._plant.SetVelocities(plant_context, np.zeros(self._plant.num_velocities()))
@@ -211,9 +207,7 @@ class ArmStation(Diagram):
         actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(self._instance)]
         driven = [actuator.joint().name() for actuator in actuators]
         if undriven := [joint for joint in self._arm.joint_names if joint not in driven]:
-            raise StationError(
-                f"{self._true_arm.sdf}: joint {', '.join(undriven)} has no <effort>, so no motor"
-            )
+            raise StationError(f"{self._true_arm.sdf}: joint {', '.join(undriven)} has no <effort>, so no motor")
         columns = [driven.index(joint) for joint in self._arm.joint_names]
         limits = np.array([actuators[i].effort_limit() for i in columns])
         # Motors of other joints (massless rotors that ride on a linkage) get zero: their inertia is all they

@@ -117,9 +117,7 @@ class GravityPidController(LeafSystem):
         self.DeclareVectorOutputPort(
             name="gravity_effort", size=n, calc=self._calc_gravity_effort, prerequisites_of_calc={ticket}
         )
-        self.DeclareVectorOutputPort(
-            name="fault", size=1, calc=self._calc_fault, prerequisites_of_calc={ticket}
-        )
+        self.DeclareVectorOutputPort(name="fault", size=1, calc=self._calc_fault, prerequisites_of_calc={ticket})
         constants = (np.ascontiguousarray(model.theta), np.concatenate([model.trust, limits]), self._period)
         step = _compile_step(model.static_model.torque_into)
         update = self._make_update(step, *constants, restart=False)
@@ -285,9 +283,7 @@ def _compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
             effort[i] = min(max(without_integral + integral[i], -limit[i]), limit[i])
 
     array = numba.float64[::1]
-    view = numba.types.Array(
-        numba.float64, 1, "C", readonly=True
-    )  # what Drake gives of inputs and parameters
+    view = numba.types.Array(numba.float64, 1, "C", readonly=True)  # what Drake gives of inputs and parameters
     flag = numba.boolean
     signature = numba.void(view, view, flag, view, array, array, numba.float64, flag, array, array)
     dispatcher = numba.njit(signature)(step)

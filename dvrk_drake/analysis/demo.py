@@ -1,0 +1,283 @@
+"""The whole way on a simulated arm: collect, identify, validate, release, hold; everything written to one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Meshcat
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import SpatialInertia, UnitInertia
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from dvrk_drake.analysis.collection import collect_static_poses
+from dvrk_drake.analysis.plots import plot_identification, plot_positions, plot_torque_error
+from dvrk_drake.analysis.static_identification import StaticIdentification, identify_static
+from dvrk_drake.analysis.validation import Validation, validate
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.plant import add_arm
+from dvrk_drake.models.recording import Recording, write_recording
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.arm_view import start_meshcat
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
+
+POSES, FRESH_POSES = 40, 15
+#: Effort noise of one sample, as a share of the effort limit.
+EFFORT_NOISE = 0.01
+#: Release: pose held, then let go, then driven home; phases end at these times [s].
+HELD_UNTIL, RELEASED_UNTIL, HOME_UNTIL = 0.5, 4.5, 7.5
+RELEASE_POSE = np.array([0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5])
+#: Where the paper's simulation starts (Fig. 7): J5, J3 and J2 off home [rad].
+STEP_START = np.array([0.0, -0.22, -0.79, 0.0, 3.13, 0.0, 0.0])
+STEP_DURATION = 4.0
+
+
+@dataclass(frozen=True)
+class TrueArm:
+    """A simulated arm that its model does not describe exactly.
+
+    Attributes:
+        arm: its description.
+        inertias: link -> true spatial inertia about the link's origin.
+        effects, coefficients: true joint effects [N m].
+        damping: (n,) viscous friction of the joints [N m s/rad].
+    """
+
+    arm: Arm
+    inertias: dict[str, SpatialInertia]
+    effects: tuple[JointEffect, ...]
+    coefficients: tuple[float, ...]
+    damping: NDArray[np.float64]
+
+    def station(self, meshcat: Meshcat | None = None) -> ArmStation:
+        """A station that simulates it, once `prepare` was called with a context."""
+        return ArmStation(self.arm, meshcat=meshcat, modify_plant=self._add_damping)
+
+    def prepare(self, station: ArmStation, context: Context) -> None:
+        """Puts the true inertias into a station's context."""
+        station.set_link_inertias(context, self.inertias)
+
+    def effect_torque(self) -> JointEffectTorque:
+        """A new system that plays the joint effects."""
+        return JointEffectTorque(self.arm, self.effects, self.coefficients)
+
+    def _add_damping(self, plant: MultibodyPlant) -> None:
+        for name, damping in zip(self.arm.joint_names, self.damping, strict=True):
+            plant.GetJointByName(name).set_default_damping_vector([damping])
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demo found; paths are in its output folder."""
+
+    identification: StaticIdentification
+    fresh: Validation
+    fresh_paper: Validation
+    drift: dict[str, NDArray[np.float64]]
+    step_error: NDArray[np.float64]
+    files: list[Path]
+
+
+def make_true_arm(arm: Arm, generator: np.random.Generator) -> TrueArm:
+    """An arm whose links are up to 20 % heavier or lighter than the model's, with springs and cables of its own."""
+    plant = MultibodyPlant(1e-3)
+    instance = add_arm(plant, arm)
+    inertias = {}
+    for index in plant.GetBodyIndices(instance):
+        body = plant.get_body(index)
+        M = body.default_spatial_inertia()
+        if body.name() == "base_link":
+            continue
+        # Scaled mass, centre of mass moved by up to 2 mm: still a possible body, as the move adds what it must.
+        shift = generator.uniform(-0.002, 0.002, 3)
+        mass = M.get_mass() * generator.uniform(0.8, 1.2)
+        I_Bcm = M.Shift(M.get_com()).get_unit_inertia()
+        inertias[body.name()] = SpatialInertia(
+            mass, M.get_com() + shift, UnitInertia(I_Bcm.ShiftFromCenterOfMass(-(M.get_com() + shift)))
+        )
+    effects = (
+        JointEffect("wrist_platform", "offset"),
+        JointEffect("wrist_platform", "spring"),
+        JointEffect("wrist_pitch", "spring"),
+    )
+    damping = 0.03 * arm.effort_limits
+    return TrueArm(arm, inertias, effects, (0.02, 0.05, -0.03), damping)
+
+
+def run_demo(
+    output: Path,
+    arm_name: str = "mtml",
+    seed: int = 0,
+    progress: Callable[[str, float], None] = lambda what, share: None,
+) -> DemoResult:
+    """Runs it and writes `output`, an existing folder.
+
+    Args:
+        output: for model.yaml, poses.csv, fresh_poses.csv, the plots and arm.html, a Meshcat recording.
+        arm_name: which arm.
+        seed: of the true arm, the poses and the noise.
+        progress: called with what is being done and the finished share of it, 0..1.
+    """
+    generator = np.random.default_rng(seed)
+    arm = load_arm(arm_name)
+    nominal = IdentifiedModel.from_arm(arm)
+    true_arm = make_true_arm(arm, generator)
+
+    def collect(count: int, what: str) -> Recording:
+        poses = arm.sample_poses(count, generator, margin=0.1)
+        # A person turns platform and handle by a hand's reach, not by turns.
+        poses[:, [3, 6]] = np.clip(poses[:, [3, 6]], -1.5, 1.5)
+        return collect_static_poses(
+            true_arm.station(),
+            nominal,
+            poses,
+            effort_noise=EFFORT_NOISE,
+            generator=generator,
+            effects=true_arm.effect_torque(),
+            prepare=true_arm.prepare,
+            progress=lambda share: progress(what, share),
+        )
+
+    poses = collect(POSES, "collecting poses")
+    write_recording(poses, output / "poses.csv")
+    identification = identify_static(poses, arm, progress=lambda share: progress("identifying", share))
+    model = identification.model
+    model.provenance.recording = "poses.csv"
+    model.save(output / "model.yaml")
+    fresh_poses = collect(FRESH_POSES, "collecting fresh poses")
+    write_recording(fresh_poses, output / "fresh_poses.csv")
+    fresh = validate(model, fresh_poses)
+    paper_model = identify_static(poses, arm, "paper").model
+    fresh_paper = validate(paper_model, fresh_poses)
+
+    meshcat = start_meshcat()
+    t, released = _release(true_arm, model, meshcat, lambda share: progress("releasing and holding", share / 3))
+    with atomic_write(output / "arm.html") as stream:
+        stream.write(meshcat.StaticHtml())
+    _, with_nominal = _release(
+        true_arm, nominal, None, lambda share: progress("releasing and holding", (1 + share) / 3)
+    )
+    t_step, step = _step(true_arm, model, lambda share: progress("releasing and holding", (2 + share) / 3))
+
+    progress("drawing", 0.0)
+    names = arm.joint_names
+    plot_identification(output, identification, poses)
+    plot_torque_error(
+        output / "fresh_torque_error.png",
+        names,
+        np.array([j.rms_torque for j in fresh.joints]),
+        {
+            "identified": np.array([j.rms_error for j in fresh.joints]),
+            "the paper's least squares": np.array([j.rms_error for j in fresh_paper.joints]),
+        },
+        f"{arm.name} (simulated): {FRESH_POSES} fresh poses",
+    )
+    plot_positions(
+        output / "release.png",
+        names,
+        t,
+        {"identified model": released, "model as drawn (SDF)": with_nominal},
+        f"Held until {HELD_UNTIL} s, released under gravity compensation until {RELEASED_UNTIL} s, then driven home by PID",
+    )
+    plot_positions(
+        output / "step.png",
+        names,
+        t_step,
+        {"identified model": step},
+        "Step of the paper's Fig. 7 to zero, gravity + PID",
+    )
+    progress("drawing", 1.0)
+    window = (t >= HELD_UNTIL) & (t <= RELEASED_UNTIL)
+    drift = {
+        label: np.abs(q[window] - q[window][0]).max(axis=0)
+        for label, q in (("identified", released), ("as drawn", with_nominal))
+    }
+    files = sorted(path for path in output.iterdir() if path.is_file())
+    return DemoResult(identification, fresh, fresh_paper, drift, np.abs(step[-1]), files)
+
+
+def _closed_loop(
+    true_arm: TrueArm, model: IdentifiedModel, q_start: NDArray[np.float64], meshcat: Meshcat | None
+) -> tuple[Simulator, ArmStation, GravityPidController, ConstantVectorSource]:
+    name = true_arm.arm.name.lower()
+    builder = DiagramBuilder()
+    station = builder.AddSystem(true_arm.station(meshcat))
+    controller = builder.AddSystem(GravityPidController(model))
+    effects = builder.AddSystem(true_arm.effect_torque())
+    desired = builder.AddSystem(ConstantVectorSource(np.concatenate([q_start, np.zeros_like(q_start)])))
+    state = station.GetOutputPort(f"{name}.state_estimated")
+    builder.Connect(state, controller.GetInputPort("state_estimated"))
+    builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
+    builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))
+    builder.Connect(state, effects.get_input_port())
+    builder.Connect(effects.get_output_port(), station.GetInputPort(f"{name}.effort_disturbance"))
+    simulator = Simulator(builder.Build())
+    context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    true_arm.prepare(station, context)
+    station.set_positions(context, q_start)
+    return simulator, station, controller, desired
+
+
+def _release(
+    true_arm: TrueArm, model: IdentifiedModel, meshcat: Meshcat | None, progress: Callable[[float], None]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Holds a pose, releases the arm under gravity compensation, drives it home; t (m,) and q (m, n)."""
+    simulator, station, controller, desired = _closed_loop(true_arm, model, RELEASE_POSE, meshcat)
+    root = simulator.get_mutable_context()
+    settings = controller.GetMyMutableContextFromRoot(root)
+    home = np.zeros(2 * true_arm.arm.num_joints)
+
+    def at(t: float) -> None:
+        if abs(t - HELD_UNTIL) < 1e-9:
+            controller.SetMode(settings, "gravity")
+        if abs(t - RELEASED_UNTIL) < 1e-9:
+            desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(home)
+            controller.SetMode(settings, "hold")
+
+    if meshcat is not None:
+        meshcat.StartRecording()
+    t, q = _sample(simulator, station, HOME_UNTIL, at, progress)
+    if meshcat is not None:
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+    return t, q
+
+
+def _step(
+    true_arm: TrueArm, model: IdentifiedModel, progress: Callable[[float], None]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The paper's Fig. 7: from `STEP_START` to zero under gravity + PID."""
+    simulator, station, _, desired = _closed_loop(true_arm, model, STEP_START, None)
+    home = np.zeros(2 * true_arm.arm.num_joints)
+    root = simulator.get_mutable_context()
+    desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(home)
+    return _sample(simulator, station, STEP_DURATION, lambda t: None, progress)
+
+
+def _sample(
+    simulator: Simulator,
+    station: ArmStation,
+    duration: float,
+    at: Callable[[float], None],
+    progress: Callable[[float], None],
+    period: float = 0.01,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Simulates and samples the pose every `period`; `at(t)` is called before the arm moves on from t."""
+    context = station.GetMyContextFromRoot(simulator.get_context())
+    times = np.arange(round(duration / period) + 1) * period
+    q = []
+    for t in times:
+        simulator.AdvanceTo(t)
+        q.append(station.get_positions(context))
+        at(t)
+        progress(t / duration)
+    return times, np.array(q)

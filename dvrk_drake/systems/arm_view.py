@@ -1,0 +1,90 @@
+"""An arm in Meshcat, posed by its independent joints alone, so that its linkage is never torn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.geometry import Meshcat, MeshcatParams, MeshcatVisualizer, MeshcatVisualizerParams, Role
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
+
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import add_arm, set_arm_positions
+
+#: Where the camera stands and looks by default [m, base frame], with Meshcat's 75 degree view magnified by ZOOM.
+CAMERA, TARGET, ZOOM = (1.1, 0.9, 0.35), (0.0, -0.09, 0.045), 2.8
+
+
+def start_meshcat(
+    camera: Sequence[float] = CAMERA, target: Sequence[float] = TARGET, zoom: float = ZOOM, port: int | None = None
+) -> Meshcat:
+    """A Meshcat on localhost with a light ground and the camera on the arm; a free port unless one is given."""
+    meshcat = Meshcat(MeshcatParams(host="localhost", port=port, show_stats_plot=False))
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    meshcat.SetProperty("/Background", "top_color", [0.86, 0.89, 0.92])
+    meshcat.SetProperty("/Background", "bottom_color", [0.97, 0.97, 0.97])
+    meshcat.SetProperty("/Cameras/default/rotated/<object>", "zoom", zoom)
+    meshcat.SetCameraPose(np.asarray(camera, float), np.asarray(target, float))
+    return meshcat
+
+
+class ArmView:
+    """Draws an arm at poses of its independent joints; sliders for them on request.
+
+    Drake's own JointSliders move every joint of the tree by itself and pull the parallelogram apart; here the dependent
+    joints follow through the arm's linkage.
+    """
+
+    def __init__(self, arm: Arm, meshcat: Meshcat, role: Role = Role.kIllustration) -> None:
+        """Of `arm` in `meshcat`, at zero."""
+        self.arm, self.meshcat = arm, meshcat
+        builder = DiagramBuilder()
+        self._plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
+        add_arm(self._plant, arm)
+        self._plant.Finalize()
+        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, MeshcatVisualizerParams(role=role))
+        self._diagram = builder.Build()
+        self._context = self._diagram.CreateDefaultContext()
+        self._q = np.clip(np.zeros(arm.num_joints), arm.position_lower, arm.position_upper)
+        self._slider_names: list[str] = []
+        self.show(self._q)
+
+    def show(self, q: ArrayLike) -> None:
+        """Draws the pose q (n,) [rad, m]; it need not be inside the limits."""
+        self._q = np.array(q, dtype=float)
+        set_arm_positions(self._plant, self._plant.GetMyMutableContextFromRoot(self._context), self.arm, self._q)
+        self._diagram.ForcedPublish(self._context)
+
+    def add_sliders(self) -> None:
+        """Adds one slider per independent joint, from its lower to its upper limit."""
+        self._slider_names = [f"q{i + 1} {name}" for i, name in enumerate(self.arm.joint_names)]
+        for i, name in enumerate(self._slider_names):
+            lower, upper = self.arm.position_lower[i], self.arm.position_upper[i]
+            self.meshcat.AddSlider(name, lower, upper, (upper - lower) / 1000, self._q[i])
+
+    def follow_sliders(self) -> NDArray[np.float64]:
+        """Draws the sliders' pose if it changed, and returns it. A coupled limit holds back the slider that moved."""
+        wanted = np.array([self.meshcat.GetSliderValue(name) for name in self._slider_names])
+        if np.array_equal(wanted, self._q):
+            return self._q
+        q = self._inside_coupled_limits(wanted)
+        for name, value, target in zip(self._slider_names, wanted, q, strict=True):
+            if value != target:
+                self.meshcat.SetSliderValue(name, target)
+        self.show([self.meshcat.GetSliderValue(name) for name in self._slider_names])
+        return self._q
+
+    def _inside_coupled_limits(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The farthest pose on the way from the shown pose to the wanted one that meets the coupled limits."""
+        A, lower, upper = self.arm.limit_matrix()
+        share = 1.0
+        for row in range(self.arm.num_joints, len(A)):
+            start, end = A[row] @ self._q, A[row] @ wanted
+            if end > upper[row]:
+                share = min(share, max(0.0, (upper[row] - start) / (end - start)))
+            elif end < lower[row]:
+                share = min(share, max(0.0, (lower[row] - start) / (end - start)))
+        return self._q + share * (wanted - self._q)

@@ -1,0 +1,54 @@
+"""The joint effects of an arm as torques that act on its simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.models.arm import Arm
+
+
+class JointEffectTorque(LeafSystem):
+    """Plays the joint effects that identification looks for: the same formulas, so that what is put in can be found.
+
+    .. pydrake_system::
+
+        name: JointEffectTorque
+        input_ports:
+        - state_estimated
+        output_ports:
+        - effort_disturbance
+
+    - `state_estimated` (2n): q, then v of the arm's joints [rad, rad/s; m, m/s on a prismatic joint].
+    - `effort_disturbance` (n): what acts on the joints [N m, N], for `ArmStation`'s port of that name. An effect is the
+      effort that motors need to hold against it, so this is minus their sum.
+    """
+
+    def __init__(self, arm: Arm, effects: Sequence[JointEffect], coefficients: ArrayLike) -> None:
+        """Of the `effects` with one coefficient each [N m; N on a prismatic joint]."""
+        super().__init__()
+        n = arm.num_joints
+        model = compile_static_model(arm, tuple(effects))
+        gravity_free = np.zeros(model.num_parameters)
+        gravity_free[model.num_parameters - len(effects) :] = -np.asarray(coefficients, float)
+        self._theta = gravity_free
+        self._torque_into = model.torque_into
+        self._num_joints = n
+        self.DeclareVectorInputPort(name="state_estimated", size=2 * n)
+        self.DeclareVectorOutputPort(
+            name="effort_disturbance",
+            size=n,
+            calc=self._calc_effort,
+            prerequisites_of_calc={self.input_port_ticket(self.get_input_port(0).get_index())},
+        )
+
+    def _calc_effort(self, context: Context, output: BasicVector) -> None:
+        q = np.array(self.EvalVectorInput(context, 0).get_value()[: self._num_joints])
+        effort = np.empty(self._num_joints)
+        self._torque_into(q, self._theta, effort)
+        output.SetFromVector(effort)
