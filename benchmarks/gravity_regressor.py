@@ -1,6 +1,6 @@
 """Our compiled gravity regressor and torque beside Pinocchio's, same arm, same run.
 
-Pinocchio's model is built from the Drake plant's own joints and masses, and both must agree before anything is timed. Run:
+Pinocchio's model is built from the Drake plant's own joints and masses; both must agree before anything is timed. Run:
 
     make benchmark        or        pip install '.[benchmark]' && python benchmarks/gravity_regressor.py [--json FILE]
 """
@@ -25,7 +25,7 @@ from dvrk_drake.models.plant import make_arm_plant
 
 
 def build_pinocchio(arm: Arm, plant: MultibodyPlant) -> pinocchio.Model:
-    """The serial chain of the independent joints; crank and coupler hang on the linkage, which Pinocchio's tree has not."""
+    """The serial chain of the independent joints; crank and coupler hang on the linkage, which it has not."""
     context = plant.CreateDefaultContext()
     model = pinocchio.Model()
     model.gravity.linear = arm.gravity

@@ -22,7 +22,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one verb; returns the exit code: 0, or 2 for bad input."""
     options = _parser().parse_args(arguments)
     try:
-        logging.getLogger("drake").setLevel(logging.WARNING)
         options.run(options)
     except DvrkDrakeError as error:
         print(f"dvrk-drake: error: {error}", file=sys.stderr)
@@ -142,6 +141,7 @@ def _view(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.systems.arm_view import ArmView, start_meshcat
 
+    _quiet_drake()
     arm = load_arm(options.arm)
     meshcat = start_meshcat(port=options.port)
     view = ArmView(arm, meshcat)
@@ -159,6 +159,7 @@ def _demo(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.demo import run_demo
     from dvrk_drake.analysis.tables import make_console, print_demo
 
+    _quiet_drake()
     output = _made_folder(options.output)
     with _ProgressBar("") as (progress, task):
         result = run_demo(
@@ -265,6 +266,11 @@ def _mounted(arm, gravity):
     return arm.with_gravity(gravity)
 
 
+def _quiet_drake() -> None:
+    """Keeps Drake's remarks (Meshcat's address) off the terminal; its import sets the level, so this comes after."""
+    logging.getLogger("drake").setLevel(logging.WARNING)
+
+
 def _check_folder(path: str) -> None:
     """Refuses an output whose folder does not exist before work begins, not after."""
     if not Path(path).resolve().parent.is_dir():
@@ -283,13 +289,15 @@ class _ProgressBar:
     """A progress bar of 0..100 on stderr, gone when the work is done; silent where stderr is no terminal."""
 
     def __init__(self, what: str):
+        console = Console(stderr=True)
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
             TaskProgressColumn(),
             TimeElapsedColumn(),
-            console=Console(stderr=True),
+            console=console,
             transient=True,
+            disable=not console.is_terminal,
         )
         self._task = self._progress.add_task(what, total=100)
 
@@ -299,3 +307,7 @@ class _ProgressBar:
 
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

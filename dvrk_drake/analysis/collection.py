@@ -17,7 +17,7 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 
-#: Highest joint speed on the way between poses [rad/s or m/s], least time for a way, time to settle, then samples a pose.
+#: Highest joint speed between poses [rad/s or m/s], least time on the way [s], time to settle [s], samples a pose.
 TRAVEL_SPEED, LEAST_TRAVEL, SETTLE, SAMPLES = 4.0, 0.8, 1.0, 10
 #: Between two samples of a pose [s].
 SAMPLE_SPACING = 0.01

@@ -186,7 +186,7 @@ def run_demo(
         names,
         t,
         {"identified model": released, "model as drawn (SDF)": with_nominal},
-        f"Held until {HELD_UNTIL} s, released under gravity compensation until {RELEASED_UNTIL} s, then driven home by PID",
+        f"Held until {HELD_UNTIL} s, released under gravity compensation until {RELEASED_UNTIL} s, then driven home",
     )
     plot_positions(
         output / "step.png",
@@ -273,7 +273,7 @@ def _sample(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Simulates and samples the pose every `period`; `at(t)` is called before the arm moves on from t."""
     context = station.GetMyContextFromRoot(simulator.get_context())
-    times = np.arange(round(duration / period) + 1) * period
+    times = np.arange(round(duration / period) + 1, dtype=np.float64) * period
     q = []
     for t in times:
         simulator.AdvanceTo(t)

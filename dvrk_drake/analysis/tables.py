@@ -20,12 +20,13 @@ NEXT_STEPS = """
 Open {folder}/arm.html in a browser: the arm is held, released, and driven home.
 
 With a real arm:
-  1. Record poses at rest: move it by hand to 40 or more varied poses inside its limits, let position control hold each,
-     and write q1..q7, tau1..tau7 [rad, N m] of each settled pose into a CSV (docs/public_recordings.md has the lines).
+  1. Record poses at rest: move it by hand to 40 or more varied poses inside its limits, let position control hold
+     each, and write q1..q7, tau1..tau7 [rad, N m] of every settled pose into a CSV (lines for that are in
+     docs/public_recordings.md).
   2. dvrk-drake identify poses.csv --arm mtml --output model.yaml --plots plots
   3. Record some more on another day:  dvrk-drake validate model.yaml other.csv
-  4. Only when every joint is better than zero torque there, let GravityPidController(model) near the arm, with a hand on
-     the stop button. Switch the controller's own gravity compensation off first, or it is compensated twice."""
+  4. Only when every joint is better than zero torque there, let GravityPidController(model) near the arm, with a
+     hand on the stop button. Switch the controller's own gravity compensation off first, or it is compensated twice."""
 
 
 def make_console() -> Console:

@@ -1,0 +1,186 @@
+"""The command line as a user meets it: what it writes, and one clear line with exit code 2 for bad input."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.recording import Recording, read_recording, write_recording
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A recording of exact poses with a little noise, and the model that identify made of it."""
+    folder = tmp_path_factory.mktemp("cli")
+    arm = load_arm("mtmr")
+    generator = np.random.default_rng(0)
+    model = compile_static_model(arm)
+    for name, count in (("poses", 40), ("other", 12)):
+        q = arm.sample_poses(count, generator, margin=0.05)
+        tau = model.torque(q, model.gravity.base_values)
+        tau += 0.003 * arm.effort_limits * generator.normal(size=q.shape)
+        write_recording(Recording(q=q, tau=tau), folder / f"{name}.csv")
+    command = ["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", f"{folder}/model.yaml"]
+    assert main([*command, "--plots", f"{folder}/plots"]) == 0
+    return folder
+
+
+def fails(capsys, *arguments):
+    """The one line on stderr of a command that must be refused."""
+    assert main([str(a) for a in arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("dvrk-drake: error: ")
+    assert error.count("\n") == 1, error
+    return error
+
+
+def test_identify_writes_a_model_and_plots(folder):
+    model = IdentifiedModel.load(folder / "model.yaml")
+    nominal = IdentifiedModel.from_arm(load_arm("mtmr"))
+    q = read_recording(folder / "other.csv").q
+    limits = load_arm("mtmr").effort_limits
+    error = (model.holding_torque(q) - nominal.holding_torque(q)) / limits
+    assert np.sqrt(np.mean(error[:, 1:6] ** 2, axis=0)).max() < 0.005
+    assert {p.name for p in (folder / "plots").iterdir()} == {"torque_error.png", "predicted.png"}
+
+
+def test_validate_writes_json(folder, capsys):
+    json_file = folder / "v.json"
+    assert main(["validate", f"{folder}/model.yaml", f"{folder}/other.csv", "--json", str(json_file)]) == 0
+    result = json.loads(json_file.read_text())
+    assert result["poses"] == 12
+    assert [j["name"] for j in result["joints"]] == list(load_arm("mtmr").joint_names)
+    recording = read_recording(folder / "other.csv")
+    model = IdentifiedModel.load(folder / "model.yaml")
+    residual = recording.tau - model.holding_torque(recording.q)
+    for j, joint in enumerate(result["joints"]):
+        assert joint["rms_error"] == pytest.approx(np.sqrt(np.mean(residual[:, j] ** 2)))
+        assert joint["rms_torque"] == pytest.approx(np.sqrt(np.mean(recording.tau[:, j] ** 2)))
+        assert joint["relative_error"] == pytest.approx(joint["rms_error"] / joint["rms_torque"])
+    table = capsys.readouterr().out
+    assert "[N m; N if prismatic]" in table
+    assert "…" not in table
+
+
+@pytest.mark.parametrize("coordinates", ["joint", "actuator"])
+def test_predict_writes_one_row_a_row_in_the_recordings_coordinates(folder, coordinates):
+    arm = load_arm("mtmr")
+    q = read_recording(folder / "other.csv").q
+    recorded = q if coordinates == "joint" else arm.transmission.position(q)
+    write_recording(Recording(q=recorded), folder / "only_q.csv")
+    out = folder / "predicted.csv"
+    command = ["predict", f"{folder}/model.yaml", f"{folder}/only_q.csv", "--output", str(out)]
+    assert main([*command, "--coordinates", coordinates]) == 0
+    rows = np.loadtxt(out, delimiter=",", skiprows=1)
+    assert out.read_text().splitlines()[0] == "tau1,tau2,tau3,tau4,tau5,tau6,tau7"
+    expected = IdentifiedModel.load(folder / "model.yaml").holding_torque(q)
+    tau = rows if coordinates == "joint" else rows @ arm.transmission.matrix
+    np.testing.assert_allclose(tau, expected, atol=1e-13)
+
+
+def test_exported_python_and_c_compute_the_plants_torque(tmp_path, capsys):
+    arm = load_arm("mtml")
+    model = compile_static_model(arm)
+    q = np.random.default_rng(0).uniform(-2, 2, (5, 7))
+    expected = model.torque(q, model.gravity.base_values)
+
+    assert main(["model", "mtml", "--python"]) == 0
+    namespace: dict = {}
+    exec(capsys.readouterr().out, namespace)
+    beta = [value for value, _ in namespace["BASE_PARAMETERS"]]
+    out, Y = np.empty(7), np.empty((7, 12))
+    for pose, tau in zip(q, expected, strict=True):
+        namespace["gravity_torque"](pose, 9.81, beta, out)
+        namespace["gravity_regressor"](pose, 9.81, Y)
+        np.testing.assert_allclose(out, tau, atol=1e-14)
+        np.testing.assert_allclose(Y @ beta, tau, atol=1e-14)
+
+    assert main(["model", "mtml", "--c", "--output", str(tmp_path / "g.c")]) == 0
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("no C compiler here: the exported C was not compiled")
+    library = tmp_path / "g.so"
+    subprocess.run(
+        [compiler, "-Wall", "-Werror", "-shared", "-fPIC", "-o", library, tmp_path / "g.c", "-lm"], check=True
+    )
+    import ctypes
+
+    function = ctypes.CDLL(str(library)).mtml_gravity_torque
+    array = np.ctypeslib.ndpointer(np.float64, flags="C_CONTIGUOUS")
+    function.argtypes = [array, ctypes.c_double, array, array]
+    for pose, tau in zip(q, expected, strict=True):
+        function(np.ascontiguousarray(pose), 9.81, np.array(beta), out)
+        np.testing.assert_allclose(out, tau, atol=1e-14)
+
+
+def test_latex_names_every_parameter_and_torque(capsys):
+    assert main(["model", "mtml", "--latex", "--frames", "paper", "--serial"]) == 0
+    text = capsys.readouterr().out
+    for i in range(1, 13):
+        assert rf"\beta_{{{i}}} &=" in text
+    for j in range(1, 8):
+        assert rf"\tau_{{{j}}} &=" in text
+    assert r"- L_{4} ( m_{4} + \dots + m_{7} ) - m_{3} c_{3z} + m_{4} c_{4y}" in text
+    assert text.count(r"\begin{align*}") == text.count(r"\end{align*}") == 3
+    assert text.count(r"\left(") == text.count(r"\right)")
+
+
+def test_mounting_changes_the_base_set(capsys):
+    assert main(["model", "mtml", "--gravity", "0", "9.81", "0"]) == 0
+    assert "m1 c1x" in capsys.readouterr().out
+
+
+def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
+    poses, model = folder / "poses.csv", folder / "model.yaml"
+    out = tmp_path / "never.yaml"
+    assert 'unknown arm "mtm"; known arms: mtml, mtmr' in fails(capsys, "model", "mtm")
+    identify = ("identify", poses, "--arm", "mtmr", "--output")
+    assert "its folder does not exist" in fails(capsys, *identify, tmp_path / "no" / "m.yaml")
+    assert "no such file" in fails(capsys, "identify", tmp_path / "x.csv", "--arm", "mtmr", "--output", out)
+    assert "no such file" in fails(capsys, "validate", tmp_path / "x.yaml", poses)
+    assert "must be between 1 and 30" in fails(capsys, *identify, out, "--gravity", "0", "0", "0")
+
+    text = poses.read_text().splitlines()
+    bad = tmp_path / "bad.csv"
+    for lines, message in (
+        ([text[0].replace("tau4", "torque4"), *text[1:]], f"{bad}:1: missing column tau4"),
+        ([text[0], text[1].replace(text[1].split(",")[9], "nan"), *text[2:]], f"{bad}:2: tau3 is nan"),
+        ([text[0], *text[1:3], text[3] + ",1"], f"{bad}:4: has 15 cells, the header names 14"),
+        ([], f"{bad}: is empty"),
+        (text[:4], f"{bad}: has 3 poses, too few"),
+    ):
+        bad.write_text("\n".join(lines))
+        assert message in fails(capsys, "identify", bad, "--arm", "mtmr", "--output", out)
+    recording = read_recording(poses)
+    write_recording(Recording(q=np.degrees(recording.q), tau=recording.tau), bad)
+    assert "are these degrees?" in fails(capsys, "identify", bad, "--arm", "mtmr", "--output", out)
+    write_recording(Recording(q=recording.q + 1.5 * np.eye(7)[5], tau=recording.tau), bad)
+    assert "wrist_yaw (q6)" in fails(capsys, "validate", model, bad)
+    (tmp_path / "m.yaml").write_text(model.read_text().replace("trust", "thrust"))
+    assert "not a model file" in fails(capsys, "validate", tmp_path / "m.yaml", poses)
+    assert not out.exists()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.csv", "m.yaml"]
+
+
+def test_unknown_option_is_exit_code_2_in_a_process_of_its_own():
+    command = [sys.executable, "-m", "dvrk_drake.cli", "identify", "--nonsense"]
+    process = subprocess.run(command, capture_output=True, check=False)
+    assert process.returncode == 2
+
+
+def test_convert(tmp_path, capsys):
+    generator = np.random.default_rng(0)
+    values = generator.uniform(-0.2, 0.2, (30, 21))
+    np.savetxt(tmp_path / "wpi.csv", values, delimiter=",", fmt="%.17g")
+    assert main(["convert", str(tmp_path / "wpi.csv"), str(tmp_path / "ours.csv")]) == 0
+    assert "--coordinates actuator" in capsys.readouterr().out
+    ours = read_recording(tmp_path / "ours.csv", coordinates="actuator")
+    np.testing.assert_array_equal(ours.q, values[:, :7])
+    np.testing.assert_array_equal(ours.tau, values[:, 14:])
