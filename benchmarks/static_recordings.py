@@ -1,0 +1,77 @@
+"""Our identification, the paper's and zero torque on the real static recordings: left-out poses and other recordings.
+
+    python benchmarks/static_recordings.py FOLDER [--arm mtmr]
+
+FOLDER holds CSVs with q1..q7, tau1..tau7 (docs/public_recordings.md says where they come from); every one is used to
+identify, and all others to judge.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from dvrk_drake.analysis.static_identification import identify_static
+from dvrk_drake.analysis.validation import validate
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.recording import Recording, read_recording
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--arm", default="mtmr")
+    options = parser.parse_args()
+    arm = load_arm(options.arm)
+    recordings: dict[str, Recording] = {}
+    for path in sorted(options.folder.glob("*.csv")):
+        try:
+            recording = read_recording(path)
+            recording.measured_effort()
+            recordings[path.stem] = recording
+        except RecordingError as error:
+            print(f"left out: {error}")
+    console = Console(width=130, highlight=False)
+    for name, recording in recordings.items():
+        ours, paper = identify_static(recording, arm), identify_static(recording, arm, "paper")
+        doubted = np.zeros(recording.q.shape, dtype=bool)
+        for doubt in ours.doubts:
+            doubted[doubt.row, list(doubt.joints)] = True
+        table = Table(title=f"identified from {name}; RMS error N m without doubted measurements", title_justify="left")
+        for column in ("judged on", "by", *arm.joint_names):
+            table.add_column(column, justify="right")
+        tau = recording.measured_effort()
+
+        def rms(values: np.ndarray, use: np.ndarray) -> list[str]:
+            return [f"{np.sqrt(np.mean(values[use[:, j], j] ** 2)):.4f}" for j in range(values.shape[1])]
+
+        table.add_row("left-out poses", "zero", *rms(tau, ~doubted))
+        table.add_row("", "paper", *rms(paper.left_out_residuals, ~doubted))
+        table.add_row("", "ours", *rms(ours.left_out_residuals, ~doubted))
+        table.add_row("", "ours, ten-fold", *(f"{j.rms_cross_validation_undoubted:.4f}" for j in ours.model.joints))
+        everything = np.ones_like(doubted)
+        table.add_row("left-out, all", "zero", *rms(tau, everything))
+        table.add_row("", "paper", *rms(paper.left_out_residuals, everything))
+        table.add_row("", "ours", *rms(ours.left_out_residuals, everything))
+        for other_name, other in recordings.items():
+            if other_name == name:
+                continue
+            by_ours, by_paper = validate(ours.model, other).joints, validate(paper.model, other).joints
+            table.add_row(other_name, "zero", *(f"{j.rms_torque_undoubted:.4f}" for j in by_ours))
+            table.add_row("", "paper", *(f"{j.rms_error_undoubted:.4f}" for j in by_paper))
+            table.add_row("", "ours", *(f"{j.rms_error_undoubted:.4f}" for j in by_ours))
+        console.print(table)
+        effects = ", ".join(f"{e.joint} {e.kind} {e.value:+.3f}" for e in ours.model.joint_effects)
+        trusts = ", ".join(f"{j.name} {j.trust:.2f}" for j in ours.model.joints if j.trust < 1)
+        console.print(f"effects chosen: {effects or 'none'}; trust below 1: {trusts or 'none'}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
