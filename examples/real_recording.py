@@ -1,0 +1,16 @@
+"""Identify a real arm from a recording of poses at rest, as `dvrk-drake identify` does: python real_recording.py FILE.csv"""
+
+import sys
+
+from dvrk_drake.analysis.static_identification import identify_static
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.recording import read_recording
+
+recording = read_recording(sys.argv[1])
+result = identify_static(recording, load_arm("mtmr"))
+for doubt in result.doubts:
+    print(f"doubted: {doubt.where}: {doubt.reason}")
+for joint in result.model.joints:
+    error, zero = joint.rms_leave_one_out_undoubted, joint.rms_zero_torque_undoubted
+    print(f"{joint.name:15} left-out error {error:.4f} N m, zero torque {zero:.4f} N m")
+result.model.save("model.yaml")

@@ -1,0 +1,16 @@
+"""The gravity regressor of a master arm over many poses, and least squares on it by hand."""
+
+import numpy as np
+
+from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.models.arm import load_arm
+
+arm = load_arm("mtmr")
+model = compile_static_model(arm)
+q = arm.sample_poses(200, np.random.default_rng(0), margin=0.05)
+
+Y = model.regressor(q)  # (200, 7, 12), N m per kg m
+tau = model.torque(q, model.gravity.base_values)  # (200, 7), what the SDF's own masses need
+beta = np.linalg.lstsq(Y.reshape(-1, Y.shape[2]), tau.ravel(), rcond=None)[0]
+for name, value in zip(model.gravity.base.names, beta, strict=True):
+    print(f"{value:+.5f} kg m  {name}")
