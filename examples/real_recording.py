@@ -1,4 +1,4 @@
-"""Identify a real arm from a recording of poses at rest, as `dvrk-drake identify` does: python real_recording.py FILE.csv"""
+"""Identify a real arm from a recording of poses at rest, as `dvrk-drake identify` does: real_recording.py FILE.csv"""
 
 import sys
 

@@ -1,0 +1,101 @@
+"""The demo as a user runs it, on fewer poses: it must find the arm that it hid, and hold it."""
+
+import numpy as np
+import pytest
+
+from dvrk_drake.analysis import demo
+from dvrk_drake.analysis.collection import visiting_trajectory
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.models.recording import read_recording
+from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    shorter = pytest.MonkeyPatch()
+    shorter.setattr(demo, "POSES", 20)
+    shorter.setattr(demo, "FRESH_POSES", 6)
+    stages = []
+    yield folder, demo.run_demo(folder, progress=lambda what, share: stages.append((what, share))), stages
+    shorter.undo()
+
+
+def test_demo_writes_everything(result):
+    folder, outcome, stages = result
+    names = {path.name for path in folder.iterdir()}
+    assert names == {
+        "arm.html",
+        "fresh_poses.csv",
+        "fresh_torque_error.png",
+        "model.yaml",
+        "poses.csv",
+        "predicted.png",
+        "release.png",
+        "step.png",
+        "torque_error.png",
+    }
+    assert {path.name for path in outcome.files} == names
+    assert "<html" in (folder / "arm.html").read_text()[:200].lower()
+    assert len(read_recording(folder / "poses.csv")) == 20
+    assert IdentifiedModel.load(folder / "model.yaml").arm == "mtml"
+    assert all(0.0 <= share <= 1.0 for _, share in stages)
+    assert len({what for what, _ in stages}) == 5
+
+
+def test_demo_beats_zero_torque_and_the_paper_on_fresh_poses(result):
+    _, outcome, _ = result
+    for ours, paper in zip(outcome.fresh.joints[1:], outcome.fresh_paper.joints[1:], strict=True):
+        assert ours.rms_error < 0.2 * ours.rms_torque, ours
+        assert ours.rms_error < paper.rms_error, (ours, paper)
+
+
+def test_demo_finds_the_springs_that_it_put_in(result):
+    _, outcome, _ = result
+    found = {(e.joint, e.kind): e.value for e in outcome.identification.model.joint_effects}
+    assert found["wrist_platform", "spring"] == pytest.approx(0.05, abs=0.01)
+    assert found["wrist_pitch", "spring"] == pytest.approx(-0.03, abs=0.003)
+
+
+def test_demo_drifts_less_than_with_the_nominal_model_and_comes_to_rest(result):
+    _, outcome, _ = result
+    assert outcome.drift["identified"].max() < 0.3 * outcome.drift["as drawn"].max()
+    assert outcome.step_error.max() < 1e-3
+
+
+def test_true_arm_is_possible_and_differs():
+    arm = load_arm("mtml")
+    true_arm = demo.make_true_arm(arm, np.random.default_rng(3))
+    plant = make_arm_plant(arm)
+    for name, M in true_arm.inertias.items():
+        assert M.IsPhysicallyValid(), name
+        assert M.get_mass() != plant.GetBodyByName(name).default_mass()
+
+
+def test_trajectory_rests_at_each_pose_and_stays_inside_the_limits():
+    arm = load_arm("mtml")
+    poses = arm.sample_poses(6, np.random.default_rng(0), margin=0.02)
+    trajectory, settled = visiting_trajectory(poses)
+    for t, pose in zip(settled, poses, strict=True):
+        np.testing.assert_allclose(trajectory.value(t).ravel(), pose, atol=1e-12)
+        np.testing.assert_allclose(trajectory.EvalDerivative(t).ravel(), 0, atol=1e-12)
+    times = np.arange(0, trajectory.end_time(), 0.01)
+    assert not any(arm.limit_violations(trajectory.value(t).ravel(), tolerance=1e-9) for t in times)
+    speed = max(np.abs(trajectory.EvalDerivative(t)).max() for t in times)
+    assert speed < 4.0 + 1e-6
+
+
+def test_joint_effect_torque_is_minus_what_identification_calls_the_effect():
+    arm = load_arm("mtml")
+    system = JointEffectTorque(
+        arm, [JointEffect("wrist_pitch", "spring"), JointEffect("outer_yaw", "offset")], [0.2, 0.1]
+    )
+    context = system.CreateDefaultContext()
+    q = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
+    system.get_input_port().FixValue(context, np.concatenate([q, np.ones(7)]))
+    np.testing.assert_allclose(
+        system.get_output_port().Eval(context), [-0.1, 0, 0, 0, -0.2 * np.sin(0.5), 0, 0], atol=1e-16
+    )
