@@ -52,7 +52,7 @@ class GravityPidController(LeafSystem):
     **Time.** Inputs are sampled and the outputs change every `period` seconds, and at initialization, which
     also empties the integrator and latches the pose. Beside a discrete plant of the same period the command
     is therefore one period late, as it is on hardware. A forced discrete update is the same step, for loops
-    that are driven by messages.
+    that are driven by messages. Gains and mode are part of the Context and can be changed while running.
 
     **Saturation.** `effort` is clamped to the effort limits. Anti-windup is by conditional integration
     (Astrom and Hagglund, Advanced PID Control, 2006, chapter 3): a joint's integrator stands still while its
@@ -106,12 +106,13 @@ class GravityPidController(LeafSystem):
 
         self.DeclareVectorInputPort(name="state_estimated", size=2 * n)
         self.DeclareVectorInputPort(name="desired_state", size=2 * n)
-        # One array each for gains and memory: fetching an array from a Context costs more than the control
-        # law.
-        parameters = np.concatenate([self._checked(gains or arm.gains), [self._mode_number(mode)]])
-        self.DeclareNumericParameter(model_vector=BasicVector(parameters))
         effort = self.DeclareDiscreteState(num_state_variables=n)
-        memory = self.DeclareDiscreteState(num_state_variables=4 * n + 3)
+        # Gains and mode are kept with the memory, not as numeric parameters: reading those from Python would
+        # cost 4-8 us an update.
+        initial = np.concatenate(
+            [self._checked(gains or arm.gains), [self._mode_number(mode)], np.zeros(4 * n + 3)]
+        )
+        memory = self.DeclareDiscreteState(model_vector=BasicVector(initial))
         self.DeclareStateOutputPort(name="effort", state_index=effort)
         ticket = self.discrete_state_ticket(memory)
         self.DeclareVectorOutputPort(
@@ -140,11 +141,12 @@ class GravityPidController(LeafSystem):
             ControllerError: not n finite numbers >= 0 each.
         """
         values = self._checked(gains)
-        context.get_mutable_numeric_parameter(0).get_mutable_value()[: values.size] = values
+        context.get_mutable_discrete_state(_MEMORY).get_mutable_value()[: values.size] = values
 
     def GetGains(self, context: Context) -> Gains:
         """The gains in use."""
-        kp, kd, ki = context.get_numeric_parameter(0).get_value()[:-1].reshape(3, -1).tolist()
+        n = len(self._joint_names)
+        kp, kd, ki = context.get_discrete_state(_MEMORY).get_value()[: 3 * n].reshape(3, n).tolist()
         return Gains(kp=kp, kd=kd, ki=ki)
 
     def SetMode(self, context: Context, mode: Mode) -> None:
@@ -153,11 +155,13 @@ class GravityPidController(LeafSystem):
         Raises:
             ControllerError: neither "hold" nor "gravity".
         """
-        context.get_mutable_numeric_parameter(0).get_mutable_value()[-1] = self._mode_number(mode)
+        mode_index = 3 * len(self._joint_names)
+        context.get_mutable_discrete_state(_MEMORY).get_mutable_value()[mode_index] = self._mode_number(mode)
 
     def GetMode(self, context: Context) -> Mode:
         """The mode in use."""
-        return _MODES[int(context.get_numeric_parameter(0).get_value()[-1])]
+        mode_index = 3 * len(self._joint_names)
+        return _MODES[int(context.get_discrete_state(_MEMORY).get_value()[mode_index])]
 
     def _checked(self, gains: Gains) -> NDArray[np.float64]:
         n = len(self._joint_names)
@@ -186,9 +190,8 @@ class GravityPidController(LeafSystem):
     ) -> Callable[[Context, DiscreteValues], None]:
         """The handler of an update event.
 
-        It runs between two steps of the plant, which leave nothing of Python in the processor's caches: what costs
-        is each different thing that it touches. So its names are local, and vectors are read in place, all the same
-        way.
+        It runs between two steps of the plant, which leave nothing of Python in the processor's caches: what
+        costs is each different thing that it touches. So its names are local and it touches few things.
         """
         eval_vector_input = self.EvalVectorInput
 
@@ -199,7 +202,6 @@ class GravityPidController(LeafSystem):
                 state,
                 state if desired is None else desired.get_value(),
                 desired is not None,
-                context.get_numeric_parameter(0).get_value(),
                 theta,
                 constants,
                 period,
@@ -212,7 +214,7 @@ class GravityPidController(LeafSystem):
 
     def _calc_gravity_effort(self, context: Context, output: BasicVector) -> None:
         n = output.size()
-        output.SetFromVector(context.get_discrete_state(_MEMORY).get_value()[3 * n : 4 * n])
+        output.SetFromVector(context.get_discrete_state(_MEMORY).get_value()[6 * n + 1 : 7 * n + 1])
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, context.get_discrete_state(_MEMORY).get_value()[-1])
@@ -223,21 +225,26 @@ _MEMORY = DiscreteStateIndex(1)
 
 @cache
 def _compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
-    """One update of the controller as one compiled function without allocation; constants are its arguments.
+    """One update of the controller as one compiled function without allocation.
 
-    Arrays: state, desired (2n); parameters: kp, kd, ki (n each), mode; constants: trust, effort limits (n
-    each); in place: effort (n) and memory: integral, latched pose, last finite pose, gravity effort (n each),
-    then three flags: a pose is latched, a finite pose was seen, fault.
+    Arrays: state, desired (2n); constants: trust, effort limits (n each); in place: effort (n) and memory: kp,
+    kd, ki (n each), mode, then integral, latched pose, last finite pose, gravity effort (n each), then three
+    flags: a pose is latched, a finite pose was seen, fault.
     """
 
-    def step(state, desired, has_desired, parameters, theta, constants, period, restart, effort, memory):
+    def step(state, desired, has_desired, theta, constants, period, restart, effort, memory):
         n = effort.size
-        kp, kd, ki = parameters[:n], parameters[n : 2 * n], parameters[2 * n : 3 * n]
+        kp, kd, ki = memory[:n], memory[n : 2 * n], memory[2 * n : 3 * n]
+        hold = memory[3 * n] == 0.0
         trust, limit = constants[:n], constants[n:]
-        integral, latched_q = memory[:n], memory[n : 2 * n]
-        last_q, gravity = memory[2 * n : 3 * n], memory[3 * n : 4 * n]
-        LATCHED, SEEN, FAULT = 4 * n, 4 * n + 1, 4 * n + 2
-        hold = parameters[3 * n] == 0.0
+        rest = memory[3 * n + 1 :]
+        integral, latched_q, last_q, gravity = (
+            rest[:n],
+            rest[n : 2 * n],
+            rest[2 * n : 3 * n],
+            rest[3 * n : 4 * n],
+        )
+        LATCHED, SEEN, FAULT = 7 * n + 1, 7 * n + 2, 7 * n + 3
 
         if restart:
             memory[LATCHED] = 0.0
@@ -285,11 +292,9 @@ def _compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
             effort[i] = min(max(without_integral + integral[i], -limit[i]), limit[i])
 
     array = numba.float64[::1]
-    view = numba.types.Array(
-        numba.float64, 1, "C", readonly=True
-    )  # what Drake gives of inputs and parameters
+    view = numba.types.Array(numba.float64, 1, "C", readonly=True)  # what Drake gives of inputs
     flag = numba.boolean
-    signature = numba.void(view, view, flag, view, array, array, numba.float64, flag, array, array)
+    signature = numba.void(view, view, flag, array, array, numba.float64, flag, array, array)
     dispatcher = numba.njit(signature)(step)
     # The one compiled signature itself, without the choice between signatures that costs 4 us a call.
     return dispatcher.overloads[signature.args].entry_point
