@@ -3,9 +3,9 @@
     python benchmarks/control_step.py [--json FILE] [--repetitions N] [--seconds S]
 
 All rows simulate the same ArmStation (10 joints, 3 of them coupled; 1 ms SAP steps), publish nothing and run
-as fast as they can. Each repetition starts from the same pose and steps all joints by 0.1 rad: a moving arm is
-the same work for the solver in all controlled rows. Repetitions are interleaved, so that a busy machine slows
-all rows alike. Times are CPU time of this process, medians over the repetitions.
+as fast as they can. Each repetition starts from the same pose and steps all joints by 0.1 rad: a moving arm
+is the same work for the solver in all controlled rows. Repetitions are interleaved, so that a busy machine
+slows all rows alike. Times are CPU time of this process, medians over the repetitions.
 
 Rows:
     python      GravityPidController: Python LeafSystem, one compiled update per millisecond.

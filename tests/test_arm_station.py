@@ -227,7 +227,7 @@ def test_link_inertias_change_one_context_only():
         station.plant.CalcTotalMass(station.GetSubsystemContext(station.plant, c)) for c in (heavy, nominal)
     ]
     assert mass[0] - mass[1] == pytest.approx(1.0 - 0.06, abs=1e-12)
-    with pytest.raises(StationError, match="unknown link hand; links: .*wrist_roll_link"):
+    with pytest.raises(StationError, match=r"unknown link hand; links: .*wrist_roll_link"):
         station.set_link_inertias(heavy, {"hand": payload})
 
 

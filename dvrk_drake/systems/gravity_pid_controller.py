@@ -227,8 +227,8 @@ _MEMORY = DiscreteStateIndex(1)
 def _compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
     """One update of the controller as one compiled function without allocation.
 
-    Arrays: state, desired (2n); constants: trust, effort limits (n each); in place: effort (n), memory: kp, kd,
-    ki (n each), mode, then integral, latched pose, last finite pose, gravity effort (n each), then three
+    Arrays: state, desired (2n); constants: trust, effort limits (n each); in place: effort (n), memory: kp,
+    kd, ki (n each), mode, then integral, latched pose, last finite pose, gravity effort (n each), then three
     flags: a pose is latched, a finite pose was seen, fault.
     """
 
