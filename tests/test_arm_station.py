@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from pydrake.geometry import Meshcat
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -272,6 +273,13 @@ def test_errors_say_what_to_do():
     station = ArmStation(ARM)
     with pytest.raises(StationError, match="a pose of MTML is 7 finite numbers"):
         station.set_positions(station.CreateDefaultContext(), np.zeros(6))
+
+
+def test_meshcat_is_given_the_arm():
+    meshcat = Meshcat()
+    diagram = ArmStation(ARM, meshcat=meshcat)
+    diagram.ForcedPublish(diagram.CreateDefaultContext())
+    assert meshcat.HasPath("/drake/visualizer")
 
 
 def test_two_stations_in_one_diagram_and_again():
