@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
@@ -220,4 +220,4 @@ class GravityPidController(LeafSystem):
         output.SetAtIndex(0, context.get_discrete_state(_MEMORY).get_value()[-1])
 
 
-_MEMORY = DiscreteStateIndex(1)
+_MEMORY = 1  # index of the discrete state group
