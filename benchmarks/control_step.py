@@ -2,23 +2,24 @@
 
     python benchmarks/control_step.py [--json FILE] [--repetitions N] [--seconds S]
 
-All rows simulate the same ArmStation (10 joints, 3 of them coupled; 1 ms SAP steps), publish nothing and run as
-fast as they can. Each repetition starts from the same pose and steps all joints by 0.1 rad, so that the solver has
-the same work in all rows: at rest it stops early, and at a joint limit it works longer. Repetitions are interleaved:
-a busy machine slows all rows alike. Times are CPU time of this process, medians over the repetitions.
+All rows simulate the same ArmStation (10 joints, 3 of them coupled; 1 ms SAP steps), publish nothing and run
+as fast as they can. Each repetition starts from the same pose and steps all joints by 0.1 rad: a moving arm
+is the same work for the solver in all controlled rows. Repetitions are interleaved, so that a busy machine
+slows all rows alike. Times are CPU time of this process, medians over the repetitions.
 
 Rows:
     python      GravityPidController: Python LeafSystem, one compiled update per millisecond.
-    cpp         Drake's InverseDynamics (gravity compensation) on a controller plant, PidController and Adder.
-                InverseDynamics ignores couplers, so it runs on the whole tree and a MatrixGain projects with G':
-                the only way in which stock blocks give this arm's true gravity. The goal is set against this row.
-    cpp_serial  The same on a plant of the seven independent joints alone, without projection. Its gravity is wrong
-                here (the counterweight is on the linkage), but it is what stock blocks cost without a linkage: a
-                lower bound.
-    none        No control: the constant effort that balances the start pose.
+    cpp         Drake's InverseDynamics (gravity compensation) on a controller plant, PidController, Adder.
+                InverseDynamics ignores couplers, so it runs on the whole tree and a MatrixGain projects with
+                G': the only way in which stock blocks give this arm's true gravity. The goal is set against
+                this row.
+    cpp_serial  The same on a plant of the seven independent joints alone, without projection. Its gravity is
+                wrong here (the counterweight is on the linkage), but it is what stock blocks cost without a
+                linkage: a lower bound.
+    none        No control: the constant effort that balances the start pose. The solver has less to do.
 
-PidController's integral is a continuous state: the cpp rows run with the cheapest integrator for it, explicit Euler
-at 1 ms. Both its blocks feed through, so the cpp rows act without the period of delay that the python row has.
+PidController's integral is a continuous state: the cpp rows run with the cheapest integrator for it, explicit
+Euler at 1 ms. Both blocks feed through, so the cpp rows act without the period of delay of the python row.
 """
 
 from __future__ import annotations
@@ -145,7 +146,7 @@ def main() -> None:
     arm = load_arm("mtml")
     rows = {row: start(row, arm) for row in ("python", "cpp", "cpp_serial", "none")}
 
-    # The comparison is only fair if both compute the same: compare the first commands, as they reach the motors.
+    # Only fair if both compute the same: compare the first commands, as they reach the motors.
     ours, theirs = (effort(rows[row][2], rows[row][0].get_context()) for row in ("python", "cpp"))
     difference = np.abs(ours - np.clip(theirs, -arm.effort_limits, arm.effort_limits)).max()
     assert difference < 1e-9, f"efforts differ by {difference} N m"

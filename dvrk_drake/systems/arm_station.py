@@ -73,9 +73,9 @@ class ArmStation(Diagram):
     - `plant_state`, `body_poses`, `query_object`: the plant's own, of the whole tree. Simulation only, as is
       `effort_disturbance`; all others are those of `station_ports`.
 
-    Everything but the plant's step is C++ without state of its own. Measured values are exact and undelayed.
-    The arm meets each joint's position limits (Drake's discrete plants enforce them) but not the coupled
-    limits of its linkage.
+    All of it is C++ and has no state but the plant's. Measured values are exact and undelayed. Drake's solver
+    holds the linkage to about 1e-8 m at 1 ms (1e-7 m with `closure="ball"`), and each joint in its position
+    limits; the coupled limits of the linkage are not there.
     """
 
     def __init__(

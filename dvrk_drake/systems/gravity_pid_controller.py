@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Literal, get_args
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.systems.gravity_pid_step import compile_step, entry_point
 
 #: "hold" regulates a pose, "gravity" only carries the arm's weight and leaves it free to move.
 Mode = Literal["hold", "gravity"]
@@ -52,7 +51,7 @@ class GravityPidController(LeafSystem):
     **Time.** Inputs are sampled and the outputs change every `period` seconds, and at initialization, which
     also empties the integrator and latches the pose. Beside a discrete plant of the same period the command
     is therefore one period late, as it is on hardware. A forced discrete update is the same step, for loops
-    that are driven by messages.
+    that are driven by messages. Gains and mode are part of the Context and can be changed while running.
 
     **Saturation.** `effort` is clamped to the effort limits. Anti-windup is by conditional integration
     (Astrom and Hagglund, Advanced PID Control, 2006, chapter 3): a joint's integrator stands still while its
@@ -106,12 +105,11 @@ class GravityPidController(LeafSystem):
 
         self.DeclareVectorInputPort(name="state_estimated", size=2 * n)
         self.DeclareVectorInputPort(name="desired_state", size=2 * n)
-        # One array each for gains and memory: fetching an array from a Context costs more than the control
-        # law.
-        parameters = np.concatenate([self._checked(gains or arm.gains), [self._mode_number(mode)]])
-        self.DeclareNumericParameter(model_vector=BasicVector(parameters))
         effort = self.DeclareDiscreteState(num_state_variables=n)
-        memory = self.DeclareDiscreteState(num_state_variables=4 * n + 3)
+        # Gains and mode are kept with the memory, not as numeric parameters: reading those from Python would
+        # cost 4-8 us an update.
+        initial = np.concatenate([self._checked(gains or arm.gains), [self._mode_number(mode)], np.zeros(4 * n + 3)])
+        memory = self.DeclareDiscreteState(model_vector=BasicVector(initial))
         self.DeclareStateOutputPort(name="effort", state_index=effort)
         ticket = self.discrete_state_ticket(memory)
         self.DeclareVectorOutputPort(
@@ -119,7 +117,8 @@ class GravityPidController(LeafSystem):
         )
         self.DeclareVectorOutputPort(name="fault", size=1, calc=self._calc_fault, prerequisites_of_calc={ticket})
         constants = (np.ascontiguousarray(model.theta), np.concatenate([model.trust, limits]), self._period)
-        step = _compile_step(model.static_model.torque_into)
+        self._dispatcher = compile_step(model.static_model.torque_into)  # owns the compiled code
+        step = entry_point(self._dispatcher)
         update = self._make_update(step, *constants, restart=False)
         restart = self._make_update(step, *constants, restart=True)
         self.DeclareInitializationDiscreteUpdateEvent(update=restart)
@@ -138,11 +137,12 @@ class GravityPidController(LeafSystem):
             ControllerError: not n finite numbers >= 0 each.
         """
         values = self._checked(gains)
-        context.get_mutable_numeric_parameter(0).get_mutable_value()[: values.size] = values
+        context.get_mutable_discrete_state(_MEMORY).get_mutable_value()[: values.size] = values
 
     def GetGains(self, context: Context) -> Gains:
         """The gains in use."""
-        kp, kd, ki = context.get_numeric_parameter(0).get_value()[:-1].reshape(3, -1).tolist()
+        n = len(self._joint_names)
+        kp, kd, ki = context.get_discrete_state(_MEMORY).get_value()[: 3 * n].reshape(3, n).tolist()
         return Gains(kp=kp, kd=kd, ki=ki)
 
     def SetMode(self, context: Context, mode: Mode) -> None:
@@ -151,11 +151,13 @@ class GravityPidController(LeafSystem):
         Raises:
             ControllerError: neither "hold" nor "gravity".
         """
-        context.get_mutable_numeric_parameter(0).get_mutable_value()[-1] = self._mode_number(mode)
+        mode_index = 3 * len(self._joint_names)
+        context.get_mutable_discrete_state(_MEMORY).get_mutable_value()[mode_index] = self._mode_number(mode)
 
     def GetMode(self, context: Context) -> Mode:
         """The mode in use."""
-        return _MODES[int(context.get_numeric_parameter(0).get_value()[-1])]
+        mode_index = 3 * len(self._joint_names)
+        return _MODES[int(context.get_discrete_state(_MEMORY).get_value()[mode_index])]
 
     def _checked(self, gains: Gains) -> NDArray[np.float64]:
         n = len(self._joint_names)
@@ -184,9 +186,8 @@ class GravityPidController(LeafSystem):
     ) -> Callable[[Context, DiscreteValues], None]:
         """The handler of an update event.
 
-        It runs between two steps of the plant, which leave nothing of Python in the processor's caches: what costs
-        is each different thing that it touches. So its names are local, and vectors are read in place, all the same
-        way.
+        It runs between two steps of the plant, which leave nothing of Python in the processor's caches: what
+        costs is each different thing that it touches. So its names are local and it touches few things.
         """
         eval_vector_input = self.EvalVectorInput
 
@@ -197,7 +198,6 @@ class GravityPidController(LeafSystem):
                 state,
                 state if desired is None else desired.get_value(),
                 desired is not None,
-                context.get_numeric_parameter(0).get_value(),
                 theta,
                 constants,
                 period,
@@ -210,82 +210,10 @@ class GravityPidController(LeafSystem):
 
     def _calc_gravity_effort(self, context: Context, output: BasicVector) -> None:
         n = output.size()
-        output.SetFromVector(context.get_discrete_state(_MEMORY).get_value()[3 * n : 4 * n])
+        output.SetFromVector(context.get_discrete_state(_MEMORY).get_value()[6 * n + 1 : 7 * n + 1])
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, context.get_discrete_state(_MEMORY).get_value()[-1])
 
 
-_MEMORY = DiscreteStateIndex(1)
-
-
-@cache
-def _compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
-    """One update of the controller as one compiled function without allocation; constants are its arguments.
-
-    Arrays: state, desired (2n); parameters: kp, kd, ki (n each), mode; constants: trust, effort limits (n
-    each); in place: effort (n) and memory: integral, latched pose, last finite pose, gravity effort (n each),
-    then three flags: a pose is latched, a finite pose was seen, fault.
-    """
-
-    def step(state, desired, has_desired, parameters, theta, constants, period, restart, effort, memory):
-        n = effort.size
-        kp, kd, ki = parameters[:n], parameters[n : 2 * n], parameters[2 * n : 3 * n]
-        trust, limit = constants[:n], constants[n:]
-        integral, latched_q = memory[:n], memory[n : 2 * n]
-        last_q, gravity = memory[2 * n : 3 * n], memory[3 * n : 4 * n]
-        LATCHED, SEEN, FAULT = 4 * n, 4 * n + 1, 4 * n + 2
-        hold = parameters[3 * n] == 0.0
-
-        if restart:
-            memory[LATCHED] = 0.0
-            memory[SEEN] = 0.0
-            integral[:] = 0.0
-        fault = False
-        for i in range(2 * n):
-            fault |= not np.isfinite(state[i])
-        if not fault:
-            last_q[:] = state[:n]
-            memory[SEEN] = 1.0
-        if hold and has_desired:
-            for i in range(2 * n):
-                fault |= not np.isfinite(desired[i])
-        memory[FAULT] = 1.0 if fault else 0.0
-
-        if memory[SEEN] == 0.0:
-            gravity[:] = 0.0
-        else:
-            torque_into(last_q, theta, gravity)
-            for i in range(n):
-                gravity[i] *= trust[i]
-        if fault or not hold:
-            memory[LATCHED] = 0.0
-            for i in range(n):
-                integral[i] = 0.0
-                effort[i] = min(max(gravity[i], -limit[i]), limit[i])
-            return
-
-        if memory[LATCHED] == 0.0:
-            latched_q[:] = last_q
-            memory[LATCHED] = 1.0
-        for i in range(n):
-            e = (desired[i] if has_desired else latched_q[i]) - state[i]
-            de = (desired[n + i] if has_desired else 0.0) - state[n + i]
-            without_integral = gravity[i] + kp[i] * e + kd[i] * de
-            increment = 0.0 if restart else ki[i] * e * period
-            if ki[i] == 0.0:
-                integral[i] = 0.0
-            command = without_integral + integral[i] + increment
-            far = abs(kp[i] * e) > limit[i]
-            winds_up = (command > limit[i] and increment > 0.0) or (command < -limit[i] and increment < 0.0)
-            if not (far or winds_up):
-                integral[i] += increment
-            effort[i] = min(max(without_integral + integral[i], -limit[i]), limit[i])
-
-    array = numba.float64[::1]
-    view = numba.types.Array(numba.float64, 1, "C", readonly=True)  # what Drake gives of inputs and parameters
-    flag = numba.boolean
-    signature = numba.void(view, view, flag, view, array, array, numba.float64, flag, array, array)
-    dispatcher = numba.njit(signature)(step)
-    # The one compiled signature itself, without the choice between signatures that costs 4 us a call.
-    return dispatcher.overloads[signature.args].entry_point
+_MEMORY = 1  # index of the discrete state group

@@ -1,0 +1,291 @@
+"""The simulated arm behind its driver's ports."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat
+from pydrake.multibody.tree import SpatialInertia, UnitInertia
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import StationError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import tree_selector
+from dvrk_drake.systems.arm_station import ArmStation, station_ports
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+
+ARM = load_arm("mtml")
+MODEL = IdentifiedModel.from_arm(ARM)
+N = ARM.num_joints
+# What SAP holds the linkage to [m] at 1 ms under this arm's loads: its constraints are stiff, not rigid.
+# Measured: 1.0e-8 at rest and 1.2e-8 falling with couplers, 1.3e-7 with the ball constraint.
+GAP = {"mimic": 2e-8, "ball": 2e-7}
+POSES = ARM.sample_poses(5, np.random.default_rng(0), margin=0.1)
+
+
+def loop_gap(station, context):
+    """Largest distance [m] between frames that the linkage keeps together."""
+    plant = station.plant
+    plant_context = station.GetSubsystemContext(plant, context)
+    gaps = []
+    for loop in ARM.loop_closures:
+        A, B = plant.GetFrameByName(loop.frame_a), plant.GetFrameByName(loop.frame_b)
+        gaps.append(np.linalg.norm(A.CalcPose(plant_context, B).translation()))
+    return max(gaps)
+
+
+def linkage_error(station, context):
+    """Largest difference [rad] between the tree's joints and what the linkage makes of the arm's."""
+    plant_context = station.GetSubsystemContext(station.plant, context)
+    q_tree = station.plant.GetPositions(plant_context)[tree_selector(station.plant, ARM)]
+    return np.abs(q_tree - ARM.linkage.position(station.get_positions(context))).max()
+
+
+def released(q, closure="mimic", **arguments):
+    """A station under gravity compensation alone, at pose q; and its simulator."""
+    builder = DiagramBuilder()
+    station = builder.AddSystem(ArmStation(ARM, closure=closure, **arguments))
+    controller = builder.AddSystem(GravityPidController(MODEL, mode="gravity"))
+    builder.Connect(station.GetOutputPort("mtml.state_estimated"), controller.GetInputPort("state_estimated"))
+    builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort("mtml.effort_commanded"))
+    simulator = Simulator(builder.Build())
+    station.set_positions(station.GetMyMutableContextFromRoot(simulator.get_mutable_context()), q)
+    return station, simulator
+
+
+@pytest.mark.parametrize("name", ["mtml", "mtmr"])
+def test_port_names_and_sizes(name):
+    arm = load_arm(name)
+    station = ArmStation(arm)
+    inputs = {p.get_name(): p.size() for p in map(station.get_input_port, range(station.num_input_ports()))}
+    outputs = {p.get_name(): p.size() for p in map(station.get_output_port, range(station.num_output_ports()))}
+    expected = station_ports(arm)
+    assert expected.inputs == {f"{name}.effort_commanded": 7}
+    assert expected.inputs.items() <= inputs.items()
+    assert expected.outputs.items() <= outputs.items()
+    assert set(inputs) - set(expected.inputs) == {f"{name}.effort_disturbance"}
+    assert set(outputs) - set(expected.outputs) == {"plant_state", "body_poses", "query_object"}
+
+
+@pytest.mark.parametrize("q", POSES)
+@pytest.mark.parametrize("closure", ["mimic", "ball"])
+def test_exact_gravity_compensation_holds_a_released_arm(q, closure):
+    station, simulator = released(q, closure)
+    simulator.AdvanceTo(2.0)
+    context = station.GetMyContextFromRoot(simulator.get_context())
+    assert np.abs(station.get_positions(context) - q).max() < 1e-4
+    assert loop_gap(station, context) < GAP[closure]
+
+
+@pytest.mark.parametrize("closure", ["mimic", "ball"])
+def test_linkage_stays_closed_while_the_arm_falls(closure):
+    station = ArmStation(ARM, closure=closure)
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    station.set_positions(context, POSES[0])
+    worst = 0.0
+    for t in np.arange(0.01, 0.5, 0.01):
+        simulator.AdvanceTo(t)
+        worst = max(worst, loop_gap(station, context))
+    assert np.abs(station.get_positions(context) - POSES[0]).max() > 0.1
+    assert worst < GAP[closure]
+
+
+def test_energy_never_grows_without_effort_and_its_loss_vanishes_with_the_step():
+    # No damping and no limit in reach: what is lost is the integrator's, which is of first order in the step.
+    q = np.array([0.1, 0.4, -0.2, 0.3, 0.5, 0.1, 0.0])
+    losses = []
+    for time_step in (1e-3, 2.5e-4):
+        station = ArmStation(ARM, time_step=time_step)
+        simulator = Simulator(station)
+        context = simulator.get_mutable_context()
+        station.set_positions(context, q)
+        plant = station.plant
+        plant_context = station.GetSubsystemContext(plant, context)
+
+        def energy(plant=plant, plant_context=plant_context):
+            # Drake's kinetic energy leaves the rotors out; its mass matrix holds them.
+            v = plant.GetVelocities(plant_context)
+            kinetic = 0.5 * v @ plant.CalcMassMatrix(plant_context) @ v
+            return kinetic, plant.EvalPotentialEnergy(plant_context)
+
+        total = [sum(energy())]
+        for t in np.arange(0.01, 0.201, 0.01):
+            simulator.AdvanceTo(t)
+            total.append(sum(energy()))
+        A, lower, upper = ARM.limit_matrix()
+        assert np.all(A[:N] @ station.get_positions(context) > lower[:N])
+        assert np.all(A[:N] @ station.get_positions(context) < upper[:N])
+        kinetic, _ = energy()
+        assert kinetic > 0.05
+        losses.append((total[0] - np.array(total)) / kinetic)
+    assert np.abs(losses[0]).max() < 0.02
+    assert np.abs(losses[1]).max() < np.abs(losses[0]).max() / 3
+
+
+def test_effort_measured_is_the_clamped_command():
+    station = ArmStation(ARM)
+    context = station.CreateDefaultContext()
+    port = station.GetInputPort("mtml.effort_commanded")
+    command = np.linspace(-0.02, 0.02, N)
+    port.FixValue(context, command)
+    np.testing.assert_array_equal(station.GetOutputPort("mtml.effort_measured").Eval(context), command)
+    port.FixValue(context, 100 * np.array([1, -1, 1, -1, 1, -1, 1.0]))
+    expected = ARM.effort_limits * [1, -1, 1, -1, 1, -1, 1]
+    np.testing.assert_array_equal(station.GetOutputPort("mtml.effort_measured").Eval(context), expected)
+
+
+def acceleration_of(station, q, inputs):
+    """Mean acceleration of the independent joints over the first millisecond."""
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    station.set_positions(context, q)
+    for name, value in inputs.items():
+        station.GetInputPort(name).FixValue(context, value)
+    simulator.AdvanceTo(1e-3)
+    return station.GetOutputPort("mtml.velocity_estimated").Eval(context) / 1e-3
+
+
+@pytest.mark.parametrize("j", range(N))
+def test_efforts_act_on_their_own_joint_through_the_linkage(j):
+    # M vd = tau - G at rest, with M and G of the seven independent joints: a known truth for both inputs.
+    q = POSES[1]
+    station = ArmStation(ARM)
+    plant = station.plant
+    context = station.CreateDefaultContext()
+    station.set_positions(context, q)
+    selection = tree_selector(plant, ARM)
+    G = ARM.linkage.matrix
+    M = plant.CalcMassMatrix(station.GetSubsystemContext(plant, context))
+    M = G.T @ M[np.ix_(selection, selection)] @ G
+    tau = MODEL.holding_torque(q)
+    extra = 0.2 * ARM.effort_limits * np.eye(N)[j]
+    expected = np.linalg.solve(M, extra)
+    for name in ("mtml.effort_commanded", "mtml.effort_disturbance"):
+        inputs = {"mtml.effort_commanded": tau, "mtml.effort_disturbance": np.zeros(N)}
+        inputs[name] = inputs[name] + extra
+        # Ten short steps: SAP's couplers give by 0.2 % in the first step, and are stiff after a few.
+        measured = acceleration_of(ArmStation(ARM, time_step=1e-4), q, inputs)
+        np.testing.assert_allclose(measured, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
+
+
+def test_disturbance_is_not_clamped():
+    far = 10 * ARM.effort_limits * np.eye(N)[0]
+    q = POSES[1]
+    commanded = acceleration_of(ArmStation(ARM), q, {"mtml.effort_commanded": far})
+    disturbed = acceleration_of(ArmStation(ARM), q, {"mtml.effort_disturbance": far})
+    assert disturbed[0] > 5 * commanded[0] > 0
+
+
+def test_unconnected_inputs_mean_a_limp_arm():
+    q = POSES[2]
+    unconnected = acceleration_of(ArmStation(ARM), q, {})
+    zero = {"mtml.effort_commanded": np.zeros(N), "mtml.effort_disturbance": np.zeros(N)}
+    np.testing.assert_array_equal(unconnected, acceleration_of(ArmStation(ARM), q, zero))
+    station = ArmStation(ARM)
+    context = station.CreateDefaultContext()
+    np.testing.assert_array_equal(station.GetOutputPort("mtml.effort_measured").Eval(context), np.zeros(N))
+
+
+def test_measurements_are_the_state_of_the_independent_joints():
+    station = ArmStation(ARM)
+    context = station.CreateDefaultContext()
+    station.set_positions(context, POSES[3])
+    plant_context = station.GetMutableSubsystemContext(station.plant, context)
+    v = np.arange(1.0, 1 + N)
+    v_plant = np.zeros(station.plant.num_velocities())
+    for name, value in zip(ARM.joint_names, v, strict=True):
+        v_plant[station.plant.GetJointByName(name).velocity_start()] = value
+    station.plant.SetVelocities(plant_context, v_plant)
+    np.testing.assert_array_equal(station.GetOutputPort("mtml.position_measured").Eval(context), POSES[3])
+    np.testing.assert_array_equal(station.GetOutputPort("mtml.velocity_estimated").Eval(context), v)
+    expected = np.concatenate([POSES[3], v])
+    np.testing.assert_array_equal(station.GetOutputPort("mtml.state_estimated").Eval(context), expected)
+    np.testing.assert_array_equal(station.get_positions(context), POSES[3])
+
+
+def test_set_positions_closes_the_linkage_and_rests():
+    station = ArmStation(ARM, closure="ball")
+    context = station.CreateDefaultContext()
+    station.set_positions(context, POSES[4])
+    assert loop_gap(station, context) < 1e-15
+    assert linkage_error(station, context) < 1e-15
+    assert not np.any(station.GetOutputPort("mtml.velocity_estimated").Eval(context))
+
+
+def test_link_inertias_change_one_context_only():
+    station = ArmStation(ARM)
+    heavy, nominal = station.CreateDefaultContext(), station.CreateDefaultContext()
+    payload = SpatialInertia(
+        1.0, np.array([0, 0, -0.05]), UnitInertia.SolidSphere(0.03).ShiftFromCenterOfMass([0, 0, 0.05])
+    )
+    station.set_link_inertias(heavy, {"wrist_roll_link": payload})
+    mass = [station.plant.CalcTotalMass(station.GetSubsystemContext(station.plant, c)) for c in (heavy, nominal)]
+    assert mass[0] - mass[1] == pytest.approx(1.0 - 0.06, abs=1e-12)
+    with pytest.raises(StationError, match=r"unknown link hand; links: .*wrist_roll_link"):
+        station.set_link_inertias(heavy, {"hand": payload})
+
+
+def test_modify_plant_and_plant_arm():
+    def add_damping(plant):
+        for name in ARM.joint_names:
+            plant.GetJointByName(name).set_default_damping_vector([0.5])
+
+    q = POSES[0]
+    free, damped = ArmStation(ARM), ArmStation(ARM, modify_plant=add_damping)
+    moved = []
+    for station in (free, damped):
+        simulator = Simulator(station)
+        station.set_positions(simulator.get_mutable_context(), q)
+        simulator.AdvanceTo(0.2)
+        moved.append(np.abs(station.get_positions(simulator.get_context()) - q).max())
+    assert moved[1] < 0.5 * moved[0]
+
+    weightless = ArmStation(ARM, plant_arm=ARM.with_gravity([0.0, 0.0, 0.0]))
+    assert weightless.arm is ARM
+    assert not np.any(acceleration_of(weightless, q, {}))
+
+
+def test_stronger_motors_are_measured():
+    def strengthen(plant):
+        plant.GetJointActuatorByName("outer_yaw").set_effort_limit(50.0)
+
+    station = ArmStation(ARM, modify_plant=strengthen)
+    context = station.CreateDefaultContext()
+    station.GetInputPort("mtml.effort_commanded").FixValue(context, np.full(N, 20.0))
+    effort = station.GetOutputPort("mtml.effort_measured").Eval(context)
+    np.testing.assert_array_equal(effort, np.minimum(20.0, [50.0, *ARM.effort_limits[1:]]))
+
+
+def test_errors_say_what_to_do():
+    with pytest.raises(StationError, match="comes with the LCM interface"):
+        ArmStation(ARM, hardware=True)
+    with pytest.raises(StationError, match="time_step must be a positive number"):
+        ArmStation(ARM, time_step=0.0)
+    with pytest.raises(StationError, match="plant_arm must have the joints of MTML"):
+        ArmStation(ARM, plant_arm=dataclasses.replace(ARM, joint_names=ARM.joint_names[::-1]))
+    station = ArmStation(ARM)
+    with pytest.raises(StationError, match="a pose of MTML is 7 finite numbers"):
+        station.set_positions(station.CreateDefaultContext(), np.zeros(6))
+
+
+def test_meshcat_is_given_the_arm():
+    meshcat = Meshcat()
+    diagram = ArmStation(ARM, meshcat=meshcat)
+    diagram.ForcedPublish(diagram.CreateDefaultContext())
+    assert meshcat.HasPath("/drake/visualizer")
+
+
+def test_two_stations_in_one_diagram_and_again():
+    for _ in range(2):
+        builder = DiagramBuilder()
+        left = builder.AddSystem(ArmStation(ARM))
+        right = builder.AddSystem(ArmStation(load_arm("mtmr")))
+        simulator = Simulator(builder.Build())
+        simulator.AdvanceTo(0.01)
+        context = simulator.get_context()
+        q = [s.get_positions(s.GetMyContextFromRoot(context)) for s in (left, right)]
+        np.testing.assert_array_equal(*q)
+        assert np.any(q[0])

@@ -1,0 +1,275 @@
+"""The control law against its own equation, and what it does when something is wrong."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ControllerError, ModelError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+
+ARM = load_arm("mtml")
+MODEL = IdentifiedModel.from_arm(ARM)
+N = ARM.num_joints
+GAINS = Gains(kp=[1.0 + j for j in range(N)], kd=[0.5 + 0.1 * j for j in range(N)], ki=[0.2 * j for j in range(N)])
+UNLIMITED = np.full(N, 1e6)
+POSES = ARM.sample_poses(5, np.random.default_rng(0))
+
+
+class Bench:
+    """A controller alone; `step` is one update, as the Simulator or a message loop makes it."""
+
+    def __init__(self, desired=None, **arguments):
+        self.controller = GravityPidController(arguments.pop("model", MODEL), **arguments)
+        self.context = self.controller.CreateDefaultContext()
+        if desired is not None:
+            self.controller.GetInputPort("desired_state").FixValue(self.context, desired)
+
+    def set_state(self, q, v=None):
+        value = np.concatenate([q, np.zeros(N) if v is None else v])
+        self.controller.GetInputPort("state_estimated").FixValue(self.context, value)
+
+    def initialize(self, q, v=None):
+        self.set_state(q, v)
+        self.controller.ExecuteInitializationEvents(self.context)
+        return self.output("effort")
+
+    def step(self, q, v=None):
+        self.set_state(q, v)
+        self.context.SetDiscreteState(self.controller.EvalUniquePeriodicDiscreteUpdate(self.context))
+        return self.output("effort")
+
+    def output(self, name):
+        return self.controller.GetOutputPort(name).Eval(self.context)
+
+
+def test_ports():
+    controller = GravityPidController(MODEL)
+    inputs = [controller.get_input_port(i) for i in range(controller.num_input_ports())]
+    outputs = [controller.get_output_port(i) for i in range(controller.num_output_ports())]
+    assert [(p.get_name(), p.size()) for p in inputs] == [
+        ("state_estimated", 2 * N),
+        ("desired_state", 2 * N),
+    ]
+    assert [(p.get_name(), p.size()) for p in outputs] == [("effort", N), ("gravity_effort", N), ("fault", 1)]
+    # All outputs are held between updates: no algebraic loop with a plant that feeds through.
+    assert not controller.HasAnyDirectFeedthrough()
+
+
+@pytest.mark.parametrize("q", POSES)
+def test_gravity_mode_is_the_plants_own_gravity(q):
+    plant = make_arm_plant(ARM)
+    plant_context = plant.CreateDefaultContext()
+    set_arm_positions(plant, plant_context, ARM, q)
+    bench = Bench(mode="gravity", effort_limits=UNLIMITED)
+    effort = bench.initialize(q, v=np.ones(N))
+    np.testing.assert_allclose(effort, holding_torque(plant, plant_context, ARM), atol=1e-12)
+    np.testing.assert_array_equal(bench.output("gravity_effort"), effort)
+    assert bench.output("fault") == [0.0]
+
+
+def test_law_is_equation_11():
+    rng = np.random.default_rng(1)
+    q_d, v_d = POSES[0], rng.normal(size=N)
+    bench = Bench(np.concatenate([q_d, v_d]), gains=GAINS, effort_limits=UNLIMITED, period=2e-3)
+    bench.initialize(POSES[1])
+    integral = np.zeros(N)
+    for _ in range(20):
+        q, v = POSES[1] + rng.normal(scale=0.1, size=N), rng.normal(size=N)
+        integral += (q_d - q) * 2e-3
+        expected = (
+            MODEL.holding_torque(q)
+            + np.multiply(GAINS.kp, q_d - q)
+            + np.multiply(GAINS.kd, v_d - v)
+            + np.multiply(GAINS.ki, integral)
+        )
+        np.testing.assert_allclose(bench.step(q, v), expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("j", range(N))
+def test_velocity_alone_is_damped_on_its_own_joint_and_no_other(j):
+    # The paper's node fed positions into the damping of joints 5-7: large positions must leave it untouched.
+    q = POSES[2] + 1.0
+    bench = Bench(np.concatenate([q, np.zeros(N)]), gains=GAINS, effort_limits=UNLIMITED)
+    still = bench.initialize(q)
+    v = 0.3 * np.eye(N)[j]
+    np.testing.assert_allclose(bench.step(q, v) - still, -GAINS.kd[j] * v, atol=1e-14)
+
+
+def test_effort_is_clamped_and_gravity_effort_is_not():
+    limits = np.full(N, 0.01)
+    q = POSES[0]
+    bench = Bench(np.concatenate([q + 0.5, np.zeros(N)]), gains=GAINS, effort_limits=limits)
+    np.testing.assert_array_equal(bench.initialize(q), limits)
+    np.testing.assert_allclose(bench.output("gravity_effort"), MODEL.holding_torque(q), atol=1e-15)
+    assert np.abs(bench.output("gravity_effort")).max() > 0.01
+
+
+def test_integrator_does_not_wind_up():
+    gains = Gains(kp=[1.0] * N, kd=[1.0] * N, ki=[100.0] * N)
+    limits = np.full(N, 2.0)
+    q = np.zeros(N)
+    bench = Bench(np.concatenate([q + 0.5, np.zeros(N)]), gains=gains, effort_limits=limits)
+    bench.initialize(q)
+    for _ in range(1000):  # 100 / s * 0.5 rad * 1 s = 50 N m, were it not for the limit
+        bench.step(q)
+    # Past the goal the command comes back at once: at most the limit was stored.
+    effort = bench.step(q + 0.5)
+    gravity = MODEL.holding_torque(q + 0.5)
+    assert np.all(effort - gravity <= 2.0 - 0.5 * 1.0 - MODEL.holding_torque(q) + 1e-9)
+    # And it unwinds when the error changes sign.
+    assert np.all(bench.step(q + 0.6) < effort - gravity + MODEL.holding_torque(q + 0.6))
+
+
+def test_integrator_waits_while_the_goal_is_far():
+    gains = Gains(kp=[10.0] * N, kd=[0.0] * N, ki=[1.0] * N)
+    q = np.zeros(N)
+    bench = Bench(np.concatenate([q + 0.5, np.zeros(N)]), gains=gains, effort_limits=np.full(N, 2.0))
+    bench.initialize(q)
+    # Braking hard keeps the command inside the limit, but Kp e = 5 N m alone is beyond it.
+    for _ in range(100):
+        bench.step(q)
+    np.testing.assert_allclose(bench.step(q + 0.5), MODEL.holding_torque(q + 0.5), atol=1e-14)
+
+
+def test_unconnected_hold_latches_the_pose_at_initialization():
+    bench = Bench(gains=GAINS, effort_limits=UNLIMITED)
+    np.testing.assert_allclose(bench.initialize(POSES[0]), MODEL.holding_torque(POSES[0]), atol=1e-14)
+    moved = POSES[0] + 0.01
+    integral = np.multiply(GAINS.ki, -0.01 * 1e-3)
+    expected = MODEL.holding_torque(moved) - 0.01 * np.array(GAINS.kp) + integral
+    np.testing.assert_allclose(bench.step(moved), expected, atol=1e-14)
+
+
+def test_switching_from_gravity_to_hold_latches_there_and_does_not_jump():
+    bench = Bench(gains=GAINS, effort_limits=UNLIMITED, mode="gravity")
+    bench.initialize(POSES[0])
+    assert bench.controller.GetMode(bench.context) == "gravity"
+    bench.step(POSES[1])
+    bench.controller.SetMode(bench.context, "hold")
+    np.testing.assert_allclose(bench.step(POSES[2]), MODEL.holding_torque(POSES[2]), atol=1e-14)
+    assert np.abs(bench.step(POSES[3]) - MODEL.holding_torque(POSES[3])).max() > 0.1
+    bench.controller.SetMode(bench.context, "gravity")
+    np.testing.assert_allclose(bench.step(POSES[3]), MODEL.holding_torque(POSES[3]), atol=1e-14)
+
+
+def test_gains_belong_to_the_context():
+    bench = Bench(gains=GAINS, effort_limits=UNLIMITED)
+    other = bench.controller.CreateDefaultContext()
+    zero = Gains(kp=[0.0] * N, kd=[0.0] * N, ki=[0.0] * N)
+    bench.initialize(POSES[0])
+    for _ in range(5):
+        bench.step(POSES[1])
+    bench.controller.SetGains(bench.context, zero)
+    assert bench.controller.GetGains(bench.context) == zero
+    assert bench.controller.GetGains(other) == GAINS
+    # Ki = 0 empties the integrator: nothing but gravity is left.
+    np.testing.assert_allclose(bench.step(POSES[1], np.ones(N)), MODEL.holding_torque(POSES[1]), atol=1e-14)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("where", ["position", "velocity", "desired"])
+def test_a_fault_leaves_the_gravity_of_the_last_finite_pose(bad, where):
+    desired = np.concatenate([POSES[0] + 0.1, np.zeros(N)])
+    bench = Bench(desired, gains=GAINS, effort_limits=UNLIMITED)
+    bench.initialize(POSES[0])
+    for _ in range(10):
+        bench.step(POSES[0])
+    q, v = POSES[1].copy(), np.zeros(N)
+    if where == "desired":
+        last = q
+        port = bench.controller.GetInputPort("desired_state")
+        port.FixValue(bench.context, np.where(np.arange(2 * N) == 3, bad, desired))
+    else:
+        last = POSES[0]
+        (q if where == "position" else v)[2] = bad
+    np.testing.assert_allclose(bench.step(q, v), MODEL.holding_torque(last), atol=1e-14)
+    np.testing.assert_allclose(bench.output("gravity_effort"), MODEL.holding_torque(last), atol=1e-14)
+    assert bench.output("fault") == [1.0]
+    # It resumes by itself, with an empty integrator.
+    bench.controller.GetInputPort("desired_state").FixValue(bench.context, desired)
+    e = 0.1
+    expected = MODEL.holding_torque(POSES[0]) + e * np.array(GAINS.kp) + e * 1e-3 * np.array(GAINS.ki)
+    np.testing.assert_allclose(bench.step(POSES[0]), expected, atol=1e-13)
+    assert bench.output("fault") == [0.0]
+
+
+def test_a_fault_before_any_pose_commands_nothing():
+    bench = Bench(gains=GAINS)
+    np.testing.assert_array_equal(bench.initialize(np.full(N, np.nan)), np.zeros(N))
+    assert bench.output("fault") == [1.0]
+    np.testing.assert_allclose(bench.step(POSES[0]), MODEL.holding_torque(POSES[0]), atol=1e-14)
+
+
+def test_gravity_mode_does_not_look_at_the_desired_state():
+    bench = Bench(np.full(2 * N, np.nan), mode="gravity")
+    bench.initialize(POSES[0])
+    assert bench.output("fault") == [0.0]
+
+
+def test_forced_update_is_the_periodic_update():
+    one, two = (Bench(gains=GAINS) for _ in range(2))
+    for bench in (one, two):
+        bench.initialize(POSES[0])
+    expected = one.step(POSES[0] + 1e-3)
+    two.set_state(POSES[0] + 1e-3)
+    discrete_state = two.controller.AllocateDiscreteVariables()
+    two.controller.CalcForcedDiscreteVariableUpdate(two.context, discrete_state)
+    two.context.SetDiscreteState(discrete_state)
+    np.testing.assert_array_equal(two.output("effort"), expected)
+
+
+def test_simulator_holds_the_output_between_updates():
+    builder = DiagramBuilder()
+    controller = builder.AddSystem(GravityPidController(MODEL, period=0.01, gains=GAINS))
+    state = builder.AddSystem(ConstantVectorSource(np.concatenate([POSES[0], np.zeros(N)])))
+    desired = builder.AddSystem(ConstantVectorSource(np.concatenate([POSES[0] + 1e-3, np.zeros(N)])))
+    builder.Connect(state.get_output_port(), controller.GetInputPort("state_estimated"))
+    builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
+    simulator = Simulator(builder.Build())
+    simulator.Initialize()
+    context = controller.GetMyContextFromRoot(simulator.get_context())
+    port = controller.GetOutputPort("effort")
+    without_integral = MODEL.holding_torque(POSES[0]) + 1e-3 * np.array(GAINS.kp)
+    np.testing.assert_allclose(port.Eval(context), without_integral, atol=1e-14)  # right from the start
+    simulator.AdvanceTo(0.055)  # updates at 0, 0.01, .. 0.05: six
+    expected = without_integral + 6 * 0.01 * 1e-3 * np.array(GAINS.ki)
+    np.testing.assert_allclose(port.Eval(context), expected, atol=1e-14)
+
+
+def test_trust_scales_the_gravity():
+    joints = [dataclasses.replace(joint, trust=0.25) for joint in MODEL.joints]
+    bench = Bench(model=dataclasses.replace(MODEL, joints=joints), mode="gravity", effort_limits=UNLIMITED)
+    np.testing.assert_allclose(bench.initialize(POSES[0]), 0.25 * MODEL.holding_torque(POSES[0]), atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"period": 0.0}, "period must be a positive number"),
+        ({"period": float("nan")}, "period must be a positive number"),
+        ({"mode": "float"}, 'unknown mode "float"; known modes: hold, gravity'),
+        ({"effort_limits": [1.0] * 6}, "effort_limits must be 7 positive numbers"),
+        ({"effort_limits": [np.nan] * 7}, "effort_limits must be 7 positive numbers"),
+        ({"gains": Gains(kp=[1.0], kd=[1.0] * 7, ki=[1.0] * 7)}, "gains.kp must be 7 finite numbers"),
+        (
+            {"gains": Gains(kp=[1.0] * 7, kd=[-1.0] * 7, ki=[1.0] * 7)},
+            "gains.kd must be 7 finite numbers >= 0",
+        ),
+    ],
+)
+def test_errors_say_what_is_allowed(arguments, message):
+    with pytest.raises(ControllerError, match=message):
+        GravityPidController(MODEL, **arguments)
+
+
+def test_a_model_that_does_not_fit_its_arm_is_refused():
+    with pytest.raises(ModelError, match="base parameters must be"):
+        GravityPidController(dataclasses.replace(MODEL, base_parameters=MODEL.base_parameters[1:]))
