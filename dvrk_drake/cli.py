@@ -40,11 +40,17 @@ def _model(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.tables import make_console, print_symbolic_model
     from dvrk_drake.dynamics import export
     from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
+    from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.atomic_file import atomic_write
 
-    gravity = derive_gravity(_mounted(load_arm(options.arm), options.gravity), options.frames, options.serial)
-    writers = {"latex": export.to_latex, "python": export.to_python, "c": export.to_c}
+    arm = _mounted(load_arm(options.arm), options.gravity)
+    gravity = derive_gravity(arm, options.frames, options.serial)
+    writers = {
+        "latex": lambda gravity: export.to_latex(gravity, SymbolicPlant(arm, options.frames).frame_poses()),
+        "python": export.to_python,
+        "c": export.to_c,
+    }
     if options.format is None:
         print_symbolic_model(make_console(), gravity)
         return

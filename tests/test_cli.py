@@ -127,8 +127,10 @@ def test_latex_names_every_parameter_and_torque(capsys):
         assert rf"\beta_{{{i}}} &=" in text
     for j in range(1, 8):
         assert rf"\tau_{{{j}}} &=" in text
+    assert r"P &= g \left(" in text
+    assert r"X_{0,7} &=" in text
     assert r"- L_{4} ( m_{4} + \dots + m_{7} ) - m_{3} c_{3z} + m_{4} c_{4y}" in text
-    assert text.count(r"\begin{align*}") == text.count(r"\end{align*}") == 3
+    assert text.count(r"\begin{align*}") == text.count(r"\end{align*}") == 5
     assert text.count(r"\left(") == text.count(r"\right)")
 
 

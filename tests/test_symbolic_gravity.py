@@ -5,10 +5,12 @@ import sys
 
 import numpy as np
 import pytest
+import sympy
 
 from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
-from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
+from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, derive_gravity
+from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
@@ -82,10 +84,6 @@ def random_q():
 
 def evaluate(gravity, q):
     """The symbolic regressor by sympy's own evaluation, independent of our code generator."""
-    import sympy
-
-    from dvrk_drake.dynamics.symbolic_gravity import GRAVITY
-
     function = sympy.lambdify([*gravity.q, GRAVITY], gravity.regressor, modules="numpy")
     return np.array([np.array(function(*pose, 9.81), dtype=float) for pose in q])
 
@@ -162,6 +160,40 @@ def test_regressor_times_parameters_is_the_plants_holding_torque(arm, random_q, 
     np.testing.assert_allclose(model.torque(random_q[0], beta), expected[0], atol=1e-12)
     stacked = model.regressor(random_q).reshape(-1, len(beta))
     assert np.linalg.matrix_rank(stacked) == len(beta)
+
+
+def test_torque_is_the_gradient_of_the_symbolic_potential_and_the_potential_is_the_plants(arm, random_q):
+    gravity = derive_gravity(arm)
+    gradient = sympy.Matrix(gravity.potential).T.jacobian(gravity.q).T
+    difference = sympy.lambdify([*gravity.q], (gradient - gravity.regressor).subs(GRAVITY, 9.81), modules="numpy")
+    assert max(np.abs(np.array(difference(*q), float)).max() for q in random_q) < 1e-12
+    potential = sympy.lambdify([*gravity.q], gravity.potential.subs(GRAVITY, 9.81), modules="numpy")
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    constants = []
+    for q in random_q:
+        set_arm_positions(plant, context, arm, q)
+        ours = (np.array(potential(*q), float) @ gravity.base_values)[0]
+        constants.append(plant.CalcPotentialEnergy(context) - ours)
+    assert np.ptp(constants) < 1e-12
+
+
+@pytest.mark.parametrize("frames", ["dh", "paper"])
+def test_symbolic_frames_are_the_plants(arm, random_q, frames):
+    symbolic = SymbolicPlant(arm, frames)
+    poses = symbolic.frame_poses()
+    assert set(poses) == {"1", "2", "3", "4", "5", "6", "7", "crank", "coupler"}
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    zero = plant.GetFrameByName(f"{frames}_0")
+    for label, X_0F in poses.items():
+        frame = plant.GetFrameByName(f"{frames if label.isdigit() else 'dh'}_{label}")
+        function = sympy.lambdify([*symbolic.q], X_0F, modules="numpy")
+        for q in random_q[:10]:
+            set_arm_positions(plant, context, arm, q)
+            np.testing.assert_allclose(
+                np.array(function(*q), float), frame.CalcPose(context, zero).GetAsMatrix4(), atol=1e-12
+            )
 
 
 def test_base_set_is_complete_when_masses_change(arm, random_q):

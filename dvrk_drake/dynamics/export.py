@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import sympy
 
@@ -11,9 +11,14 @@ from dvrk_drake.dynamics import codegen
 from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, SymbolicGravity
 
 
-def to_latex(gravity: SymbolicGravity) -> str:
-    """Base parameters, torque and regressor as LaTeX (needs amsmath); s_{23} is sin(q2 + q3)."""
-    short = _short_angles(gravity)
+def to_latex(gravity: SymbolicGravity, frame_poses: Mapping[str, sympy.Matrix]) -> str:
+    """Base parameters, potential energy, torque, regressor and frames as LaTeX (needs amsmath); s_{23} is sin(q2 + q3).
+
+    Args:
+        gravity: the derivation.
+        frame_poses: X_0F of each link frame, from `SymbolicPlant.frame_poses`.
+    """
+    short = _short_angles(gravity, *frame_poses.values())
     Y = sympy.Matrix(gravity.regressor).xreplace(short)
     name = gravity.arm.name
     lines = [
@@ -26,14 +31,21 @@ def to_latex(gravity: SymbolicGravity) -> str:
         ),
         r"\end{align*}",
         r"\begin{align*}",
+        rf"P &= {_linear_combination(sympy.Matrix(gravity.potential).xreplace(short))} + \text{{constant}} \\",
+        r"\end{align*}",
+        r"\begin{align*}",
     ]
-    for j in range(Y.rows):
-        terms = [rf"\beta_{{{k + 1}}} {_factor(Y[j, k] / GRAVITY)}" for k in range(Y.cols) if Y[j, k] != 0]
-        lines.append(rf"\tau_{{{j + 1}}} &= " + (rf"g \left({' + '.join(terms)}\right) \\" if terms else r"0 \\"))
+    lines += [rf"\tau_{{{j + 1}}} &= {_linear_combination(Y[j, :])} \\" for j in range(Y.rows)]
     lines.append(r"\end{align*}")
     lines.append(r"\begin{align*}")
     for (row, column), entry in sorted(Y.todok().items()):
         lines.append(rf"Y_{{{row + 1},{column + 1}}} &= {sympy.latex(entry)} \\")
+    lines.append(r"\end{align*}")
+    lines.append(r"\begin{align*}")
+    for label, X_0F in frame_poses.items():
+        index = label if label.isdigit() else rf"\mathrm{{{label}}}"
+        matrix = sympy.latex(sympy.Matrix(X_0F).xreplace(short), mat_str="pmatrix", mat_delim="")
+        lines.append(rf"X_{{0,{index}}} &= {matrix} \\")
     return "\n".join([*lines, r"\end{align*}", ""])
 
 
@@ -87,10 +99,17 @@ def _beta_symbols(gravity: SymbolicGravity) -> tuple[sympy.Symbol, ...]:
     return tuple(sympy.Symbol(f"beta{i + 1}") for i in range(len(gravity.base.names)))
 
 
-def _short_angles(gravity: SymbolicGravity) -> dict[sympy.Expr, sympy.Symbol]:
+def _linear_combination(row: sympy.Matrix) -> str:
+    """g (beta_1 row_1 + ...) of a row (1, b) that holds the factor g; 0 if it is zero."""
+    terms = [rf"\beta_{{{k + 1}}} {_factor(entry / GRAVITY)}" for k, entry in enumerate(row) if entry != 0]
+    return rf"g \left({' + '.join(terms)}\right)" if terms else "0"
+
+
+def _short_angles(gravity: SymbolicGravity, *matrices: sympy.Matrix) -> dict[sympy.Expr, sympy.Symbol]:
     number = {q: str(i + 1) for i, q in enumerate(gravity.q)}
     short = {}
-    for function in gravity.regressor.atoms(sympy.sin, sympy.cos):
+    found = set().union(*(m.atoms(sympy.sin, sympy.cos) for m in (gravity.regressor, gravity.potential, *matrices)))
+    for function in found:
         letter = "s" if isinstance(function, sympy.sin) else "c"
         indices = "".join(sorted(number[q] for q in function.args[0].free_symbols))
         short[function] = sympy.Symbol(f"{letter}_{{{indices}}}")

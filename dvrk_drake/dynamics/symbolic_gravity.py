@@ -6,18 +6,16 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import pydrake.symbolic as symbolic
 import sympy
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody, SpatialInertia_, UnitInertia_
+from pydrake.multibody.tree import Frame, RigidBody
 
 from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParameter, reduce_to_base
-from dvrk_drake.dynamics.trigonometry import simplify_trigonometry
+from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant, arm_instance, exact_rotation
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import make_arm_plant, tree_selector
 
 GRAVITY = sympy.Symbol("g", positive=True)
 
@@ -32,7 +30,8 @@ class SymbolicGravity:
         standard_parameters: mass and first moments of every link, in the named frames of the SDF.
         standard_values: (p,) their values in the SDF [kg, kg m].
         base: the base parameters beta = base.combination standard_values [kg m].
-        regressor: sympy (n, b) in q and the symbol g = |gravity| [m/s^2].
+        regressor: sympy (n, b) in q and the symbol g = |gravity| [m/s^2]; d potential / dq.
+        potential: sympy (1, b); potential beta is the part of the potential energy that depends on q [J].
     """
 
     arm: Arm
@@ -41,6 +40,7 @@ class SymbolicGravity:
     standard_values: NDArray[np.float64]
     base: BaseParameters
     regressor: sympy.ImmutableDenseMatrix
+    potential: sympy.ImmutableDenseMatrix
 
     @property
     def base_values(self) -> NDArray[np.float64]:
@@ -69,113 +69,39 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
     Raises:
         ArmError: the arm's SDF has no frames of that prefix.
     """
-    numeric = make_arm_plant(arm)
-    plant = numeric.ToSymbolic()
-    magnitude = np.linalg.norm(arm.gravity)
-    plant.mutable_gravity_field().set_gravity_vector(arm.gravity / magnitude)
-    labels = _labelled_bodies(numeric, frames)
-
-    q = [symbolic.Variable(f"q{i + 1}") for i in range(arm.num_joints)]
-    context = plant.CreateDefaultContext()
-    q_plant = np.empty(plant.num_positions(), dtype=object)
-    q_plant[tree_selector(numeric, arm)] = _tree_positions(arm, q)
-    plant.SetPositions(context, q_plant)
-
+    plant = SymbolicPlant(arm, frames)
+    labels = [label for label in plant.bodies if label.isdigit() or not serial]
     parameters: list[StandardParameter] = []
     values: list[float] = []
-    unknowns: list[tuple[symbolic.Variable, list[symbolic.Variable]]] = []
-    for label, (body, X_BF) in labels.items():
-        m = symbolic.Variable(f"m_{label}")
-        c_F = [symbolic.Variable(f"c_{label}{axis}") for axis in "xyz"]
-        R_BF = _exact(X_BF.rotation().matrix())
-        p_BoBcm = [
-            symbolic.Expression(X_BF.translation()[i])
-            + sum((R_BF[i, j] * c_F[j] for j in range(3)), symbolic.Expression(0))
-            for i in range(3)
-        ]
-        M_BBo = SpatialInertia_[symbolic.Expression](
-            symbolic.Expression(m),
-            p_BoBcm,
-            UnitInertia_[symbolic.Expression](1, 1, 1),
-            skip_validity_check=True,
-        )
-        plant.get_body(body.index()).SetSpatialInertiaInBodyFrame(context, M_BBo)
-        if label.isdigit() or not serial:
-            unknowns.append((m, c_F))
-            parameters += [StandardParameter(label), *(StandardParameter(label, axis) for axis in "xyz")]
-            mass, moment_B = _mass_and_moment(numeric, body)
-            values += [mass, *(R_BF.T @ (moment_B - mass * X_BF.translation()))]
-
-    for index in plant.GetBodyIndices(_arm_instance(plant)):
-        if not any(index == body.index() for body, _ in labels.values()) and not numeric.IsAnchored(
-            numeric.get_body(index)
-        ):
-            # A rotor: counted with its link (_mass_and_moment). Mass 0 would divide by zero in newer Drake.
-            M_rotor = SpatialInertia_[symbolic.Expression](
-                symbolic.Variable("m_rotor"),
-                [0, 0, 0],
-                UnitInertia_[symbolic.Expression](1, 1, 1),
-                skip_validity_check=True,
-            )
-            plant.get_body(index).SetSpatialInertiaInBodyFrame(context, M_rotor)
-    P = plant.CalcPotentialEnergy(context)
-    energies: list[symbolic.Expression] = []  # P per unit of each standard parameter
-    for m, c_F in unknowns:
-        dP_dm = P.Differentiate(m)
-        energies.append(dP_dm.Substitute({c: symbolic.Expression(0) for c in c_F}))
-        energies += [dP_dm.Differentiate(c) for c in c_F]
-    drake_columns = [[energy.Differentiate(v) for v in q] for energy in energies]
-
-    memo: dict = {}
-    symbols = tuple(sympy.Symbol(f"q{i + 1}", real=True) for i in range(arm.num_joints))
-    to_ours = {symbolic.to_sympy(symbolic.Expression(v), memo=memo): s for v, s in zip(q, symbols, strict=True)}
-    columns = [[symbolic.to_sympy(e, memo=memo) for e in column] for column in drake_columns]
-    standard = sympy.Matrix(columns).T.xreplace(to_ours)
+    for label in labels:
+        parameters += [StandardParameter(label), *(StandardParameter(label, axis) for axis in "xyz")]
+        values += _mass_and_moment(plant.numeric, *plant.bodies[label])
+    energies = [energy for link in plant.potential_energy(labels) for energy in link]
+    columns = [[plant.to_sympy(energy.Differentiate(v)) for v in plant.drake_q] for energy in energies]
+    standard = sympy.Matrix(columns).T
 
     base = reduce_to_base(
-        _evaluate_at_random_poses(standard, symbols, arm),
+        _evaluate_at_random_poses(standard, plant.q, arm),
         parameters,
         _readable_preference(parameters),
-        _named_lengths(numeric, frames, labels),
+        _named_lengths(plant, frames),
     )
     chosen = standard.extract(list(range(arm.num_joints)), list(base.columns))
-    parallel = _parallel_pairs(numeric, arm)
-    regressor = chosen.applyfunc(lambda e: GRAVITY * simplify_trigonometry(e, symbols, parallel))
     return SymbolicGravity(
-        arm, symbols, tuple(parameters), np.array(values), base, sympy.ImmutableDenseMatrix(regressor)
+        arm=arm,
+        q=plant.q,
+        standard_parameters=tuple(parameters),
+        standard_values=np.array(values),
+        base=base,
+        regressor=sympy.ImmutableDenseMatrix(GRAVITY * chosen.applyfunc(plant.simplify)),
+        potential=sympy.ImmutableDenseMatrix(
+            [[GRAVITY * plant.simplify(plant.to_sympy(energies[column])) for column in base.columns]]
+        ),
     )
 
 
-def _exact(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A rotation matrix with the entries that are 0 or +-1 but for the rounding of their angles made exactly that."""
-    return np.where(np.abs(R - np.round(R)) < 1e-12, np.round(R), R)
-
-
-def _tree_positions(arm: Arm, q: list[symbolic.Variable]) -> list[symbolic.Expression]:
-    G, c = arm.linkage.matrix, arm.linkage.offset
-    return [
-        sum((G[row, j] * q[j] for j in np.flatnonzero(G[row])), symbolic.Expression(c[row])) for row in range(len(c))
-    ]
-
-
-def _labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[RigidBody, RigidTransform]]:
-    """Bodies by label with the frame F that their parameters are written in, X_BF; numbered links first.
-
-    The links are those with a frame <frames>_<number>, the base's 0 left out, or dh_<name> for links of a linkage.
-    """
-    bodies = {}
-    for index in plant.GetFrameIndices(_arm_instance(plant)):
-        frame = plant.get_frame(index)
-        prefix, _, label = frame.name().partition("_")
-        if (prefix == frames or (prefix == "dh" and not label.isdigit())) and not plant.IsAnchored(frame.body()):
-            bodies[label] = (frame.body(), frame.GetFixedPoseInBodyFrame())
-    if not any(label.isdigit() for label in bodies):
-        raise ArmError(f'the SDF has no frames "{frames}_1", "{frames}_2", ...; try "dh"')
-    return dict(sorted(bodies.items(), key=lambda item: (not item[0].isdigit(), item[0])))
-
-
-def _mass_and_moment(plant: MultibodyPlant, body: RigidBody) -> tuple[float, NDArray[np.float64]]:
-    """Mass and first moment about Bo in B of a link and the rotors on it: child bodies centred on their own axis.
+def _mass_and_moment(plant: MultibodyPlant, body: RigidBody, X_BF: RigidTransform) -> list[float]:
+    """[m, m cx, m cy, m cz] in F of a link and the rotors on it: child bodies centred on their own axis.
 
     Turning such a rotor moves no mass, so for gravity it is part of the link.
     """
@@ -189,20 +115,18 @@ def _mass_and_moment(plant: MultibodyPlant, body: RigidBody) -> tuple[float, NDA
                 raise ArmError(f"{child.name()} needs a frame dh_<name>: its centre of mass is off its joint's axis")
             p_BCcm = child.body_frame().CalcPose(context, body.body_frame()) @ child.default_com()
             mass, moment_B = mass + child.default_mass(), moment_B + child.default_mass() * p_BCcm
-    return mass, moment_B
+    R_BF = exact_rotation(X_BF.rotation().matrix())
+    return [mass, *(R_BF.T @ (moment_B - mass * X_BF.translation()))]
 
 
 def _named_frames(plant: MultibodyPlant) -> list[Frame]:
-    frames = map(plant.get_frame, plant.GetFrameIndices(_arm_instance(plant)))
+    frames = map(plant.get_frame, plant.GetFrameIndices(arm_instance(plant)))
     return [frame for frame in frames if frame.name().startswith("dh_")]
 
 
-def _arm_instance(plant: MultibodyPlant) -> ModelInstanceIndex:
-    return plant.GetBodyByName("base_link").model_instance()
-
-
-def _named_lengths(plant: MultibodyPlant, frames: str, labels: dict) -> dict[str, float]:
+def _named_lengths(symbolic_plant: SymbolicPlant, frames: str) -> dict[str, float]:
     """Constant distances between the frames of neighbouring links, named as the field does: L2, L3, L4, L_crank."""
+    plant, labels = symbolic_plant.numeric, symbolic_plant.bodies
     context = plant.CreateDefaultContext()
     lengths = {"1": 1.0}
     for label in labels:
@@ -211,7 +135,7 @@ def _named_lengths(plant: MultibodyPlant, frames: str, labels: dict) -> dict[str
             X = plant.GetFrameByName(f"{frames}_{label}").CalcPose(context, previous)
             name = f"L{label}"
         else:
-            parents = [plant.get_joint(j) for j in plant.GetJointIndices(_arm_instance(plant))]
+            parents = [plant.get_joint(j) for j in plant.GetJointIndices(arm_instance(plant))]
             child = next((j for j in parents if j.parent_body() == labels[label][0] and j.num_positions()), None)
             if child is None:
                 continue
@@ -245,17 +169,3 @@ def _evaluate_at_random_poses(
         .reshape(columns.shape[1], -1)
         .T
     )
-
-
-def _parallel_pairs(plant: MultibodyPlant, arm: Arm) -> list[tuple[int, int]]:
-    """Neighbouring independent joints that turn about parallel axes: their angles appear as a sum."""
-    context = plant.CreateDefaultContext()
-    pairs = []
-    joints = [plant.GetJointByName(name) for name in arm.joint_names]
-    for i in range(len(joints) - 1):
-        a, b = joints[i], joints[i + 1]
-        if a.type_name() == b.type_name() == "revolute" and b.parent_body() == a.child_body():
-            axes = [j.frame_on_parent().CalcPoseInWorld(context).rotation() @ j.revolute_axis() for j in (a, b)]
-            if np.allclose(axes[0], axes[1], atol=1e-12):
-                pairs.append((i, i + 1))
-    return pairs

@@ -21,7 +21,7 @@ def simplify_trigonometry(
     whole = {x: sympy.Integer(int(x)) for x in expression.atoms(sympy.Float) if float(x).is_integer()}
     result = expression.xreplace(whole)
     names = {sympy.sin(x): y for x, y in zip(q, s, strict=True)} | {sympy.cos(x): y for x, y in zip(q, c, strict=True)}
-    result = sympy.expand(result.xreplace(names))
+    plain = result = sympy.expand(result.xreplace(names))
     back: dict[sympy.Symbol, sympy.Expr] = dict(zip([*s, *c], [*map(sympy.sin, q), *map(sympy.cos, q)], strict=True))
     for i, j in parallel:
         S, C = sympy.symbols(f"S{i} C{i}")
@@ -29,10 +29,18 @@ def simplify_trigonometry(
         result = _eliminate_product(result, s[i], c[j], S - c[i] * s[j])
         result = _eliminate_product(result, c[i], c[j], C + s[i] * s[j])
         back |= {S: sympy.sin(q[i] + q[j]), C: sympy.cos(q[i] + q[j])}
+    result = _without_squared_cosines(result, s, c)
+    if any(result.has(s[j]) or result.has(c[j]) for _, j in parallel):
+        # The sum did not absorb the second angle: perhaps a link turns it back, as a coupler does, and it drops out.
+        result = min(result, _without_squared_cosines(plain, s, c), key=sympy.count_ops)
+    return _collect(result).xreplace(back)
+
+
+def _without_squared_cosines(e: sympy.Expr, s: Sequence[sympy.Symbol], c: Sequence[sympy.Symbol]) -> sympy.Expr:
+    """Writes 1 - s^2 for every c^2, so that equal polynomials look equal."""
     for si, ci in zip(s, c, strict=True):
-        result = _eliminate_product(result, ci, ci, 1 - si**2)
-    shortened = _collect(result)
-    return shortened.xreplace(back)
+        e = _eliminate_product(e, ci, ci, 1 - si**2)
+    return e
 
 
 def _eliminate_product(e: sympy.Expr, a: sympy.Symbol, b: sympy.Symbol, replacement: sympy.Expr) -> sympy.Expr:

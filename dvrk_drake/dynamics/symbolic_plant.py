@@ -1,0 +1,175 @@
+"""An arm's plant in symbols: its frames and potential energy as functions of the independent joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pydrake.symbolic as symbolic
+import sympy
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex, RigidBody, SpatialInertia_, UnitInertia_
+
+from dvrk_drake.dynamics.trigonometry import simplify_trigonometry
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import make_arm_plant, tree_selector
+
+
+class SymbolicPlant:
+    """`MultibodyPlant.ToSymbolic()` with the linkage put in: every position is a function of q1..qn.
+
+    Attributes:
+        arm: the arm.
+        numeric: the same plant in numbers.
+        bodies: label ("1".."7", "crank", ...) -> moving body and the frame F its parameters are written in, X_BF.
+        q: the n joint positions as sympy symbols q1..qn [rad, m].
+        drake_q: the same as Drake's variables.
+    """
+
+    def __init__(self, arm: Arm, frames: str = "dh") -> None:
+        """Builds it with a gravity of size 1 in the arm's direction.
+
+        Args:
+            arm: the arm.
+            frames: prefix of the SDF's link frames, "dh" or another that the SDF has.
+
+        Raises:
+            ArmError: the SDF has no frames of that prefix.
+        """
+        self.arm, self._frames = arm, frames
+        self.numeric = make_arm_plant(arm)
+        self.bodies = _labelled_bodies(self.numeric, frames)
+        self._plant = self.numeric.ToSymbolic()
+        self._plant.mutable_gravity_field().set_gravity_vector(arm.gravity / np.linalg.norm(arm.gravity))
+        self._context = self._plant.CreateDefaultContext()
+        self.drake_q = [symbolic.Variable(f"q{i + 1}") for i in range(arm.num_joints)]
+        self.q = tuple(sympy.Symbol(f"q{i + 1}", real=True) for i in range(arm.num_joints))
+        self._memo: dict = {}
+        self._ours = {
+            symbolic.to_sympy(symbolic.Expression(v), memo=self._memo): s
+            for v, s in zip(self.drake_q, self.q, strict=True)
+        }
+        self._parallel = _parallel_pairs(self.numeric, arm)
+        q_plant = np.empty(self._plant.num_positions(), dtype=object)
+        q_plant[tree_selector(self.numeric, arm)] = _tree_positions(arm, self.drake_q)
+        self._plant.SetPositions(self._context, q_plant)
+        self._set_rotors_apart()
+
+    def to_sympy(self, expression: symbolic.Expression | float) -> sympy.Expr:
+        """A Drake expression in q as a sympy expression in `self.q`, not simplified."""
+        if isinstance(expression, float):
+            return sympy.Float(expression)
+        return symbolic.to_sympy(expression, memo=self._memo).xreplace(self._ours)
+
+    def simplify(self, expression: sympy.Expr) -> sympy.Expr:
+        """`simplify_trigonometry` with the sums of this arm's parallel joints as one angle."""
+        return simplify_trigonometry(expression, self.q, self._parallel)
+
+    def frame_poses(self) -> dict[str, sympy.ImmutableDenseMatrix]:
+        """X_0F(q), the pose of every link frame in frame 0: label -> 4 x 4 (the paper's II.A and III.B) [m]."""
+        zero = self.numeric.GetFrameByName(f"{self._frames}_0")
+        X_W0 = zero.CalcPoseInWorld(self.numeric.CreateDefaultContext())
+        X_0W = _exact_matrix(X_W0.inverse())
+        poses = {}
+        for label, (body, X_BF) in self.bodies.items():
+            X_WB = self._plant.EvalBodyPoseInWorld(self._context, self._plant.get_body(body.index())).GetAsMatrix4()
+            X_WB_sympy = sympy.Matrix([[self.to_sympy(entry) for entry in row] for row in X_WB])
+            X_0F = sympy.Matrix(X_0W) * X_WB_sympy * sympy.Matrix(_exact_matrix(X_BF))
+            poses[label] = sympy.ImmutableDenseMatrix(X_0F.applyfunc(self.simplify))
+        return poses
+
+    def potential_energy(self, labels: Sequence[str]) -> list[list[symbolic.Expression]]:
+        """P per unit of mass and first moments [1, x, y, z in F] of each labelled link, as Drake expressions.
+
+        From `CalcPotentialEnergy` with the mass m and the centre of mass c of every link as symbols: P is linear in m
+        and m c, so dP/dm at c = 0 is what a unit of mass at the origin of F adds, d2P/dm dc what a unit of moment adds.
+        """
+        unknowns = {}
+        for label, (body, X_BF) in self.bodies.items():
+            m = symbolic.Variable(f"m_{label}")
+            c_F = [symbolic.Variable(f"c_{label}{axis}") for axis in "xyz"]
+            X = _exact_matrix(X_BF)
+            p_BoBcm = [
+                symbolic.Expression(X[i, 3]) + sum((X[i, j] * c_F[j] for j in range(3)), symbolic.Expression(0))
+                for i in range(3)
+            ]
+            self._set_mass(body, m, p_BoBcm)
+            unknowns[label] = (m, c_F)
+        P = self._plant.CalcPotentialEnergy(self._context)
+        energies = []
+        for label in labels:
+            m, c_F = unknowns[label]
+            dP_dm = P.Differentiate(m)
+            at_origin = dP_dm.Substitute({c: symbolic.Expression(0) for c in c_F})
+            energies.append([at_origin, *(dP_dm.Differentiate(c) for c in c_F)])
+        return energies
+
+    def _set_rotors_apart(self) -> None:
+        """Bodies without a label are rotors, counted with their link; mass 0 would divide by zero in newer Drake."""
+        labelled = {body.index() for body, _ in self.bodies.values()}
+        for index in self.numeric.GetBodyIndices(arm_instance(self.numeric)):
+            if index not in labelled and not self.numeric.IsAnchored(self.numeric.get_body(index)):
+                self._set_mass(self.numeric.get_body(index), symbolic.Variable("m_rotor"), [0, 0, 0])
+
+    def _set_mass(self, body: RigidBody, m: symbolic.Variable, p_BoBcm: list) -> None:
+        M_BBo = SpatialInertia_[symbolic.Expression](
+            symbolic.Expression(m), p_BoBcm, UnitInertia_[symbolic.Expression](1, 1, 1), skip_validity_check=True
+        )
+        self._plant.get_body(body.index()).SetSpatialInertiaInBodyFrame(self._context, M_BBo)
+
+
+def exact_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """R with the entries that are 0 or +-1 but for the rounding of their angles made exactly that."""
+    return np.where(np.abs(R - np.round(R)) < 1e-12, np.round(R), R)
+
+
+def _exact_matrix(X: RigidTransform) -> NDArray[np.float64]:
+    """X as a matrix, (4, 4), with an exact rotation."""
+    matrix = X.GetAsMatrix4()
+    matrix[:3, :3] = exact_rotation(matrix[:3, :3])
+    return matrix
+
+
+def _tree_positions(arm: Arm, q: list[symbolic.Variable]) -> list[symbolic.Expression]:
+    G, c = arm.linkage.matrix, arm.linkage.offset
+    return [
+        sum((G[row, j] * q[j] for j in np.flatnonzero(G[row])), symbolic.Expression(c[row])) for row in range(len(c))
+    ]
+
+
+def _labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[RigidBody, RigidTransform]]:
+    """Bodies by label with the frame F that their parameters are written in, X_BF; numbered links first.
+
+    The links are those with a frame <frames>_<number>, the base's 0 left out, or dh_<name> for links of a linkage.
+    """
+    bodies = {}
+    for index in plant.GetFrameIndices(arm_instance(plant)):
+        frame = plant.get_frame(index)
+        prefix, _, label = frame.name().partition("_")
+        if (prefix == frames or (prefix == "dh" and not label.isdigit())) and not plant.IsAnchored(frame.body()):
+            bodies[label] = (frame.body(), frame.GetFixedPoseInBodyFrame())
+    if not any(label.isdigit() for label in bodies):
+        raise ArmError(f'the SDF has no frames "{frames}_1", "{frames}_2", ...; try "dh"')
+    return dict(sorted(bodies.items(), key=lambda item: (not item[0].isdigit(), item[0])))
+
+
+def arm_instance(plant: MultibodyPlant) -> ModelInstanceIndex:
+    """The model instance of the arm in a plant that holds one."""
+    return plant.GetBodyByName("base_link").model_instance()
+
+
+def _parallel_pairs(plant: MultibodyPlant, arm: Arm) -> list[tuple[int, int]]:
+    """Neighbouring independent joints that turn about parallel axes: their angles appear as a sum."""
+    context = plant.CreateDefaultContext()
+    pairs = []
+    joints = [plant.GetJointByName(name) for name in arm.joint_names]
+    for i in range(len(joints) - 1):
+        a, b = joints[i], joints[i + 1]
+        if a.type_name() == b.type_name() == "revolute" and b.parent_body() == a.child_body():
+            axes = [j.frame_on_parent().CalcPoseInWorld(context).rotation() @ j.revolute_axis() for j in (a, b)]
+            if np.allclose(axes[0], axes[1], atol=1e-12):
+                pairs.append((i, i + 1))
+    return pairs
