@@ -39,9 +39,9 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import Adder, ConstantVectorSource, MatrixGain
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import MODELS_FOLDER, PACKAGE_URL, Arm, load_arm
+from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import make_arm_plant, tree_selector
-from dvrk_drake.models.sdf_facts import DRAKE
+from dvrk_drake.models.sdf_model import DRAKE, compose_sdf
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
@@ -50,7 +50,7 @@ GOAL = START + 0.1
 
 
 def serial_plant(arm: Arm) -> MultibodyPlant:
-    root = ElementTree.parse(MODELS_FOLDER / arm.sdf.removeprefix(PACKAGE_URL)).getroot()
+    root = compose_sdf(arm.sdf)
     model = root.find("model")
     names = arm.joint_names
     ElementTree.register_namespace("drake", DRAKE.strip("{}"))

@@ -142,7 +142,7 @@ def test_mounting_changes_the_base_set(capsys):
 def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
     poses, model = folder / "poses.csv", folder / "model.yaml"
     out = tmp_path / "never.yaml"
-    assert 'unknown arm "mtm"; known arms: mtml, mtmr' in fails(capsys, "model", "mtm")
+    assert 'unknown arm "mtm"; known arms: mtml, mtmr, psm' in fails(capsys, "model", "mtm")
     identify = ("identify", poses, "--arm", "mtmr", "--output")
     assert "its folder does not exist" in fails(capsys, *identify, tmp_path / "no" / "m.yaml")
     assert "no such file" in fails(capsys, "identify", tmp_path / "x.csv", "--arm", "mtmr", "--output", out)

@@ -211,7 +211,7 @@ def test_transmission_keeps_power(arm):
 
 def test_left_and_right_share_the_mechanism_and_differ_in_limits():
     left, right = load_arm("MTML"), load_arm("mtmr")
-    assert known_arms() == ["mtml", "mtmr"]
+    assert known_arms() == ["mtml", "mtmr", "psm"]
     assert left.sdf == right.sdf
     np.testing.assert_allclose([left.position_lower[0], left.position_upper[0]], [-0.698132, 1.13446])
     np.testing.assert_allclose([right.position_lower[3], right.position_upper[3]], [-1.6580, 3.5779])
@@ -227,12 +227,12 @@ def test_arm_limits_lie_inside_what_the_sdf_allows(name):
     from pydrake.multibody.parsing import Parser
     from pydrake.multibody.plant import MultibodyPlant
 
-    from dvrk_drake.models.arm import MODELS_FOLDER
+    from dvrk_drake.models.sdf_model import MODELS_FOLDER
 
     bare = MultibodyPlant(1e-3)
     parser = Parser(bare)
     parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))
-    parser.AddModelsFromUrl(arm.sdf)
+    parser.AddModelsFromUrl(*arm.sdf)
     for i, joint in enumerate(arm.joint_names):
         mechanism, own = bare.GetJointByName(joint), plant.GetJointByName(joint)
         assert mechanism.position_lower_limits()[0] <= arm.position_lower[i] == own.position_lower_limits()[0]
@@ -247,20 +247,20 @@ def test_sampled_poses_respect_all_limits(arm):
 
 
 def test_unknown_arm_lists_the_known_ones():
-    with pytest.raises(ArmError, match='unknown arm "mtm"; known arms: mtml, mtmr'):
+    with pytest.raises(ArmError, match='unknown arm "mtm"; known arms: mtml, mtmr, psm'):
         load_arm("mtm")
 
 
 def test_friction_tag_is_forbidden(tmp_path):
-    from dvrk_drake.models.sdf_facts import read_sdf_facts
+    from dvrk_drake.models.sdf_model import compose_sdf, read_sdf_facts
 
     path = tmp_path / "a.sdf"
     path.write_text(
         '<sdf version="1.9"><model name="a"><joint name="j" type="revolute"><axis><xyz>0 0 1</xyz>'
         "<dynamics><friction>1</friction></dynamics></axis></joint></model></sdf>"
     )
-    with pytest.raises(ArmError, match="joint j has <friction>, which Drake drops silently"):
-        read_sdf_facts(path)
+    with pytest.raises(ArmError, match="joint j of the SDF has <friction>, which Drake drops silently"):
+        read_sdf_facts(compose_sdf([str(path)]))
 
 
 def test_arm_file_with_a_typo_is_refused(tmp_path):

@@ -104,7 +104,7 @@ class IdentifiedModel:
                 for name, value in zip(gravity.base.names, gravity.base_values, strict=True)
             ],
             joints=[JointStatistics(name=name) for name in arm.joint_names],
-            provenance=Provenance(recording=arm.sdf, method="nominal"),
+            provenance=Provenance(recording=" ".join(arm.sdf), method="nominal"),
         )
 
     @classmethod

@@ -57,9 +57,9 @@ class SymbolicGravity:
 def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> SymbolicGravity:
     """Derives the gravity torque of `arm` from its plant.
 
-    The plant gives its potential energy P(q, m, c) with every link's mass m and centre of mass c as symbols
-    (`MultibodyPlant.CalcPotentialEnergy` on `ToSymbolic()`); tau = G' dP/dq_tree falls out by making the tree a
-    function of the independent joints first. P is linear in m and m c: the regressor's columns are its derivatives.
+    `MultibodyPlant.ToSymbolic()` gives the pose of every link, and so the potential energy P per unit of its mass m and
+    of its first moment m c, in which P is linear. tau = G' dP/dq_tree falls out by making the tree a function of the
+    independent joints first: the regressor's columns are the derivatives.
 
     Args:
         arm: the arm; its gravity vector sets the mounting.

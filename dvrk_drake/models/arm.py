@@ -7,18 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.common.yaml import yaml_load_typed
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.arm_schema import ArmDescription, CoupledLimit, Gains, LoopClosure, Mechanism
+from dvrk_drake.models.arm_schema import ArmDescription, CoupledLimit, Gains, Instrument, LoopClosure, Mechanism
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.sdf_facts import read_sdf_facts
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf, read_sdf_facts
 
-MODELS_FOLDER = Path(__file__).parent
-PACKAGE_URL = "package://dvrk_drake/"
+Schema = TypeVar("Schema", ArmDescription, Mechanism, Instrument)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Arm:
         name: as the dVRK names it, e.g. "MTML".
         joint_names: the n independent joints.
         tree_joint_names: the joints of the SDF tree, linkage included.
-        sdf: package URL of the model file.
+        sdf: package URLs of the model files: the arm's, then its instrument's if it has one.
         position_lower, position_upper: (n,) limits of this arm.
         effort_limits: (n,) limits of the joint torques, from the SDF.
         coupled_limits: limits of sums of joint positions.
@@ -43,7 +43,7 @@ class Arm:
     name: str
     joint_names: tuple[str, ...]
     tree_joint_names: tuple[str, ...]
-    sdf: str
+    sdf: tuple[str, ...]
     position_lower: NDArray[np.float64]
     position_upper: NDArray[np.float64]
     effort_limits: NDArray[np.float64]
@@ -118,51 +118,77 @@ def load_arm(name: str) -> Arm:
             raise ArmError(f'unknown arm "{name}"; known arms: {", ".join(known_arms())}')
     if not path.is_file():
         raise ArmError(f"{path}: no such arm file")
+    description = _load_yaml(ArmDescription, path)
+    mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)
+    instrument = Instrument()
+    if description.instrument:
+        instrument = _load_part(Instrument, path, "instrument", description.instrument)
+    return _build_arm(path, description, mechanism, instrument)
+
+
+def _load_yaml(schema: type[Schema], path: Path) -> Schema:
     try:
-        description = yaml_load_typed(schema=ArmDescription, filename=str(path))
-        mechanism_path = MODELS_FOLDER / "mechanisms" / f"{description.mechanism}.yaml"
-        mechanism = yaml_load_typed(schema=Mechanism, filename=str(mechanism_path))
+        return yaml_load_typed(schema=schema, filename=str(path))
     except Exception as error:
         # yaml_load_typed raises many types, from YAML's to KeyError; each text names the field.
         raise ArmError(f"{path}: {error}") from error
-    return _build_arm(path, description, mechanism)
 
 
-def _build_arm(path: Path, description: ArmDescription, mechanism: Mechanism) -> Arm:
-    joints = mechanism.joints
-    facts = read_sdf_facts(MODELS_FOLDER / mechanism.sdf.removeprefix(PACKAGE_URL))
-    if set(joints) != set(description.position_limits):
-        raise ArmError(f"{path}: position_limits must name exactly {', '.join(joints)}")
+def _load_part(schema: type[Schema], arm_path: Path, kind: str, name: str) -> Schema:
+    folder = MODELS_FOLDER / f"{kind}s"
+    path = folder / f"{name}.yaml"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
+        raise ArmError(f'{arm_path}: unknown {kind} "{name}"; known {kind}s: {known}')
+    return _load_yaml(schema, path)
+
+
+def _build_arm(path: Path, description: ArmDescription, mechanism: Mechanism, instrument: Instrument) -> Arm:
+    joints = [*mechanism.joints, *instrument.joints]
+    sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)
+    facts = read_sdf_facts(compose_sdf(sdf))
+    position_limits = {**instrument.position_limits, **description.position_limits}
+    if set(joints) != set(position_limits):
+        raise ArmError(f"{path}: position_limits must name exactly {', '.join(mechanism.joints)}")
     if missing := set(joints) - set(facts.joint_names):
-        raise ArmError(f"{mechanism.sdf}: has no joint {', '.join(sorted(missing))}")
-    limits = np.array([description.position_limits[j] for j in joints])
-    if limits.shape != (len(joints), 2) or np.any(limits[:, 0] >= limits[:, 1]):
+        raise ArmError(f"{path}: its SDF has no joint {', '.join(sorted(missing))}")
+    if any(len(limits) != 2 or limits[0] >= limits[1] for limits in position_limits.values()):
         raise ArmError(f"{path}: each of position_limits must be [lower, upper] with lower < upper")
-    for which, values in dataclasses.asdict(mechanism.gains).items():
+    limits = np.array([position_limits[j] for j in joints])
+    gains = Gains(*(getattr(mechanism.gains, k) + getattr(instrument.gains, k) for k in ("kp", "kd", "ki")))
+    for which, values in dataclasses.asdict(gains).items():
         if len(values) != len(joints):
             raise ArmError(f"{path}: gains.{which} has {len(values)} numbers, one a joint is {len(joints)}")
-    J = np.eye(len(joints))
-    for actuator, terms in mechanism.transmission.items():
-        J[joints.index(actuator)] = [terms.get(j, 0.0) for j in joints]
     G = np.zeros((len(facts.joint_names), len(joints)))
     c = np.zeros(len(facts.joint_names))
     for row, name in enumerate(facts.joint_names):
         leader, multiplier, offset = facts.mimics.get(name, (name, 1.0, 0.0))
         if leader not in joints:
-            raise ArmError(f"{mechanism.sdf}: joint {name} is neither independent nor a mimic of one that is")
+            raise ArmError(f"{path}: joint {name} of its SDF is neither independent nor a mimic of one that is")
         G[row, joints.index(leader)], c[row] = multiplier, offset
     return Arm(
         name=description.name,
         joint_names=tuple(joints),
         tree_joint_names=facts.joint_names,
-        sdf=mechanism.sdf,
+        sdf=sdf,
         position_lower=limits[:, 0],
         position_upper=limits[:, 1],
         effort_limits=np.array([facts.effort_limits[j] for j in joints]),
         coupled_limits=tuple(mechanism.coupled_limits),
         linkage=LinearMap(G, c),
-        transmission=LinearMap(J, np.zeros(len(joints))),
+        transmission=LinearMap(_transmission(joints, mechanism, instrument), np.zeros(len(joints))),
         loop_closures=tuple(mechanism.loop_closures),
         gravity=np.asarray(description.gravity, float),
-        gains=mechanism.gains,
+        gains=gains,
     )
+
+
+def _transmission(joints: list[str], mechanism: Mechanism, instrument: Instrument) -> NDArray[np.float64]:
+    """J with a = J q: the mechanism's rows, and the inverse of the instrument's coupling."""
+    J: NDArray[np.float64] = np.eye(len(joints))
+    for joint, terms in instrument.joint_from_actuator.items():
+        J[joints.index(joint)] = [terms.get(j, 0.0) for j in joints]
+    J = np.asarray(np.linalg.inv(J), dtype=np.float64)
+    for actuator, terms in mechanism.transmission.items():
+        J[joints.index(actuator)] = [terms.get(j, 0.0) for j in joints]
+    return J

@@ -46,10 +46,25 @@ class Mechanism:
 
 
 @dataclass
+class Instrument:
+    """Schema of `instruments/*.yaml`: what hangs on an arm and can be swapped; its joints follow the arm's.
+
+    `joint_from_actuator` is the disc coupling as the dVRK states it: joint = sum of coefficient * actuator.
+    """
+
+    sdf: str = ""
+    joints: list[str] = field(default_factory=list)
+    joint_from_actuator: dict[str, dict[str, float]] = field(default_factory=dict)
+    position_limits: dict[str, list[float]] = field(default_factory=dict)
+    gains: Gains = field(default_factory=Gains)
+
+
+@dataclass
 class ArmDescription:
     """Schema of `arms/*.yaml`. `gravity` is the gravity vector [m/s^2] in the arm's base frame."""
 
     name: str = ""
     mechanism: str = ""
+    instrument: str = ""
     position_limits: dict[str, list[float]] = field(default_factory=dict)
     gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81])

@@ -12,8 +12,8 @@ from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context
 
-from dvrk_drake.models.arm import MODELS_FOLDER, PACKAGE_URL, Arm
-from dvrk_drake.models.sdf_facts import DRAKE
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.sdf_model import DRAKE, MODELS_FOLDER, compose_sdf
 
 #: How the loops of a linkage are held: "mimic" couples the joints of a tree, "ball" pins the cut loop with constraints.
 Closure = Literal["mimic", "ball"]
@@ -27,10 +27,11 @@ def add_arm(plant: MultibodyPlant, arm: Arm, closure: Closure = "mimic") -> Mode
     plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
     parser = Parser(plant)
     parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))
-    if closure == "mimic":
-        (instance,) = parser.AddModelsFromUrl(arm.sdf)
-    else:
-        (instance,) = parser.AddModelsFromString(_without_mimics(arm), "sdf")
+    model = compose_sdf(arm.sdf)
+    if closure == "ball":
+        _remove_loop_mimics(model, arm)
+    (instance,) = parser.AddModelsFromString(ElementTree.tostring(model, encoding="unicode"), "sdf")
+    if closure == "ball":
         for loop in arm.loop_closures:
             A = plant.GetFrameByName(loop.frame_a, instance)
             B = plant.GetFrameByName(loop.frame_b, instance)
@@ -74,15 +75,13 @@ def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray
     return -arm.linkage.pull_back_effort(tau_g)
 
 
-def _without_mimics(arm: Arm) -> str:
-    root = ElementTree.parse(MODELS_FOLDER / arm.sdf.removeprefix(PACKAGE_URL)).getroot()
+def _remove_loop_mimics(root: ElementTree.Element, arm: Arm) -> None:
+    """Only those on a loop: a rotor or counterweight that follows another joint closes none, its mimic is its cable."""
+    loop_joints = _loop_joints(root, arm)
     for joint in root.iter("joint"):
         for mimic in joint.findall(f"{DRAKE}mimic"):
-            # A rotor that follows another joint closes no loop: only its coupler can hold it.
-            if joint.get("name") in _loop_joints(root, arm):
+            if joint.get("name") in loop_joints:
                 joint.remove(mimic)
-    ElementTree.register_namespace("drake", DRAKE.strip("{}"))
-    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _loop_joints(root: ElementTree.Element, arm: Arm) -> set[str]:

@@ -207,7 +207,9 @@ class ArmStation(Diagram):
         actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(self._instance)]
         driven = [actuator.joint().name() for actuator in actuators]
         if undriven := [joint for joint in self._arm.joint_names if joint not in driven]:
-            raise StationError(f"{self._true_arm.sdf}: joint {', '.join(undriven)} has no <effort>, so no motor")
+            raise StationError(
+                f"{' '.join(self._true_arm.sdf)}: joint {', '.join(undriven)} has no <effort>, so no motor"
+            )
         columns = [driven.index(joint) for joint in self._arm.joint_names]
         limits = np.array([actuators[i].effort_limit() for i in columns])
         # Motors of other joints (massless rotors that ride on a linkage) get zero: their inertia is all they

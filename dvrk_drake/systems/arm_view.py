@@ -10,6 +10,7 @@ from pydrake.geometry import Meshcat, MeshcatParams, MeshcatVisualizer, MeshcatV
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
+from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, set_arm_positions
 
@@ -39,12 +40,18 @@ class ArmView:
     """
 
     def __init__(self, arm: Arm, meshcat: Meshcat, role: Role = Role.kIllustration) -> None:
-        """Of `arm` in `meshcat`, at zero."""
+        """Of `arm` in `meshcat`, at zero.
+
+        Raises:
+            ArmError: the arm has nothing to draw in that role.
+        """
         self.arm, self.meshcat = arm, meshcat
         builder = DiagramBuilder()
         self._plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
         add_arm(self._plant, arm)
         self._plant.Finalize()
+        if scene_graph.model_inspector().NumGeometriesWithRole(role) == 0:
+            raise ArmError(f"{arm.name} has no {'visual' if role == Role.kIllustration else 'collision'} geometry yet")
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, MeshcatVisualizerParams(role=role))
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()

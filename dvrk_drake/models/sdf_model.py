@@ -1,0 +1,84 @@
+"""An arm's SDF files as one model, and the few facts of them that Drake parses but does not give back."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dvrk_drake.errors import ArmError
+
+MODELS_FOLDER = Path(__file__).parent
+PACKAGE_URL = "package://dvrk_drake/"
+DRAKE = "{http://drake.mit.edu}"
+ElementTree.register_namespace("drake", DRAKE.strip("{}"))
+
+
+@dataclass(frozen=True)
+class SdfFacts:
+    """Moving joints of one SDF model, in the order of the file.
+
+    Attributes:
+        joint_names: every joint that can move.
+        mimics: dependent joint -> (joint it follows, multiplier, offset).
+        effort_limits: joint -> `<effort>` [N m or N]; joints without the tag are missing.
+    """
+
+    joint_names: tuple[str, ...]
+    mimics: dict[str, tuple[str, float, float]]
+    effort_limits: dict[str, float]
+
+
+def compose_sdf(urls: Sequence[str]) -> ElementTree.Element:
+    """The model of the first file with the links, joints and frames of the others added: an arm and its instrument.
+
+    Args:
+        urls: package URLs or paths.
+
+    Raises:
+        ArmError: a file is not an SDF with one model.
+    """
+    root, *others = (_read(Path(str(url).replace(PACKAGE_URL, f"{MODELS_FOLDER}/", 1))) for url in urls)
+    (model,) = root.findall("model")
+    for other in others:
+        for part in other.findall("model"):
+            model.extend(part)
+    return root
+
+
+def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
+    """Reads them from a composed model.
+
+    Raises:
+        ArmError: a joint has `<friction>`, which Drake drops silently.
+    """
+    names, mimics, efforts = [], {}, {}
+    for joint in root.findall("model/joint"):
+        name = joint.get("name", "")
+        if joint.get("type") == "fixed":
+            continue
+        if joint.find(".//friction") is not None:
+            raise ArmError(f"joint {name} of the SDF has <friction>, which Drake drops silently; model it elsewhere")
+        names.append(name)
+        mimic = joint.find(f"{DRAKE}mimic")
+        if mimic is not None:
+            mimics[name] = (
+                mimic.get("joint", ""),
+                float(mimic.get("multiplier", "1")),
+                float(mimic.get("offset", "0")),
+            )
+        effort = joint.findtext("axis/limit/effort")
+        if effort is not None:
+            efforts[name] = float(effort)
+    return SdfFacts(tuple(names), mimics, efforts)
+
+
+def _read(path: Path) -> ElementTree.Element:
+    try:
+        root = ElementTree.parse(path).getroot()
+    except (OSError, ElementTree.ParseError) as error:
+        raise ArmError(f"{path}: not a readable SDF: {error}") from error
+    if len(root.findall("model")) != 1:
+        raise ArmError(f"{path}: must hold one <model>")
+    return root
