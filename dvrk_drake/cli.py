@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
-from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-
+from dvrk_drake.cli_support import ProgressBar, check_output, import_interruptibly, made_folder, quiet_drake, seed
 from dvrk_drake.errors import DvrkDrakeError
 
 # Verbs import what they need when they run: drake and numba take seconds, `--help` should not.
@@ -22,9 +18,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one verb; returns the exit code: 0, or 2 for bad input."""
     options = _parser().parse_args(arguments)
     try:
+        import_interruptibly()
         options.run(options)
     except DvrkDrakeError as error:
-        print(f"dvrk-drake: error: {error}", file=sys.stderr)
+        print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except BrokenPipeError:
         # The reader (head, less) has seen enough.
@@ -44,6 +41,10 @@ def _model(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.atomic_file import atomic_write
 
+    if options.output is not None:
+        if options.format is None:
+            raise DvrkDrakeError("--output needs to know what to write: --latex, --python or --c")
+        check_output(options.output)
     arm = _mounted(load_arm(options.arm), options.gravity)
     gravity = derive_gravity(arm, options.frames, options.serial)
     writers = {
@@ -71,23 +72,28 @@ def _identify(options: argparse.Namespace) -> None:
 
     arm = _mounted(load_arm(options.arm), options.gravity)
     recording = read_recording(options.recording, arm.num_joints, options.coordinates)
-    _check_folder(options.output)
-    with _ProgressBar("identifying") as (progress, task):
+    check_output(options.output, options.recording)
+    with ProgressBar("identifying") as (progress, task):
         result = identify_static(
             recording, arm, options.method, lambda share: progress.update(task, completed=100 * share)
         )
     console = make_console()
     print_doubts(console, result.doubts)
     print_model(console, result.model)
-    if options.plots is not None:
-        plot_identification(_made_folder(options.plots), result, recording.in_joint_coordinates(arm))
-        console.print(f"plots: {options.plots}")
+    if len(result.recording) < len(recording):
+        console.print(
+            f"{len(recording)} rows are {len(result.recording)} distinct poses; samples of a pose are averaged"
+        )
     result.model.save(options.output)
     console.print(f"model: {options.output}")
+    if options.plots is not None:
+        plot_identification(made_folder(options.plots), result)
+        console.print(f"plots: {options.plots}")
 
 
 def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_validation
+    from dvrk_drake.analysis.static_identification import REST_SPEED
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
     from dvrk_drake.analysis.validation import validate
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -98,13 +104,21 @@ def _validate(options: argparse.Namespace) -> None:
     arm = model.load_arm()
     recording = read_recording(options.recording, arm.num_joints, options.coordinates)
     if options.json is not None:
-        _check_folder(options.json)
+        check_output(options.json, options.recording, options.model)
     validation = validate(model, recording)
     console = make_console()
+    joint, speed = recording.fastest_joint()
+    if speed > REST_SPEED:
+        console.print(
+            f"the arm moves in this recording (joint {joint + 1} at {speed:.2g} rad/s RMS): the model holds poses, and "
+            "knows nothing of inertia and of moving friction",
+            style="yellow",
+            soft_wrap=True,
+        )
     print_doubts(console, validation.doubts)
     print_validation(console, validation)
     if options.plots is not None:
-        plot_validation(_made_folder(options.plots), model, validation, recording.in_joint_coordinates(arm))
+        plot_validation(made_folder(options.plots), model, validation, recording.in_joint_coordinates(arm))
         console.print(f"plots: {options.plots}")
     if options.json is not None:
         with atomic_write(options.json) as stream:
@@ -117,6 +131,7 @@ def _predict(options: argparse.Namespace) -> None:
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.recording import read_recording, write_csv
 
+    check_output(options.output, options.recording, options.model)
     model = IdentifiedModel.load(options.model)
     recording = read_recording(options.recording, model.load_arm().num_joints, options.coordinates)
     tau = predict(model, recording)
@@ -147,7 +162,7 @@ def _view(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.systems.arm_view import ArmView, start_meshcat
 
-    _quiet_drake()
+    quiet_drake()
     arm = load_arm(options.arm)
     meshcat = start_meshcat(port=options.port)
     view = ArmView(arm, meshcat)
@@ -165,9 +180,9 @@ def _demo(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.demo import run_demo
     from dvrk_drake.analysis.tables import make_console, print_demo
 
-    _quiet_drake()
-    output = _made_folder(options.output)
-    with _ProgressBar("") as (progress, task):
+    quiet_drake()
+    output = made_folder(options.output)
+    with ProgressBar("") as (progress, task):
         result = run_demo(
             output,
             options.arm,
@@ -234,7 +249,7 @@ def _parser() -> argparse.ArgumentParser:
     verb = verbs.add_parser("demo", help="simulate an arm, identify it, compensate it, hold it; writes a folder")
     verb.add_argument("--output", default="demo_output", metavar="DIR", help="default: demo_output")
     verb.add_argument("--arm", choices=("mtml", "mtmr"), default="mtml", help="default: mtml")
-    verb.add_argument("--seed", type=int, default=0, help="of the simulated arm, its poses and noise; default: 0")
+    verb.add_argument("--seed", type=seed, default=0, help="of the simulated arm, its poses and noise; default: 0")
     verb.set_defaults(run=_demo)
     return parser
 
@@ -262,57 +277,9 @@ def _add_gravity(verb: argparse.ArgumentParser) -> None:
 
 
 def _mounted(arm, gravity):
-    import numpy as np
-
     if gravity is None:
         return arm
-    size = float(np.linalg.norm(gravity))
-    if not 1.0 <= size <= 30.0:
-        raise DvrkDrakeError(f"--gravity has the size {size:.3g} m/s^2; it must be between 1 and 30, on Earth 9.8")
     return arm.with_gravity(gravity)
-
-
-def _quiet_drake() -> None:
-    """Keeps Drake's remarks (Meshcat's address) off the terminal; its import sets the level, so this comes after."""
-    logging.getLogger("drake").setLevel(logging.WARNING)
-
-
-def _check_folder(path: str) -> None:
-    """Refuses an output whose folder does not exist before work begins, not after."""
-    if not Path(path).resolve().parent.is_dir():
-        raise DvrkDrakeError(f"{path}: cannot be written: its folder does not exist")
-
-
-def _made_folder(path: str) -> Path:
-    try:
-        Path(path).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DvrkDrakeError(f"{path}: cannot be made a folder: {error.strerror}") from error
-    return Path(path)
-
-
-class _ProgressBar:
-    """A progress bar of 0..100 on stderr, gone when the work is done; silent where stderr is no terminal."""
-
-    def __init__(self, what: str):
-        console = Console(stderr=True)
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._task = self._progress.add_task(what, total=100)
-
-    def __enter__(self):
-        self._progress.start()
-        return self._progress, self._task
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
 
 
 if __name__ == "__main__":

@@ -262,7 +262,7 @@ def test_stronger_motors_are_measured():
 def test_errors_say_what_to_do():
     with pytest.raises(StationError, match="comes with the LCM interface"):
         ArmStation(ARM, hardware=True)
-    with pytest.raises(StationError, match="time_step must be a positive number"):
+    with pytest.raises(StationError, match=r"time_step must be above 0 and at most 0.01 s"):
         ArmStation(ARM, time_step=0.0)
     with pytest.raises(StationError, match="plant_arm must have the joints of MTML"):
         ArmStation(ARM, plant_arm=dataclasses.replace(ARM, joint_names=ARM.joint_names[::-1]))

@@ -147,7 +147,7 @@ def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
     assert "its folder does not exist" in fails(capsys, *identify, tmp_path / "no" / "m.yaml")
     assert "no such file" in fails(capsys, "identify", tmp_path / "x.csv", "--arm", "mtmr", "--output", out)
     assert "no such file" in fails(capsys, "validate", tmp_path / "x.yaml", poses)
-    assert "must be between 1 and 30" in fails(capsys, *identify, out, "--gravity", "0", "0", "0")
+    assert "is weightless: gravity must be 1 m/s^2 or more" in fails(capsys, *identify, out, "--gravity", "0", "0", "0")
 
     text = poses.read_text().splitlines()
     bad = tmp_path / "bad.csv"
@@ -156,7 +156,7 @@ def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
         ([text[0], text[1].replace(text[1].split(",")[9], "nan"), *text[2:]], f"{bad}:2: tau3 is nan"),
         ([text[0], *text[1:3], text[3] + ",1"], f"{bad}:4: has 15 cells, the header names 14"),
         ([], f"{bad}: is empty"),
-        (text[:4], f"{bad}: has 3 poses, too few"),
+        (text[:4], f"{bad}: has 3 distinct poses, too few"),
     ):
         bad.write_text("\n".join(lines))
         assert message in fails(capsys, "identify", bad, "--arm", "mtmr", "--output", out)

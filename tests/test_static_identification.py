@@ -124,17 +124,22 @@ def test_a_joint_that_measures_nothing_gets_no_torque(arm):
     assert np.all(model.holding_torque(recording.q)[:, 6] == 0.0)
 
 
-def test_pure_friction_never_makes_a_joint_worse_than_zero_torque(arm):
-    """Wrist torques that have nothing to do with the pose: held-out error must not exceed commanding nothing."""
-    recording, _ = simulated(arm, noise=0.002)
-    generator = np.random.default_rng(2)
-    tau = recording.tau.copy()
-    tau[:, 4:] = generator.uniform(-0.1, 0.1, (len(tau), 3)) * arm.effort_limits[4:]
-    model = identify_static(dataclasses.replace(recording, tau=tau), arm).model
-    fresh = tau.copy()
-    fresh[:, 4:] = generator.uniform(-0.1, 0.1, (len(tau), 3)) * arm.effort_limits[4:]
-    for error in validate(model, dataclasses.replace(recording, tau=fresh)).joints:
-        assert error.rms_error <= 1.05 * error.rms_torque, error
+def test_pure_friction_hardly_makes_a_joint_worse_than_zero_torque(arm):
+    """Wrist torques that have nothing to do with the pose, judged on other poses: over seeds, no harm beyond chance."""
+    ratios = []
+    for seed in range(6):
+        generator = np.random.default_rng(seed)
+
+        def with_friction(recording, generator=generator):
+            tau = recording.tau.copy()
+            tau[:, 3:] = generator.uniform(-0.1, 0.1, (len(tau), 4)) * arm.effort_limits[3:]
+            return dataclasses.replace(recording, tau=tau)
+
+        model = identify_static(with_friction(simulated(arm, seed=seed)[0]), arm).model
+        errors = validate(model, with_friction(simulated(arm, poses=200, seed=100 + seed)[0])).joints
+        ratios.append([e.rms_error / e.rms_torque for e in errors[3:]])
+    assert np.mean(ratios) < 1.03
+    assert np.max(ratios) < 1.2
 
 
 def test_actuator_coordinates_give_the_same_model(arm):
@@ -154,19 +159,64 @@ def test_actuator_coordinates_give_the_same_model(arm):
 
 def test_too_few_poses_and_too_low_a_rank_are_refused(arm):
     recording, _ = simulated(arm, poses=4)
-    with pytest.raises(IdentificationError, match="has 4 poses, too few"):
+    with pytest.raises(IdentificationError, match="has 4 distinct poses, too few"):
         identify_static(recording, arm)
     same, _ = simulated(arm, poses=10)
     same = dataclasses.replace(same, q=np.tile(same.q[:1], (10, 1)), tau=np.tile(same.tau[:1], (10, 1)))
     with pytest.raises(IdentificationError, match=r"determine only \d of 12 base parameters"):
         identify_static(same, arm, "paper")
+    with pytest.raises(IdentificationError, match="has 1 distinct poses, too few"):
+        identify_static(same, arm)
+
+
+def test_samples_of_one_pose_cannot_vouch_for_each_other(arm):
+    """10 samples each of 12 poses with friction per pose are what their 12 averages are."""
+    recording, _ = simulated(arm, poses=12)
+    generator = np.random.default_rng(5)
+    friction = 0.1 * arm.effort_limits * generator.uniform(-1, 1, recording.q.shape)
+    noise = 1e-4 * arm.effort_limits * generator.normal(size=(10, *recording.q.shape))
+    samples = Recording(
+        q=np.repeat(recording.q, 10, axis=0),
+        tau=(recording.tau + friction + noise).transpose(1, 0, 2).reshape(-1, 7),
+        source="samples",
+    )
+    averages = Recording(q=recording.q, tau=recording.tau + friction + noise.mean(axis=0), source="averages")
+    ours, reference = identify_static(samples, arm), identify_static(averages, arm)
+    assert len(ours.recording) == 12
+    np.testing.assert_allclose(ours.model.theta, reference.model.theta, atol=1e-9)
+
+
+def test_a_joint_that_did_not_move_gets_no_torque(arm):
+    recording, _ = simulated(arm, poses=40)
+    generator = np.random.default_rng(0)
+    q = recording.q.copy()
+    q[:, 3:] = [0.5, 0.7, 0.2, 0.1]
+    model = compile_static_model(arm)
+    tau = model.torque(q, model.gravity.base_values) + 0.05 * arm.effort_limits * generator.uniform(-1, 1, q.shape)
+    result = identify_static(Recording(q=q, tau=tau, source="fixed wrist"), arm).model
+    assert np.all(result.trust[3:] == 0.0)
+    fresh, _ = simulated(arm, poses=100, seed=3)
+    for error in validate(result, fresh).joints:
+        assert error.rms_error <= error.rms_torque, error
+
+
+def test_torques_in_the_wrong_unit_are_refused(arm):
+    recording, _ = simulated(arm)
+    with pytest.raises(IdentificationError, match=r"are they in N m"):
+        identify_static(dataclasses.replace(recording, tau=1000 * recording.tau), arm)
 
 
 def test_moving_recording_is_refused(arm):
     recording, _ = simulated(arm)
-    moving = dataclasses.replace(recording, qd=np.full_like(recording.q, 0.2))
-    with pytest.raises(IdentificationError, match="the arm moves"):
-        identify_static(moving, arm)
+    t = 0.005 * np.arange(len(recording))
+    for moving in (
+        dataclasses.replace(recording, qd=np.full_like(recording.q, 0.2)),
+        dataclasses.replace(recording, t=t),
+    ):
+        with pytest.raises(IdentificationError, match="the arm moves"):
+            identify_static(moving, arm)
+    # Poses with the time at which they were taken: the arm moved in between, and rests in each.
+    assert identify_static(dataclasses.replace(recording, t=8.0 * np.arange(len(recording))), arm, "paper")
 
 
 def test_model_file_round_trip_and_refusals(arm, tmp_path):
@@ -244,6 +294,7 @@ def test_another_day_of_the_same_arm_is_predicted_better_than_by_zero_torque(arm
 
 def test_dirty_recording_names_the_poses_that_press_on_a_stop(arm, shared_data):
     result = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"), arm)
-    on_stop = {d.row + 1 for d in result.doubts if "parallelogram" in d.reason}
-    assert {61, 63, 67, 71, 73, 77} <= on_stop
-    assert {46} <= {d.row + 1 for d in result.doubts}
+    # Lines of the file; line 72 repeats the pose of line 62.
+    line = {d: int(d.where.rpartition(":")[2]) for d in result.doubts}
+    assert {62, 64, 68, 74, 78} <= {line[d] for d in result.doubts if "parallelogram" in d.reason}
+    assert 47 in line.values()

@@ -170,7 +170,7 @@ def run_demo(
 
     progress("drawing", 0.0)
     names = arm.joint_names
-    plot_identification(output, identification, poses)
+    plot_identification(output, identification)
     plot_torque_error(
         output / "fresh_torque_error.png",
         names,

@@ -108,6 +108,11 @@ def robust_fit(
     return RobustFit(fit, sigma, usable & (trusted == 0.0))
 
 
+def rms(values: NDArray[np.float64]) -> float:
+    """Root mean square; 0 of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+
+
 def _spread(values: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Robust standard deviation about zero of each column: 1.4826 median |x|, never below half the 90 % quantile's.
 

@@ -12,9 +12,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.doubts import usable_measurements
 from dvrk_drake.analysis.static_identification import StaticIdentification
 from dvrk_drake.analysis.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.recording import Recording
 
 MODEL_COLOUR, ZERO_COLOUR, MEASURED_COLOUR = "#1f6f8b", "#c9c9c9", "#d1495b"
@@ -40,7 +42,8 @@ def plot_torque_error(
         x = np.arange(len(names)) + (i - (len(bars) - 1) / 2) * width
         drawn = axes.bar(x, values, width, label=label, color=colours[i % len(colours)])
         axes.bar_label(drawn, [f"{v:.2g}" for v in values], fontsize=7, padding=2, rotation=90)
-    axes.set_yscale("log")
+    if any(np.any(values > 0) for values in bars.values()):
+        axes.set_yscale("log")
     axes.set_xticks(range(len(names)), _labels(names), fontsize=8)
     axes.set_ylabel("RMS torque error [N m]")
     axes.set_title(title)
@@ -49,17 +52,36 @@ def plot_torque_error(
     _save(figure, path)
 
 
-def plot_measured_against_predicted(path: Path, model: IdentifiedModel, recording: Recording) -> None:
-    """One panel a joint: predicted over measured torque of every pose; `recording` in joint coordinates."""
+def plot_measured_against_predicted(
+    path: Path, model: IdentifiedModel, recording: Recording, usable: NDArray[np.bool_]
+) -> None:
+    """One panel a joint: predicted over measured torque of every pose.
+
+    Args:
+        path: PNG to write.
+        model: what predicts.
+        recording: in joint coordinates.
+        usable: (m, n); what is doubted is drawn as a cross, and does not stretch the axes.
+    """
     names = model.load_arm().joint_names
     measured, predicted = recording.measured_effort(), model.holding_torque(recording.q)
     figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained")
     for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
-        span = np.array(
-            [min(measured[:, j].min(), predicted[:, j].min()), max(measured[:, j].max(), predicted[:, j].max())]
+        use = usable[:, j]
+        shown = np.concatenate([measured[use, j], predicted[use, j], [0.0]])
+        pad = 0.05 * max(float(np.ptp(shown)), 1e-6)
+        limits = np.array([shown.min() - pad, shown.max() + pad])
+        ax.plot(limits, limits, color="black", linewidth=0.8, label="measured = predicted")
+        ax.plot(measured[use, j], predicted[use, j], ".", color=MODEL_COLOUR, label="one pose")
+        ax.plot(
+            np.clip(measured[~use, j], *limits),
+            np.clip(predicted[~use, j], *limits),
+            "x",
+            color=MEASURED_COLOUR,
+            label="doubted (at the edge: outside)",
         )
-        ax.plot(span, span, color="black", linewidth=0.8, label="measured = predicted")
-        ax.plot(measured[:, j], predicted[:, j], ".", color=MODEL_COLOUR, label="one pose")
+        ax.set(xlim=limits, ylim=limits)
+        ax.locator_params(nbins=5)
         ax.set_title(f"J{j + 1} {name}", fontsize=10)
         ax.set_xlabel("measured [N m]", fontsize=8)
         ax.set_ylabel("predicted [N m]", fontsize=8)
@@ -67,12 +89,13 @@ def plot_measured_against_predicted(path: Path, model: IdentifiedModel, recordin
     for ax in axes.flat[len(names) :]:
         ax.axis("off")
     axes.flat[0].legend(fontsize=7)
-    figure.suptitle(f"{model.arm.upper()}: holding torque, {len(recording)} poses of {Path(recording.source).name}")
+    figure.suptitle(f"{model.arm}: holding torque, {len(recording)} rows of {Path(recording.source).name}")
     _save(figure, path)
 
 
-def plot_identification(folder: Path, result: StaticIdentification, recording: Recording) -> None:
-    """Writes torque_error.png and predicted.png of an identification; `recording` in joint coordinates."""
+def plot_identification(folder: Path, result: StaticIdentification) -> None:
+    """Writes torque_error.png and predicted.png of an identification."""
+    recording = result.recording
     joints = result.model.joints
     plot_torque_error(
         folder / "torque_error.png",
@@ -82,9 +105,10 @@ def plot_identification(folder: Path, result: StaticIdentification, recording: R
             "leave-one-out": np.array([j.rms_leave_one_out_undoubted for j in joints]),
             "ten-fold, effects chosen anew": np.array([j.rms_cross_validation_undoubted for j in joints]),
         },
-        f"{result.model.arm.upper()}: poses not used for fitting ({Path(recording.source).name}, without doubted ones)",
+        f"{result.model.arm}: poses not used for fitting ({Path(recording.source).name}, without doubted ones)",
     )
-    plot_measured_against_predicted(folder / "predicted.png", result.model, recording)
+    usable = usable_measurements(recording.q.shape, result.doubts)
+    plot_measured_against_predicted(folder / "predicted.png", result.model, recording, usable)
 
 
 def plot_validation(folder: Path, model: IdentifiedModel, validation: Validation, recording: Recording) -> None:
@@ -94,16 +118,17 @@ def plot_validation(folder: Path, model: IdentifiedModel, validation: Validation
         tuple(j.name for j in validation.joints),
         np.array([j.rms_torque for j in validation.joints]),
         {"model": np.array([j.rms_error for j in validation.joints])},
-        f"{model.arm.upper()}: all {validation.poses} poses of {Path(recording.source).name}",
+        f"{model.arm}: all {validation.poses} poses of {Path(recording.source).name}",
     )
-    plot_measured_against_predicted(folder / "predicted.png", model, recording)
+    usable = usable_measurements(recording.q.shape, validation.doubts)
+    plot_measured_against_predicted(folder / "predicted.png", model, recording, usable)
 
 
 def plot_positions(
     path: Path, names: tuple[str, ...], t: NDArray[np.float64], curves: dict[str, NDArray[np.float64]], title: str
 ) -> None:
     """One panel a joint of positions over time: `curves` label -> (samples, n) [rad]; dashed from the second on."""
-    figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained", sharex=True)
+    figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained")
     colours = [MODEL_COLOUR, MEASURED_COLOUR, "#edae49"]
     for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
         for i, (label, q) in enumerate(curves.items()):
@@ -113,17 +138,17 @@ def plot_positions(
             ax.set_ylim((low + high) / 2 - 1e-3, (low + high) / 2 + 1e-3)
         ax.set_title(f"J{j + 1} {name}", fontsize=10)
         ax.set_ylabel("position [rad]", fontsize=8)
+        ax.set_xlabel("time [s]", fontsize=8)
         ax.tick_params(labelsize=7)
         ax.grid(alpha=0.3)
     for ax in axes.flat[len(names) :]:
         ax.axis("off")
-    for ax in axes[-1]:
-        ax.set_xlabel("time [s]", fontsize=8)
     axes.flat[0].legend(fontsize=7)
     figure.suptitle(title)
     _save(figure, path)
 
 
 def _save(figure: plt.Figure, path: Path) -> None:
-    figure.savefig(path, dpi=110)
+    with atomic_write(path, "wb") as stream:
+        figure.savefig(stream, dpi=110, format="png")
     plt.close(figure)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Literal
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.doubts import Doubt, find_doubts, outlier_doubts, usable_measurements
 from dvrk_drake.analysis.effect_selection import StaticProblem, select_effects
-from dvrk_drake.analysis.linear_fit import LinearFit, weighted_fit
+from dvrk_drake.analysis.linear_fit import LinearFit, rms, weighted_fit
 from dvrk_drake.dynamics.identified_model import (
     BaseParameterEstimate,
     EffectEstimate,
@@ -28,20 +28,27 @@ from dvrk_drake.models.recording import Recording
 
 Method = Literal["robust", "paper"]
 
-#: Fewest poses that are accepted, and fewest for which cross-validation means something.
-LEAST_POSES = 5
+#: Fewest distinct poses that are accepted.
+LEAST_POSES = 8
+#: Rows whose joints all agree this well are samples of one pose [rad or m].
+SAME_POSE = 0.01
 #: RMS joint speed above which a recording counts as a motion [rad/s or m/s].
 REST_SPEED = 0.05
 #: A joint whose measured torque stays below this share of its effort limit says nothing about its model.
 LEAST_TORQUE = 0.02
+#: Nor does one that moved by less than this share of its range: its torque elsewhere would be a guess.
+LEAST_MOTION = 0.02
+#: Leave-one-out must lower the RMS error to this share of zero torque's, or the joint's torque is scaled down.
+LEAST_GAIN_RATIO = 0.98
 FOLDS = 10
 
 
 @dataclass(frozen=True)
 class StaticIdentification:
-    """A model with what a report of it needs: the doubts, and (m, n) residuals in joint coordinates."""
+    """A model with what a report of it needs: the poses used, in joint coordinates, doubts, and (m, n) residuals."""
 
     model: IdentifiedModel
+    recording: Recording
     doubts: list[Doubt]
     residuals: NDArray[np.float64]
     left_out_residuals: NDArray[np.float64]
@@ -58,7 +65,8 @@ def identify_static(
     "paper": unweighted least squares on the base parameters, eq. 9-10 of the paper.
     "robust" (default): each joint weighted by its own spread, measurements on a stop or far off left out, joint effects
     chosen by leave-one-out, every parameter shrunk toward zero by a prior derived from the effort limits, and a joint's
-    torque scaled down where leave-one-out says that the model is no better than zero torque.
+    torque scaled down where leave-one-out says that the model is no better than zero torque, or where the joint hardly
+    moved. Samples of one pose are averaged first: left out one at a time they would vouch for each other.
 
     Args:
         recording: poses with efforts, in either coordinates.
@@ -72,8 +80,11 @@ def identify_static(
     """
     recording.check_fits(arm)
     recording = recording.in_joint_coordinates(arm)
+    _check_rest(recording)
+    if method == "robust":
+        recording = average_repeated_poses(recording)
     tau = recording.measured_effort()
-    _check_poses(recording)
+    _check_poses(recording, arm)
     gravity_model = compile_static_model(arm)
     Y = gravity_model.regressor(recording.q)
     stacked = Y.reshape(-1, Y.shape[2])
@@ -102,11 +113,11 @@ def identify_static(
         fit, sd = robust.fit, np.sqrt(np.diag(robust.fit.covariance))
         doubts = doubts + outlier_doubts(recording, arm, robust.outliers, fit.residuals)
         usable = usable & ~robust.outliers
-        trust = _trust(tau, fit.left_out_residuals, usable, arm)
+        trust = _trust(problem, fit.left_out_residuals, usable)
         validated = _cross_validate(problem, progress)
     fit = _scaled(fit, tau, trust)
     model = IdentifiedModel(
-        arm=arm.name.lower(),
+        arm=arm.source,
         gravity=[float(x) for x in arm.gravity],
         base_parameters=[
             BaseParameterEstimate(name, *_estimate(value, error))
@@ -127,35 +138,65 @@ def identify_static(
             version=version("dvrk-drake"),
         ),
     )
-    return StaticIdentification(model, doubts, fit.residuals, fit.left_out_residuals)
+    return StaticIdentification(model, recording, doubts, fit.residuals, fit.left_out_residuals)
 
 
-def _check_poses(recording: Recording) -> None:
+def average_repeated_poses(recording: Recording) -> Recording:
+    """One row a pose: rows whose joints agree within `SAME_POSE` with the first of them are its samples."""
+    groups: list[list[int]] = []
+    for row, q in enumerate(recording.q):
+        group = next((g for g in groups if np.all(np.abs(recording.q[g[0]] - q) < SAME_POSE)), None)
+        if group is None:
+            groups.append([row])
+        else:
+            group.append(row)
+    if len(groups) == len(recording):
+        return recording
+    first = [group[0] for group in groups]
+    return replace(
+        recording,
+        q=np.array([recording.q[g].mean(axis=0) for g in groups]),
+        tau=np.array([recording.measured_effort()[g].mean(axis=0) for g in groups]),
+        qd=None,
+        t=None,
+        lines=None if recording.lines is None else recording.lines[first],
+    )
+
+
+def _check_rest(recording: Recording) -> None:
+    joint, speed = recording.fastest_joint()
+    if speed > REST_SPEED:
+        raise IdentificationError(
+            f"{recording.source}: the arm moves (joint {joint + 1} at {speed:.2g} rad/s RMS); "
+            f"static identification needs poses at rest, below {REST_SPEED} rad/s"
+        )
+
+
+def _check_poses(recording: Recording, arm: Arm) -> None:
     if len(recording) < LEAST_POSES:
         raise IdentificationError(
-            f"{recording.source}: has {len(recording)} poses, too few to identify from; "
+            f"{recording.source}: has {len(recording)} distinct poses, too few to identify from; "
             f"at least {LEAST_POSES}, better 40 or more that cover the arm's range"
         )
-    if recording.qd is not None:
-        speed = np.sqrt(np.mean(recording.qd**2, axis=0))
-        if np.any(speed > REST_SPEED):
-            joint = int(np.argmax(speed))
-            raise IdentificationError(
-                f"{recording.source}: the arm moves (qd{joint + 1} is {speed[joint]:.2g} rad/s RMS); "
-                f"static identification needs poses at rest, below {REST_SPEED} rad/s"
-            )
+    typical = np.median(np.abs(recording.measured_effort()), axis=0)
+    if np.any(typical > arm.effort_limits):
+        joint = int(np.argmax(typical / arm.effort_limits))
+        raise IdentificationError(
+            f"{recording.source}: most efforts of {arm.joint_names[joint]} (tau{joint + 1}) exceed its limit of "
+            f"{arm.effort_limits[joint]:.3g}; are they in N m (N on a prismatic joint)?"
+        )
 
 
-def _trust(
-    tau: NDArray[np.float64], left_out: NDArray[np.float64], usable: NDArray[np.bool_], arm: Arm
-) -> NDArray[np.float64]:
+def _trust(problem: StaticProblem, left_out: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(n,) scale of each joint's torque that leave-one-out supports: 1 unless it is no better than zero torque."""
+    arm = problem.arm
+    moved = np.ptp(problem.q, axis=0) > LEAST_MOTION * (arm.position_upper - arm.position_lower)
     trust = np.ones(arm.num_joints)
     for j in range(arm.num_joints):
-        measured, predicted = tau[usable[:, j], j], (tau - left_out)[usable[:, j], j]
-        if len(measured) == 0 or _rms(measured) < LEAST_TORQUE * arm.effort_limits[j]:
+        measured, predicted = problem.tau[usable[:, j], j], (problem.tau - left_out)[usable[:, j], j]
+        if not moved[j] or rms(measured) < LEAST_TORQUE * arm.effort_limits[j]:
             trust[j] = 0.0
-        elif _rms(measured - predicted) > 0.98 * _rms(measured):
+        elif rms(measured - predicted) > LEAST_GAIN_RATIO * rms(measured):
             power = np.sum(predicted**2)
             trust[j] = float(np.clip(measured @ predicted / power, 0.0, 1.0)) if power > 0 else 1.0
     return trust
@@ -170,7 +211,7 @@ def _cross_validate(problem: StaticProblem, progress: Callable[[float], None]) -
         rest = problem.subset(folds != fold)
         effects = select_effects(rest)
         robust = rest.fit(effects)
-        trust = _trust(rest.tau, robust.fit.left_out_residuals, rest.usable & ~robust.outliers, problem.arm)
+        trust = _trust(rest, robust.fit.left_out_residuals, rest.usable & ~robust.outliers)
         out = problem.subset(folds == fold)
         residuals[folds == fold] = out.tau - trust * (out.regressor(effects) @ robust.fit.theta)
         progress((fold + 2) / (FOLDS + 1))
@@ -203,13 +244,13 @@ def _statistics(
         statistics.append(
             JointStatistics(
                 name=name,
-                rms_zero_torque=_rms(tau[:, j]),
-                rms_fit=_rms(fit.residuals[:, j]),
-                rms_leave_one_out=_rms(fit.left_out_residuals[:, j]),
-                rms_zero_torque_undoubted=_rms(tau[use, j]),
-                rms_fit_undoubted=_rms(fit.residuals[use, j]),
-                rms_leave_one_out_undoubted=_rms(fit.left_out_residuals[use, j]),
-                rms_cross_validation_undoubted=_rms(validated[use, j]),
+                rms_zero_torque=rms(tau[:, j]),
+                rms_fit=rms(fit.residuals[:, j]),
+                rms_leave_one_out=rms(fit.left_out_residuals[:, j]),
+                rms_zero_torque_undoubted=rms(tau[use, j]),
+                rms_fit_undoubted=rms(fit.residuals[use, j]),
+                rms_leave_one_out_undoubted=rms(fit.left_out_residuals[use, j]),
+                rms_cross_validation_undoubted=rms(validated[use, j]),
                 num_doubted=int(np.sum(~use)),
                 trust=float(trust[j]),
                 position_lower=float(lower),
@@ -222,7 +263,3 @@ def _statistics(
 
 def _estimate(value: float, standard_error: float) -> tuple[float, float, bool]:
     return float(value), float(standard_error), bool(abs(value) > 2 * standard_error)
-
-
-def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

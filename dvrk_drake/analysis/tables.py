@@ -21,11 +21,11 @@ Open {folder}/arm.html in a browser: the arm is held, released, and driven home.
 
 With a real arm:
   1. Record poses at rest: move it by hand to 40 or more varied poses inside its limits, let position control hold
-     each, and write q1..q7, tau1..tau7 [rad, N m] of every settled pose into a CSV (lines for that are in
-     docs/public_recordings.md).
+     each, coming from changing sides (friction is in every measurement), and write q1..q7, tau1..tau7 [rad, N m] of
+     every settled pose into a CSV (lines for that are in docs/public_recordings.md).
   2. dvrk-drake identify poses.csv --arm mtml --output model.yaml --plots plots
   3. Record some more on another day:  dvrk-drake validate model.yaml other.csv
-  4. Only when every joint is better than zero torque there, let GravityPidController(model) near the arm, with a
+  4. Only when no joint is worse than zero torque there, let GravityPidController(model) near the arm, with a
      hand on the stop button. Switch the controller's own gravity compensation off first, or it is compensated twice."""
 
 
@@ -39,7 +39,7 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
     """Parameters with their standard errors, then how each joint was fitted."""
     provenance = model.provenance
     console.print(
-        f"{model.arm.upper()}, {provenance.poses} poses, method {provenance.method}, rank {provenance.rank} of "
+        f"{model.arm}, {provenance.poses} poses, method {provenance.method}, rank {provenance.rank} of "
         f"{len(model.base_parameters)}, condition number {provenance.condition_number:.3g}\n"
     )
     table = _table("Base parameters [kg m]", "", "value", "standard error", "|value| < 2 se")
@@ -82,8 +82,8 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
     for j in model.joints:
         if j.trust == 0.0:
             console.print(
-                f"{j.name}: no torque will be commanded; what was measured is too small, or too well explained by "
-                "zero, to tell gravity from friction",
+                f"{j.name}: no torque will be commanded: it hardly moved, or what was measured cannot tell "
+                "its gravity from friction",
                 style="yellow",
                 soft_wrap=True,
             )
@@ -107,6 +107,12 @@ def print_demo(console: Console, result: DemoResult, folder: str) -> None:
         table.add_row(ours.name, *drifts, f"{result.step_error[i]:.5f}")
     console.print(table)
     console.print(f"written to {folder}: {', '.join(path.name for path in result.files)}", soft_wrap=True)
+    console.print(
+        "The simulated arm has no stops in q2 + q3 yet: the step, and the release with the model as drawn, pass where "
+        "a real arm would hit them.",
+        style="dim",
+        soft_wrap=True,
+    )
     console.print(NEXT_STEPS.format(folder=folder), markup=False, soft_wrap=True)
 
 
@@ -154,7 +160,7 @@ def print_validation(console: Console, validation: Validation) -> None:
             j.name,
             f"{j.rms_torque:.4f} ({j.rms_torque_undoubted:.4f})",
             f"{j.rms_error:.4f} ({j.rms_error_undoubted:.4f})",
-            f"{j.relative_error:.2f}",
+            "" if j.relative_error is None else f"{j.relative_error:.2f}",
             str(j.num_doubted),
             style="red" if worse else "",
         )

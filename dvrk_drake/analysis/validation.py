@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.doubts import Doubt, find_doubts, usable_measurements
+from dvrk_drake.analysis.linear_fit import rms
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
@@ -17,14 +18,15 @@ from dvrk_drake.models.recording import Recording
 class JointError:
     """One joint's error over a recording: RMS in N m (N if prismatic) in the coordinates that the recording is in.
 
-    `rms_torque` is what commanding zero torque would err by; `relative_error` = rms_error / rms_torque. `_undoubted`
+    `rms_torque` is what commanding zero torque would err by; `relative_error` = rms_error / rms_torque, None where
+    nothing was measured. `_undoubted`
     leaves out `num_doubted` measurements of poses that rest on a stop or exceed the effort limit.
     """
 
     name: str
     rms_torque: float
     rms_error: float
-    relative_error: float
+    relative_error: float | None
     rms_torque_undoubted: float
     rms_error_undoubted: float
     num_doubted: int
@@ -87,20 +89,16 @@ def _joint_errors(
     errors = []
     for j, name in enumerate(arm.joint_names):
         use = usable[:, j]
-        torque, error = _rms(measured[:, j]), _rms(residuals[:, j])
+        torque, error = rms(measured[:, j]), rms(residuals[:, j])
         errors.append(
             JointError(
                 name,
                 torque,
                 error,
-                error / torque if torque > 0 else float("nan"),
-                _rms(measured[use, j]),
-                _rms(residuals[use, j]),
+                error / torque if torque > 0 else None,
+                rms(measured[use, j]),
+                rms(residuals[use, j]),
                 int(np.sum(~use)),
             )
         )
     return errors
-
-
-def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

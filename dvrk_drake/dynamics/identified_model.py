@@ -97,7 +97,7 @@ class IdentifiedModel:
         """The model that the arm's SDF states: its own inertias, no joint effects."""
         gravity = derive_gravity(arm)
         return cls(
-            arm=arm.name.lower(),
+            arm=arm.source,
             gravity=[float(x) for x in arm.gravity],
             base_parameters=[
                 BaseParameterEstimate(name, float(value), 0.0, True)
@@ -128,7 +128,12 @@ class IdentifiedModel:
         return model
 
     def save(self, path: str | Path) -> None:
-        """Writes the model file at once or not at all."""
+        """Writes the model file at once or not at all.
+
+        Raises:
+            ModelError: the model does not fit its arm, or holds numbers that are none.
+        """
+        self.check()
         with atomic_write(path) as stream:
             stream.write(yaml_dump_typed(self))
 
@@ -178,6 +183,7 @@ _ARMS: dict[tuple[str, tuple[float, ...]], Arm] = {}
 def _arm_with_gravity(name: str, gravity: tuple[float, ...]) -> Arm:
     """One Arm object per mounting, so that derivations and compilations are done once."""
     arm = load_arm(name)
-    if np.allclose(arm.gravity, gravity, rtol=0, atol=1e-12):
+    mounted = arm.with_gravity(gravity)
+    if np.allclose(arm.gravity, mounted.gravity, rtol=0, atol=1e-12):
         return arm
-    return _ARMS.setdefault((name, gravity), arm.with_gravity(gravity))
+    return _ARMS.setdefault((name, gravity), mounted)

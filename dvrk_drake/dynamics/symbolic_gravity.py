@@ -67,8 +67,10 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
         serial: leaves out the links of the linkage (crank, coupler), as the paper does.
 
     Raises:
-        ArmError: the arm's SDF has no frames of that prefix.
+        ArmError: the arm's SDF has no frames of that prefix, or gravity is (almost) zero.
     """
+    if np.linalg.norm(arm.gravity) < 1.0:
+        raise ArmError(f"{arm.name} is weightless: gravity must be 1 m/s^2 or more for a gravity model, on Earth 9.8")
     plant = SymbolicPlant(arm, frames)
     labels = [label for label in plant.bodies if label.isdigit() or not serial]
     parameters: list[StandardParameter] = []

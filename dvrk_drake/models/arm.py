@@ -27,6 +27,7 @@ class Arm:
 
     Attributes:
         name: as the dVRK names it, e.g. "MTML".
+        source: what `load_arm` loads it by: "mtml", or the absolute path of its YAML file.
         joint_names: the n independent joints.
         tree_joint_names: the joints of the SDF tree, linkage included.
         sdf: package URLs of the model files: the arm's, then its instrument's if it has one.
@@ -41,6 +42,7 @@ class Arm:
     """
 
     name: str
+    source: str
     joint_names: tuple[str, ...]
     tree_joint_names: tuple[str, ...]
     sdf: tuple[str, ...]
@@ -82,21 +84,32 @@ class Arm:
             count: number of poses.
             generator: source of randomness.
             margin: fraction of each range that is kept free at both of its ends, 0..0.5.
+
+        Raises:
+            ArmError: hardly any pose of the joint box meets the coupled limits.
         """
         A, lower, upper = self.limit_matrix()
         inset = margin * (upper - lower)
         lower, upper = lower + inset, upper - inset
         n = self.num_joints
         poses = np.empty((0, n))
+        tries = 0
         while len(poses) < count:
+            tries += 1
+            if tries > 100 and len(poses) < tries:
+                raise ArmError(f"{self.name}: hardly any pose inside its position limits meets its coupled limits")
             q = generator.uniform(lower[:n], upper[:n], (2 * count + 8, n))
             value = q @ A.T
             poses = np.vstack([poses, q[np.all((value >= lower) & (value <= upper), axis=1)]])
         return poses[:count]
 
     def with_gravity(self, gravity: Sequence[float]) -> Arm:
-        """The same arm mounted so that gravity is `gravity` (3,) [m/s^2] in its base frame."""
-        return dataclasses.replace(self, gravity=np.asarray(gravity, float))
+        """The same arm mounted so that gravity is `gravity` (3,) [m/s^2] in its base frame.
+
+        Raises:
+            ArmError: not three numbers of a size up to 30 m/s^2.
+        """
+        return dataclasses.replace(self, gravity=_checked_gravity(gravity))
 
 
 def known_arms() -> list[str]:
@@ -104,16 +117,20 @@ def known_arms() -> list[str]:
     return sorted(path.stem for path in (MODELS_FOLDER / "arms").glob("*.yaml"))
 
 
-@cache
 def load_arm(name: str) -> Arm:
     """Loads an arm by name (e.g. "mtml"; case does not matter) or by the path of an arm's YAML file.
 
     Raises:
         ArmError: no such arm, or its files contradict each other.
     """
+    return _load_arm(str(Path(name).resolve()) if name.endswith((".yaml", ".yml")) else name.lower())
+
+
+@cache
+def _load_arm(name: str) -> Arm:
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):
-        path = MODELS_FOLDER / "arms" / f"{name.lower()}.yaml"
+        path = MODELS_FOLDER / "arms" / f"{name}.yaml"
         if not path.is_file():
             raise ArmError(f'unknown arm "{name}"; known arms: {", ".join(known_arms())}')
     if not path.is_file():
@@ -123,7 +140,7 @@ def load_arm(name: str) -> Arm:
     instrument = Instrument()
     if description.instrument:
         instrument = _load_part(Instrument, path, "instrument", description.instrument)
-    return _build_arm(path, description, mechanism, instrument)
+    return _build_arm(name, path, description, mechanism, instrument)
 
 
 def _load_yaml(schema: type[Schema], path: Path) -> Schema:
@@ -143,7 +160,9 @@ def _load_part(schema: type[Schema], arm_path: Path, kind: str, name: str) -> Sc
     return _load_yaml(schema, path)
 
 
-def _build_arm(path: Path, description: ArmDescription, mechanism: Mechanism, instrument: Instrument) -> Arm:
+def _build_arm(
+    source: str, path: Path, description: ArmDescription, mechanism: Mechanism, instrument: Instrument
+) -> Arm:
     joints = [*mechanism.joints, *instrument.joints]
     sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)
     facts = read_sdf_facts(compose_sdf(sdf))
@@ -168,19 +187,39 @@ def _build_arm(path: Path, description: ArmDescription, mechanism: Mechanism, in
         G[row, joints.index(leader)], c[row] = multiplier, offset
     return Arm(
         name=description.name,
+        source=source,
         joint_names=tuple(joints),
         tree_joint_names=facts.joint_names,
         sdf=sdf,
         position_lower=limits[:, 0],
         position_upper=limits[:, 1],
         effort_limits=np.array([facts.effort_limits[j] for j in joints]),
-        coupled_limits=tuple(mechanism.coupled_limits),
+        coupled_limits=_coupled_limits(path, description, mechanism),
         linkage=LinearMap(G, c),
         transmission=LinearMap(_transmission(joints, mechanism, instrument), np.zeros(len(joints))),
         loop_closures=tuple(mechanism.loop_closures),
-        gravity=np.asarray(description.gravity, float),
+        gravity=_checked_gravity(description.gravity),
         gains=gains,
     )
+
+
+def _coupled_limits(path: Path, description: ArmDescription, mechanism: Mechanism) -> tuple[CoupledLimit, ...]:
+    limits = {limit.name: limit for limit in mechanism.coupled_limits}
+    for name, bounds in description.coupled_limits.items():
+        if name not in limits:
+            raise ArmError(f'{path}: unknown coupled limit "{name}"; known: {", ".join(limits) or "none"}')
+        if len(bounds) != 2 or bounds[0] >= bounds[1]:
+            raise ArmError(f"{path}: coupled_limits.{name} must be [lower, upper] with lower < upper")
+        limits[name] = dataclasses.replace(limits[name], lower=bounds[0], upper=bounds[1])
+    return tuple(limits.values())
+
+
+def _checked_gravity(gravity: Sequence[float]) -> NDArray[np.float64]:
+    vector = np.asarray(gravity, float)
+    if vector.shape != (3,) or not np.linalg.norm(vector) <= 30.0:
+        numbers = ", ".join(f"{x:g}" for x in vector.ravel())
+        raise ArmError(f"gravity ({numbers}) must be three numbers of a size up to 30 m/s^2; on Earth 9.8")
+    return vector
 
 
 def _transmission(joints: list[str], mechanism: Mechanism, instrument: Instrument) -> NDArray[np.float64]:

@@ -61,10 +61,15 @@ class Instrument:
 
 @dataclass
 class ArmDescription:
-    """Schema of `arms/*.yaml`. `gravity` is the gravity vector [m/s^2] in the arm's base frame."""
+    """Schema of `arms/*.yaml`.
+
+    `gravity` is the gravity vector [m/s^2] in the arm's base frame. `coupled_limits` replaces [lower, upper] of the
+    mechanism's coupled limits by name, for an arm whose stops were calibrated.
+    """
 
     name: str = ""
     mechanism: str = ""
     instrument: str = ""
     position_limits: dict[str, list[float]] = field(default_factory=dict)
+    coupled_limits: dict[str, list[float]] = field(default_factory=dict)
     gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81])

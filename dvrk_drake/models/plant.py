@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,7 @@ from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context
 
+from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.sdf_model import DRAKE, MODELS_FOLDER, compose_sdf
 
@@ -23,7 +24,12 @@ def add_arm(plant: MultibodyPlant, arm: Arm, closure: Closure = "mimic") -> Mode
     """Adds `arm` to a plant that is not finalized, welds its base to the world and sets gravity and limits.
 
     Needs a discrete plant with the SAP solver, as all of Drake's joint couplings and ball constraints do.
+
+    Raises:
+        ArmError: no such closure.
     """
+    if closure not in get_args(Closure):
+        raise ArmError(f'unknown closure "{closure}"; known: {", ".join(get_args(Closure))}')
     plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
     parser = Parser(plant)
     parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))

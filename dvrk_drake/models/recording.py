@@ -53,6 +53,21 @@ class Recording:
         source = self.source or "recording"
         return f"{source}:{self.lines[row]}" if self.lines is not None else f"{source}: row {row + 1}"
 
+    def fastest_joint(self) -> tuple[int, float]:
+        """The joint with the highest RMS speed, and that speed [rad/s or m/s]; 0 where the recording does not tell.
+
+        From qd, or from q over t where samples follow within 0.1 s: between poses the arm may well have moved.
+        """
+        if self.qd is not None:
+            qd = self.qd
+        elif self.t is not None and len(self) > 1 and np.all(np.diff(self.t) > 0) and np.median(np.diff(self.t)) < 0.1:
+            qd = np.diff(self.q, axis=0) / np.diff(self.t)[:, None]
+        else:
+            return 0, 0.0
+        speed = np.sqrt(np.mean(qd**2, axis=0))
+        joint = int(np.argmax(speed))
+        return joint, float(speed[joint])
+
     def measured_effort(self) -> NDArray[np.float64]:
         """tau (m, n).
 

@@ -111,9 +111,9 @@ class ArmStation(Diagram):
         super().__init__()
         if hardware:
             raise StationError("hardware=True is not there yet: it comes with the LCM interface. Use hardware=False")
-        if not (np.isfinite(time_step) and time_step > 0):
+        if not 0 < time_step <= 0.01:
             raise StationError(
-                f"time_step must be a positive number of seconds (the linkage needs it); got {time_step}"
+                f"time_step must be above 0 and at most 0.01 s: the wrist is lost above; got {time_step}"
             )
         true_arm = plant_arm or arm
         if true_arm.joint_names != arm.joint_names:

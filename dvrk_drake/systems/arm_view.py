@@ -10,7 +10,7 @@ from pydrake.geometry import Meshcat, MeshcatParams, MeshcatVisualizer, MeshcatV
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from dvrk_drake.errors import ArmError
+from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, set_arm_positions
 
@@ -21,8 +21,17 @@ CAMERA, TARGET, ZOOM = (1.1, 0.9, 0.35), (0.0, -0.09, 0.045), 2.8
 def start_meshcat(
     camera: Sequence[float] = CAMERA, target: Sequence[float] = TARGET, zoom: float = ZOOM, port: int | None = None
 ) -> Meshcat:
-    """A Meshcat on localhost with a light ground and the camera on the arm; a free port unless one is given."""
-    meshcat = Meshcat(MeshcatParams(host="localhost", port=port, show_stats_plot=False))
+    """A Meshcat on localhost with a light ground and the camera on the arm; a free port unless one is given.
+
+    Raises:
+        DvrkDrakeError: the port cannot be opened.
+    """
+    if port is not None and not 1024 <= port <= 65535:
+        raise DvrkDrakeError(f"port {port} cannot be opened; allowed: 1024..65535")
+    try:
+        meshcat = Meshcat(MeshcatParams(host="localhost", port=port, show_stats_plot=False))
+    except RuntimeError as error:
+        raise DvrkDrakeError(f"port {port or ''} cannot be opened: is it in use?") from error
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     meshcat.SetProperty("/Background", "top_color", [0.86, 0.89, 0.92])

@@ -46,7 +46,7 @@ class GravityPidController(LeafSystem):
       ended; so it never jumps.
     - `effort` (n): the command, inside the effort limits.
     - `gravity_effort` (n): G(q) alone, before the limits.
-    - `fault` (1): 1 while `state_estimated` (or a `desired_state` that is read) is not finite, else 0.
+    - `fault` (1): 1 while `state_estimated` (or a `desired_state` that is read) is not finite or beyond 1e6, else 0.
 
     **Time.** Inputs are sampled and the outputs change every `period` seconds, and at initialization, which
     also empties the integrator and latches the pose. Beside a discrete plant of the same period the command
@@ -189,10 +189,11 @@ class GravityPidController(LeafSystem):
         It runs between two steps of the plant, which leave nothing of Python in the processor's caches: what
         costs is each different thing that it touches. So its names are local and it touches few things.
         """
+        eval_state = self.get_input_port(0).Eval  # raises, and names the port, if it is not connected
         eval_vector_input = self.EvalVectorInput
 
         def update(context: Context, discrete_state: DiscreteValues) -> None:
-            state = eval_vector_input(context, 0).get_value()
+            state = eval_state(context)
             desired = eval_vector_input(context, 1)
             step(
                 state,

@@ -10,6 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 
 
@@ -30,12 +31,23 @@ class JointEffectTorque(LeafSystem):
     """
 
     def __init__(self, arm: Arm, effects: Sequence[JointEffect], coefficients: ArrayLike) -> None:
-        """Of the `effects` with one coefficient each [N m; N on a prismatic joint]."""
+        """Of the `effects` with one coefficient each [N m; N on a prismatic joint].
+
+        Raises:
+            StationError: an effect of no joint of the arm, or not one finite coefficient for each effect.
+        """
         super().__init__()
+        coefficients = np.asarray(coefficients, float)
+        if coefficients.shape != (len(effects),) or not np.all(np.isfinite(coefficients)):
+            raise StationError(
+                f"needs one finite coefficient for each of {len(effects)} effects; got {coefficients.tolist()}"
+            )
+        if unknown := {effect.joint for effect in effects} - set(arm.joint_names):
+            raise StationError(f"unknown joint {', '.join(sorted(unknown))}; joints: {', '.join(arm.joint_names)}")
         n = arm.num_joints
         model = compile_static_model(arm, tuple(effects))
         gravity_free = np.zeros(model.num_parameters)
-        gravity_free[model.num_parameters - len(effects) :] = -np.asarray(coefficients, float)
+        gravity_free[model.num_parameters - len(effects) :] = -coefficients
         self._theta = gravity_free
         self._torque_into = model.torque_into
         self._num_joints = n

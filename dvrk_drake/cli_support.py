@@ -1,0 +1,95 @@
+"""What the verbs of the command line share: output that is checked first, a progress bar, a clean Ctrl-C."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import logging
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+from dvrk_drake.errors import DvrkDrakeError
+
+
+def import_interruptibly() -> None:
+    """Imports what all verbs need such that Ctrl-C ends the process at once: extension modules turn it into tracebacks.
+
+    Nothing is half-written at that time. Where signals are not ours (a thread, a test) they are left alone.
+    """
+    if threading.current_thread() is not threading.main_thread() or "dvrk_drake.analysis.demo" in sys.modules:
+        return
+
+    def leave(*_: object) -> None:
+        os.write(2, b"dvrk-drake: interrupted\n")
+        os._exit(130)
+
+    before = signal.signal(signal.SIGINT, leave)
+    try:
+        importlib.import_module("dvrk_drake.analysis.demo")
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def quiet_drake() -> None:
+    """Keeps Drake's remarks (Meshcat's address) off the terminal; its import sets the level, so this comes after."""
+    logging.getLogger("drake").setLevel(logging.WARNING)
+
+
+def check_output(path: str, *inputs: str) -> None:
+    """Refuses, before work begins, an output that cannot be written or that is one of the inputs."""
+    target = Path(path).resolve()
+    if not target.parent.is_dir():
+        raise DvrkDrakeError(f"{path}: cannot be written: its folder does not exist")
+    if target.exists() and not target.is_file():
+        raise DvrkDrakeError(f"{path}: is not a regular file, so it cannot be replaced; name a file")
+    if not os.access(target if target.exists() else target.parent, os.W_OK):
+        raise DvrkDrakeError(f"{path}: cannot be written: no permission")
+    for given in inputs:
+        if target == Path(given).resolve():
+            raise DvrkDrakeError(f"{path}: is an input; name another file to write")
+
+
+def made_folder(path: str) -> Path:
+    """The folder at `path`, made if it was not there."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DvrkDrakeError(f"{path}: cannot be made a folder: {error.strerror}") from error
+    return Path(path)
+
+
+def seed(text: str) -> int:
+    """A whole number from 0, for argparse."""
+    if not text.isdigit():
+        raise argparse.ArgumentTypeError(f'"{text}" is not a whole number from 0')
+    return int(text)
+
+
+class ProgressBar:
+    """A progress bar of 0..100 on stderr, gone when the work is done; silent where stderr is no terminal."""
+
+    def __init__(self, what: str):
+        console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._progress.add_task(what, total=100)
+
+    def __enter__(self):
+        self._progress.start()
+        return self._progress, self._task
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
