@@ -13,6 +13,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import Recording, read_recording, write_recording
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
 
 
 @pytest.fixture(scope="module")
@@ -134,9 +135,65 @@ def test_latex_names_every_parameter_and_torque(capsys):
     assert text.count(r"\left(") == text.count(r"\right)")
 
 
-def test_mounting_changes_the_base_set(capsys):
+def test_mounting_changes_the_base_set_and_is_named(capsys):
     assert main(["model", "mtml", "--gravity", "0", "9.81", "0"]) == 0
     assert "m1 c1x" in capsys.readouterr().out
+    for language in ("--c", "--python", "--latex"):
+        assert main(["model", "mtml", language, "--serial", "--gravity", "0", "9.81", "0"]) == 0
+        first = capsys.readouterr().out.splitlines()[0]
+        assert "gravity (0, 9.81, 0) m/s^2" in first
+        assert "without the links of its linkage" in first
+
+
+def test_an_input_is_never_replaced(folder, capsys):
+    poses, model = folder / "poses.csv", folder / "model.yaml"
+    before = poses.read_bytes(), model.read_bytes()
+    assert "is an input" in fails(capsys, "identify", poses, "--arm", "mtmr", "--output", poses)
+    assert "is an input" in fails(capsys, "predict", model, poses, "--output", poses)
+    assert "is an input" in fails(capsys, "validate", model, poses, "--json", model)
+    assert "not a regular file" in fails(capsys, "predict", model, poses, "--output", folder)
+    assert "--latex, --python or --c" in fails(capsys, "model", "mtml", "--output", folder / "x.txt")
+    assert (poses.read_bytes(), model.read_bytes()) == before
+
+
+def test_an_arm_file_of_ones_own_serves_all_verbs(folder, tmp_path, capsys):
+    """A calibrated coupled limit in a file; the model remembers the file."""
+    text = (MODELS_FOLDER / "arms/mtmr.yaml").read_text().replace("name: MTMR", "name: OURS")
+    arm_file = tmp_path / "ours.yaml"
+    arm_file.write_text(text + "coupled_limits:\n  parallelogram: [-0.22, 0.5]\n")
+    arm = load_arm(str(arm_file))
+    assert (arm.coupled_limits[0].lower, arm.coupled_limits[0].upper) == (-0.22, 0.5)
+    model = tmp_path / "model.yaml"
+    assert main(["identify", f"{folder}/poses.csv", "--arm", str(arm_file), "--output", str(model)]) == 0
+    assert main(["validate", str(model), f"{folder}/other.csv"]) == 0
+    capsys.readouterr()
+    arm_file.write_text(text + "coupled_limits:\n  parallelogramm: [-0.22, 0.5]\n")
+    (tmp_path / "other.yaml").write_text(arm_file.read_text())
+    assert 'unknown coupled limit "parallelogramm"' in fails(capsys, "model", tmp_path / "other.yaml")
+
+
+def test_validate_says_that_a_recording_moves_and_writes_null_where_nothing_was_measured(folder, tmp_path, capsys):
+    recording = read_recording(folder / "other.csv")
+    tau = recording.tau.copy()
+    tau[:, 6] = 0.0
+    write_recording(Recording(q=recording.q, tau=tau, t=0.005 * np.arange(len(tau))), tmp_path / "moving.csv")
+    command = ["validate", f"{folder}/model.yaml", str(tmp_path / "moving.csv"), "--json", str(tmp_path / "v.json")]
+    assert main(command) == 0
+    assert "the arm moves in this recording" in capsys.readouterr().out
+    assert json.loads((tmp_path / "v.json").read_text())["joints"][6]["relative_error"] is None
+
+
+def test_interrupt_while_importing_is_one_line_and_130():
+    code = (
+        "import os, signal, sys, dvrk_drake.cli as cli, importlib\n"
+        "real = importlib.import_module\n"
+        "def interrupted(name): os.kill(os.getpid(), signal.SIGINT); return real(name)\n"
+        "importlib.import_module = interrupted\n"
+        "sys.exit(cli.main(['model', 'mtml']))\n"
+    )
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert process.returncode == 130
+    assert process.stderr == "dvrk-drake: interrupted\n"
 
 
 def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):

@@ -174,7 +174,7 @@ def test_gains_belong_to_the_context():
     np.testing.assert_allclose(bench.step(POSES[1], np.ones(N)), MODEL.holding_torque(POSES[1]), atol=1e-14)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e308])
 @pytest.mark.parametrize("where", ["position", "velocity", "desired"])
 def test_a_fault_leaves_the_gravity_of_the_last_finite_pose(bad, where):
     desired = np.concatenate([POSES[0] + 0.1, np.zeros(N)])

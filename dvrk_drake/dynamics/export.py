@@ -20,9 +20,8 @@ def to_latex(gravity: SymbolicGravity, frame_poses: Mapping[str, sympy.Matrix]) 
     """
     short = _short_angles(gravity, *frame_poses.values())
     Y = sympy.Matrix(gravity.regressor).xreplace(short)
-    name = gravity.arm.name
     lines = [
-        f"% {name}: torque that holds it against gravity, tau = Y(q) beta, |g| = {gravity.gravity_magnitude:g} m/s^2.",
+        f"% {_what(gravity)}: torque that holds it against gravity, tau = Y(q) beta.",
         "% s_i = sin q_i, c_i = cos q_i, s_{ij} = sin(q_i + q_j); beta in kg m, m_i c_i in link frame i.",
         r"\begin{align*}",
         *(
@@ -54,7 +53,7 @@ def to_python(gravity: SymbolicGravity) -> str:
     torque, regressor, arguments, beta_argument = _functions(gravity)
     names = "".join(f"    ({value!r}, {name!r}),\n" for name, value in _named_values(gravity))
     return (
-        f'"""{gravity.arm.name}: torque that holds the arm against gravity, tau = Y(q) beta [N m; N if prismatic].\n\n'
+        f'"""{_what(gravity)}: holding torque, tau = Y(q) beta [N m; N if prismatic].\n\n'
         "Made by dvrk-drake from its Drake model. q [rad; m if prismatic] in the dVRK's order and signs, g [m/s^2]\n"
         "the size of gravity, beta [kg m] the base parameters below; out is filled: out[j], or out[j, k] for the\n"
         'regressor (numpy).\n"""\n\nimport math\n\n'
@@ -71,7 +70,7 @@ def to_c(gravity: SymbolicGravity) -> str:
     prefix = gravity.arm.name.lower()
     table = "\n".join(f" *   beta[{i}] = {v!r}: {name}" for i, (name, v) in enumerate(_named_values(gravity)))
     header = (
-        f"/* {gravity.arm.name}: torque that holds the arm against gravity, tau = Y(q) beta [N m; N if prismatic].\n"
+        f"/* {_what(gravity)}: holding torque, tau = Y(q) beta [N m; N if prismatic].\n"
         " * Made by dvrk-drake from its Drake model. q [rad; m if prismatic] in the dVRK's order and signs, g [m/s^2]\n"
         f" * the size of gravity, beta [kg m] the base parameters; nominal values:\n{table}\n */\n"
     )
@@ -80,6 +79,14 @@ def to_c(gravity: SymbolicGravity) -> str:
         "#include <math.h>\n\n", ""
     )
     return header + body
+
+
+def _what(gravity: SymbolicGravity) -> str:
+    """The arm, its mounting, and what is left out: what a reader of an exported file must know."""
+    x, y, z = gravity.arm.gravity
+    labels = {p.label for p in gravity.standard_parameters}
+    serial = "" if any(not label.isdigit() for label in labels) else ", without the links of its linkage"
+    return f"{gravity.arm.name}{serial}, gravity ({x:g}, {y:g}, {z:g}) m/s^2 in its base frame"
 
 
 def _functions(
