@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from dvrk_drake.analysis.static_identification import identify_static
@@ -38,13 +39,20 @@ def main() -> int:
         except RecordingError as error:
             print(f"left out: {error}")
     console = Console(width=130, highlight=False)
-    for name, recording in recordings.items():
-        ours, paper = identify_static(recording, arm), identify_static(recording, arm, "paper")
+    for name, raw in recordings.items():
+        ours = identify_static(raw, arm)
+        recording = ours.recording  # repeated poses averaged: both methods get the same
+        paper = identify_static(recording, arm, "paper")
         doubted = np.zeros(recording.q.shape, dtype=bool)
         for doubt in ours.doubts:
             doubted[doubt.row, list(doubt.joints)] = True
-        table = Table(title=f"identified from {name}; RMS error N m without doubted measurements", title_justify="left")
-        for column in ("judged on", "by", *arm.joint_names):
+        table = Table(
+            title=escape(
+                f"from {name}, {len(raw)} rows, {len(recording)} poses: RMS error [N m] without doubted measurements"
+            ),
+            title_justify="left",
+        )
+        for column in ("judged on", "by", *(f"J{i + 1}" for i in range(arm.num_joints))):
             table.add_column(column, justify="right")
         tau = recording.measured_effort()
 

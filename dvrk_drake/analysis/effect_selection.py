@@ -23,6 +23,8 @@ EFFECT_PRIOR = {"offset": 0.03, "spring": 0.3}
 SIGMA_FLOOR = 2e-3
 #: An effect must lower the sum of squared left-out residuals (in sigma) by this much a coefficient: about log(poses).
 LEAST_GAIN = 4.0
+#: And by this many of its own standard errors over poses.
+LEAST_SIGNIFICANCE = 2.0
 #: A position-dependent effect is considered if the joint moved by this much [rad or m]; else it would fit servo error.
 LEAST_SPAN = 0.25
 
@@ -68,7 +70,7 @@ class StaticProblem:
 def select_effects(problem: StaticProblem) -> tuple[JointEffect, ...]:
     """Adds the effect (or all of one joint's) that lowers the leave-one-out error most, until none clearly does.
 
-    "Clearly": by more than `LEAST_GAIN` per coefficient and by more than the gain's own standard error over poses.
+    "Clearly": by more than `LEAST_GAIN` per coefficient and by more than twice the gain's own standard error over poses.
     Squared errors are capped at nine variances so that no single pose decides.
     """
     chosen: tuple[JointEffect, ...] = ()
@@ -86,7 +88,9 @@ def select_effects(problem: StaticProblem) -> tuple[JointEffect, ...]:
                 trial = problem.fit((*chosen, *candidate), iterations=3, start=current.sigma)
                 gains = loss - _loss(problem, trial, current.sigma)
                 gain = gains.sum()
-                clear = gain > gains.std() * np.sqrt(len(gains)) and gain > LEAST_GAIN * len(candidate)
+                clear = gain > LEAST_SIGNIFICANCE * gains.std() * np.sqrt(len(gains)) and gain > LEAST_GAIN * len(
+                    candidate
+                )
                 if clear and gain > best_gain:
                     best_gain, best = gain, candidate
         if not best:
