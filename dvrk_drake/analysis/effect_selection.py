@@ -70,8 +70,8 @@ class StaticProblem:
 def select_effects(problem: StaticProblem) -> tuple[JointEffect, ...]:
     """Adds the effect (or all of one joint's) that lowers the leave-one-out error most, until none clearly does.
 
-    "Clearly": by more than `LEAST_GAIN` per coefficient and by more than twice the gain's own standard error over poses.
-    Squared errors are capped at nine variances so that no single pose decides.
+    "Clearly": by more than `LEAST_GAIN` per coefficient and by more than twice the gain's own standard error over
+    poses. Squared errors are capped at nine variances so that no single pose decides.
     """
     chosen: tuple[JointEffect, ...] = ()
     current = problem.fit(chosen)
