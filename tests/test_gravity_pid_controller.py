@@ -273,3 +273,9 @@ def test_errors_say_what_is_allowed(arguments, message):
 def test_a_model_that_does_not_fit_its_arm_is_refused():
     with pytest.raises(ModelError, match="base parameters must be"):
         GravityPidController(dataclasses.replace(MODEL, base_parameters=MODEL.base_parameters[1:]))
+
+
+def test_unconnected_state_is_named():
+    controller = GravityPidController(MODEL)
+    with pytest.raises(ControllerError, match="input port state_estimated is not connected"):
+        Simulator(controller).Initialize()

@@ -40,7 +40,7 @@ class GravityPidController(LeafSystem):
 
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
-    - `state_estimated` (2n): q, then v.
+    - `state_estimated` (2n): q, then v. Not connected: ControllerError at initialization.
     - `desired_state` (2n): q_d, then v_d. Not read in "gravity" mode. Unconnected, "hold" mode holds the
       latched pose: the one at initialization, or at the last change from "gravity" to "hold", or when a fault
       ended; so it never jumps.
@@ -189,11 +189,13 @@ class GravityPidController(LeafSystem):
         It runs between two steps of the plant, which leave nothing of Python in the processor's caches: what
         costs is each different thing that it touches. So its names are local and it touches few things.
         """
-        eval_state = self.get_input_port(0).Eval  # raises, and names the port, if it is not connected
         eval_vector_input = self.EvalVectorInput
 
         def update(context: Context, discrete_state: DiscreteValues) -> None:
-            state = eval_state(context)
+            measured = eval_vector_input(context, 0)
+            if measured is None:
+                raise ControllerError("input port state_estimated is not connected")
+            state = measured.get_value()
             desired = eval_vector_input(context, 1)
             step(
                 state,
