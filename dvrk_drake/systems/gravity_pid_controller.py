@@ -116,11 +116,11 @@ class GravityPidController(LeafSystem):
             name="gravity_effort", size=n, calc=self._calc_gravity_effort, prerequisites_of_calc={ticket}
         )
         self.DeclareVectorOutputPort(name="fault", size=1, calc=self._calc_fault, prerequisites_of_calc={ticket})
-        constants = (np.ascontiguousarray(model.theta), np.concatenate([model.trust, limits]), self._period)
+        constants = np.concatenate([[self._period], model.trust, limits, model.theta])
         self._dispatcher = compile_step(model.static_model.torque_into)  # owns the compiled code
         step = entry_point(self._dispatcher)
-        update = self._make_update(step, *constants, restart=False)
-        restart = self._make_update(step, *constants, restart=True)
+        update = self._make_update(step, constants, restart=False)
+        restart = self._make_update(step, constants, restart=True)
         self.DeclareInitializationDiscreteUpdateEvent(update=restart)
         self.DeclarePeriodicDiscreteUpdateEvent(period_sec=self._period, offset_sec=0.0, update=update)
         self.DeclareForcedDiscreteUpdateEvent(update=update)
@@ -179,9 +179,7 @@ class GravityPidController(LeafSystem):
     def _make_update(
         self,
         step: Callable[..., None],
-        theta: NDArray[np.float64],
         constants: NDArray[np.float64],
-        period: float,
         restart: bool,
     ) -> Callable[[Context, DiscreteValues], None]:
         """The handler of an update event.
@@ -201,10 +199,8 @@ class GravityPidController(LeafSystem):
                 state,
                 state if desired is None else desired.get_value(),
                 desired is not None,
-                theta,
-                constants,
-                period,
                 restart,
+                constants,
                 discrete_state.get_mutable_value(0),
                 discrete_state.get_mutable_value(1),
             )

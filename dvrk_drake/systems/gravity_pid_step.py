@@ -15,16 +15,22 @@ ABSURD = 1e6
 def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
     """One update of the controller as one compiled function without allocation.
 
-    Arrays: state, desired (2n); constants: trust, effort limits (n each); in place: effort (n), memory: kp,
+    Arrays: state, desired (2n); constants: period, trust, effort limits
+    (n each), theta, in one array as each argument costs; in place: effort (n), memory: kp,
     kd, ki (n each), mode, then integral, latched pose, last finite pose, gravity effort (n each), then three
     flags: a pose is latched, a finite pose was seen, fault.
     """
 
-    def step(state, desired, has_desired, theta, constants, period, restart, effort, memory):
+    def step(state, desired, has_desired, restart, constants, effort, memory):
         n = effort.size
+        period, trust, limit, theta = (
+            constants[0],
+            constants[1 : n + 1],
+            constants[n + 1 : 2 * n + 1],
+            constants[2 * n + 1 :],
+        )
         kp, kd, ki = memory[:n], memory[n : 2 * n], memory[2 * n : 3 * n]
         hold = memory[3 * n] == 0.0
-        trust, limit = constants[:n], constants[n:]
         rest = memory[3 * n + 1 :]
         integral, latched_q, last_q, gravity = (
             rest[:n],
@@ -82,7 +88,7 @@ def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
     array = numba.float64[::1]
     view = numba.types.Array(numba.float64, 1, "C", readonly=True)  # what Drake gives of inputs
     flag = numba.boolean
-    signature = numba.void(view, view, flag, array, array, numba.float64, flag, array, array)
+    signature = numba.void(view, view, flag, flag, array, array, array)
     return numba.njit(signature)(step)
 
 
