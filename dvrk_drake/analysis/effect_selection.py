@@ -24,7 +24,7 @@ SIGMA_FLOOR = 2e-3
 #: An effect must lower the sum of squared left-out residuals (in sigma) by this much a coefficient: about log(poses).
 LEAST_GAIN = 4.0
 #: And by this many of its own standard errors over poses.
-LEAST_SIGNIFICANCE = 2.0
+LEAST_SIGNIFICANCE = 1.5
 #: A position-dependent effect is considered if the joint moved by this much [rad or m]; else it would fit servo error.
 LEAST_SPAN = 0.25
 
@@ -70,7 +70,7 @@ class StaticProblem:
 def select_effects(problem: StaticProblem) -> tuple[JointEffect, ...]:
     """Adds the effect (or all of one joint's) that lowers the leave-one-out error most, until none clearly does.
 
-    "Clearly": by more than `LEAST_GAIN` per coefficient and by more than twice the gain's own standard error over
+    "Clearly": by more than `LEAST_GAIN` per coefficient and by more than 1.5 of the gain's own standard errors over
     poses. Squared errors are capped at nine variances so that no single pose decides.
     """
     chosen: tuple[JointEffect, ...] = ()
