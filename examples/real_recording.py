@@ -6,6 +6,8 @@ from dvrk_drake.analysis.static_identification import identify_static
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import read_recording
 
+if len(sys.argv) != 2:
+    sys.exit("usage: python real_recording.py FILE.csv")
 recording = read_recording(sys.argv[1])
 result = identify_static(recording, load_arm("mtmr"))
 for doubt in result.doubts:
