@@ -36,7 +36,7 @@ EFFORT_NOISE = 0.01
 #: Release: pose held, then let go, then driven home; phases end at these times [s].
 HELD_UNTIL, RELEASED_UNTIL, HOME_UNTIL = 0.5, 4.5, 7.5
 RELEASE_POSE = np.array([0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5])
-#: Where the paper's simulation starts (Fig. 7): J5, J3 and J2 off home [rad].
+#: Where the paper's simulation starts (Fig. 7): J5, J3 and J2 off home [rad]; q2 + q3 is beyond a real linkage's stop.
 STEP_START = np.array([0.0, -0.22, -0.79, 0.0, 3.13, 0.0, 0.0])
 STEP_DURATION = 4.0
 

@@ -10,7 +10,7 @@ import sympy
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, RigidBody, SpatialInertia_, UnitInertia_
+from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
 from dvrk_drake.dynamics.trigonometry import simplify_trigonometry
 from dvrk_drake.errors import ArmError
@@ -30,7 +30,7 @@ class SymbolicPlant:
     """
 
     def __init__(self, arm: Arm, frames: str = "dh") -> None:
-        """Builds it with a gravity of size 1 in the arm's direction.
+        """Makes the plant symbolic and puts the linkage in.
 
         Args:
             arm: the arm.
@@ -43,7 +43,6 @@ class SymbolicPlant:
         self.numeric = make_arm_plant(arm)
         self.bodies = _labelled_bodies(self.numeric, frames)
         self._plant = self.numeric.ToSymbolic()
-        self._plant.mutable_gravity_field().set_gravity_vector(arm.gravity / np.linalg.norm(arm.gravity))
         self._context = self._plant.CreateDefaultContext()
         self.drake_q = [symbolic.Variable(f"q{i + 1}") for i in range(arm.num_joints)]
         self.q = tuple(sympy.Symbol(f"q{i + 1}", real=True) for i in range(arm.num_joints))
@@ -56,7 +55,6 @@ class SymbolicPlant:
         q_plant = np.empty(self._plant.num_positions(), dtype=object)
         q_plant[tree_selector(self.numeric, arm)] = _tree_positions(arm, self.drake_q)
         self._plant.SetPositions(self._context, q_plant)
-        self._set_rotors_apart()
 
     def to_sympy(self, expression: symbolic.Expression | float) -> sympy.Expr:
         """A Drake expression in q as a sympy expression in `self.q`, not simplified."""
@@ -99,19 +97,6 @@ class SymbolicPlant:
             up_F = [_dot(X[:, k], up_B) for k in range(4)]
             energies.append([up_F[3], *up_F[:3]])
         return energies
-
-    def _set_rotors_apart(self) -> None:
-        """Bodies without a label are rotors, counted with their link; mass 0 would divide by zero in newer Drake."""
-        labelled = {body.index() for body, _ in self.bodies.values()}
-        for index in self.numeric.GetBodyIndices(arm_instance(self.numeric)):
-            if index not in labelled and not self.numeric.IsAnchored(self.numeric.get_body(index)):
-                self._set_mass(self.numeric.get_body(index), symbolic.Variable("m_rotor"), [0, 0, 0])
-
-    def _set_mass(self, body: RigidBody, m: symbolic.Variable, p_BoBcm: list) -> None:
-        M_BBo = SpatialInertia_[symbolic.Expression](
-            symbolic.Expression(m), p_BoBcm, UnitInertia_[symbolic.Expression](1, 1, 1), skip_validity_check=True
-        )
-        self._plant.get_body(body.index()).SetSpatialInertiaInBodyFrame(self._context, M_BBo)
 
 
 def _dot(numbers: NDArray[np.float64], expressions: Sequence[symbolic.Expression]) -> symbolic.Expression:

@@ -61,7 +61,7 @@ def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic"
 
 def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex | None = None) -> NDArray[np.int_]:
     """Index into the plant's q (and v: all joints have one degree of freedom) of each of `arm.tree_joint_names`."""
-    joints = [plant.GetJointByName(n, instance) if instance else plant.GetJointByName(n) for n in arm.tree_joint_names]
+    joints = [plant.GetJointByName(name, instance) for name in arm.tree_joint_names]
     return np.array([joint.position_start() for joint in joints])
 
 
