@@ -65,17 +65,22 @@ def _model(options: argparse.Namespace) -> None:
 
 def _identify(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_identification
+    from dvrk_drake.analysis.slow_parts import slow_parts
     from dvrk_drake.analysis.static_identification import identify_static
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_model
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.recording import read_recording
 
     arm = _mounted(load_arm(options.arm), options.gravity)
-    recording = read_recording(options.recording, arm.num_joints, options.coordinates)
+    recording = read_recording(options.recording, arm, options.coordinates)
     check_output(options.output, options.recording)
+    measured = None
+    if options.slow_parts:
+        recording.check_fits(arm)
+        recording, measured = slow_parts(recording, arm)
     with ProgressBar("identifying") as (progress, task):
         result = identify_static(
-            recording, arm, options.method, lambda share: progress.update(task, completed=100 * share)
+            recording, arm, options.method, lambda share: progress.update(task, completed=100 * share), measured
         )
     console = make_console()
     print_doubts(console, result.doubts)
@@ -93,7 +98,6 @@ def _identify(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_validation
-    from dvrk_drake.analysis.static_identification import REST_SPEED
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
     from dvrk_drake.analysis.validation import validate
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -102,15 +106,14 @@ def _validate(options: argparse.Namespace) -> None:
 
     model = IdentifiedModel.load(options.model)
     arm = model.load_arm()
-    recording = read_recording(options.recording, arm.num_joints, options.coordinates)
+    recording = read_recording(options.recording, arm, options.coordinates)
     if options.json is not None:
         check_output(options.json, options.recording, options.model)
     validation = validate(model, recording)
     console = make_console()
-    joint, speed = recording.fastest_joint()
-    if speed > REST_SPEED:
+    if motion := recording.motion(arm):
         console.print(
-            f"the arm moves in this recording (joint {joint + 1} at {speed:.2g} rad/s RMS): the model holds poses, and "
+            f"the arm moves in this recording ({motion}): the model holds poses, and "
             "knows nothing of inertia and of moving friction",
             style="yellow",
             soft_wrap=True,
@@ -133,7 +136,7 @@ def _predict(options: argparse.Namespace) -> None:
 
     check_output(options.output, options.recording, options.model)
     model = IdentifiedModel.load(options.model)
-    recording = read_recording(options.recording, model.load_arm().num_joints, options.coordinates)
+    recording = read_recording(options.recording, model.load_arm(), options.coordinates)
     tau = predict(model, recording)
     write_csv(options.output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
 
@@ -141,6 +144,7 @@ def _predict(options: argparse.Namespace) -> None:
 def _convert(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.convert import convert
     from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.models.arm import load_arm
 
     console = make_console()
     recording, notes = convert(
@@ -149,6 +153,7 @@ def _convert(options: argparse.Namespace) -> None:
         format=options.format,
         variable=options.variable,
         rate=options.rate,
+        arm=None if options.arm is None else load_arm(options.arm),
         skip_invalid=options.skip_invalid,
     )
     for note in notes:
@@ -200,7 +205,7 @@ def _parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(required=True, metavar="VERB")
 
     verb = verbs.add_parser("model", help="show an arm's gravity torque and regressor", description=_model_help)
-    verb.add_argument("arm", help="mtml, mtmr, or the path of an arm's YAML file")
+    verb.add_argument("arm", help="mtml, mtmr, psm, or the path of an arm's YAML file")
     shown = verb.add_mutually_exclusive_group()
     for name in ("latex", "python", "c"):
         shown.add_argument(f"--{name}", dest="format", action="store_const", const=name, help=f"write {name} source")
@@ -212,10 +217,11 @@ def _parser() -> argparse.ArgumentParser:
 
     verb = verbs.add_parser("identify", help="identify a model from a recording of poses and holding torques")
     _add_recording(verb)
-    verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, or a YAML file")
+    verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, psm, or a YAML file")
     verb.add_argument("--output", required=True, metavar="MODEL.yaml", help="the model file to write")
     verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="default: robust")
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
+    verb.add_argument("--slow-parts", action="store_true", help="of a motion, take where a joint is slow as poses")
     _add_gravity(verb)
     verb.set_defaults(run=_identify)
 
@@ -239,10 +245,11 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument(
         "--rate", type=float, default=200.0, metavar="HZ", help="samples a second of the CSV; default: 200"
     )
+    verb.add_argument("--arm", help="write joint coordinates of this arm, e.g. psm, instead of actuator coordinates (WPI)")
     verb.add_argument("--skip-invalid", action="store_true", help="leave out rows that are not numbers, and count them")
     verb.set_defaults(run=_convert)
     verb = verbs.add_parser("view", help="show an arm in a browser, with sliders that keep its linkage together")
-    verb.add_argument("arm", help="mtml, mtmr, or the path of an arm's YAML file")
+    verb.add_argument("arm", help="mtml, mtmr, psm, or the path of an arm's YAML file")
     verb.add_argument("--port", type=int, help="of the page; default: a free one")
     verb.set_defaults(run=_view)
 

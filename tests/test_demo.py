@@ -78,7 +78,7 @@ def test_true_arm_is_possible_and_differs():
 def test_trajectory_rests_at_each_pose_and_stays_inside_the_limits():
     arm = load_arm("mtml")
     poses = arm.sample_poses(6, np.random.default_rng(0), margin=0.02)
-    trajectory, settled = visiting_trajectory(poses)
+    trajectory, settled = visiting_trajectory(arm, poses)
     for t, pose in zip(settled, poses, strict=True):
         np.testing.assert_allclose(trajectory.value(t).ravel(), pose, atol=1e-12)
         np.testing.assert_allclose(trajectory.EvalDerivative(t).ravel(), 0, atol=1e-12)

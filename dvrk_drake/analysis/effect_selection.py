@@ -10,7 +10,7 @@ import sympy
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.linear_fit import RobustFit, robust_fit
-from dvrk_drake.dynamics.joint_effects import EFFECT_KINDS, JointEffect
+from dvrk_drake.dynamics.joint_effects import EFFECT_KINDS, JointEffect, kinds_of
 from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
 from dvrk_drake.models.arm import Arm
 
@@ -25,7 +25,7 @@ SIGMA_FLOOR = 2e-3
 LEAST_GAIN = 4.0
 #: And by this many of its own standard errors over poses.
 LEAST_SIGNIFICANCE = 1.5
-#: A position-dependent effect is considered if the joint moved by this much [rad or m]; else it would fit servo error.
+#: A position-dependent effect is considered if the joint moved by this much [rad]; else it would fit servo error.
 LEAST_SPAN = 0.25
 
 
@@ -81,7 +81,8 @@ def select_effects(problem: StaticProblem) -> tuple[JointEffect, ...]:
         best_gain = 0.0
         best: tuple[JointEffect, ...] = ()
         for joint, name in enumerate(problem.arm.joint_names):
-            kinds = [k for k in EFFECT_KINDS if k == "offset" or span[joint] >= LEAST_SPAN]
+            possible = kinds_of(bool(problem.arm.prismatic[joint]))
+            kinds = [k for k in possible if k == "offset" or span[joint] >= LEAST_SPAN]
             new = [e for e in (JointEffect(name, k) for k in kinds) if e not in chosen]
             candidates: list[tuple[JointEffect, ...]] = [(e,) for e in new] + ([tuple(new)] if len(new) > 1 else [])
             for candidate in candidates:

@@ -81,9 +81,11 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
         console.print(table)
     for j in model.joints:
         if j.trust == 0.0:
+            why = "it hardly moved, or what was measured cannot tell its gravity from friction"
+            if j.rms_zero_torque == 0.0:
+                why = "no holding torque of it was measured"
             console.print(
-                f"{j.name}: no torque will be commanded: it hardly moved, or what was measured cannot tell "
-                "its gravity from friction",
+                f"{j.name}: no torque will be commanded: {why}",
                 style="yellow",
                 soft_wrap=True,
             )
@@ -170,5 +172,6 @@ def print_validation(console: Console, validation: Validation) -> None:
 def _table(title: str, *columns: str) -> Table:
     table = Table(title=escape(title), title_justify="left", title_style="bold", box=None, pad_edge=False, expand=False)
     for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
+        # The name of a base parameter may be long; numbers are never cut.
+        table.add_column(column, justify="left" if i == 0 else "right", no_wrap=i > 0, overflow="fold")
     return table

@@ -23,11 +23,13 @@ class SdfFacts:
         joint_names: every joint that can move.
         mimics: dependent joint -> (joint it follows, multiplier, offset).
         effort_limits: joint -> `<effort>` [N m or N]; joints without the tag are missing.
+        prismatic: joints that slide; all others turn.
     """
 
     joint_names: tuple[str, ...]
     mimics: dict[str, tuple[str, float, float]]
     effort_limits: dict[str, float]
+    prismatic: frozenset[str]
 
 
 def compose_sdf(urls: Sequence[str]) -> ElementTree.Element:
@@ -53,7 +55,7 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
     Raises:
         ArmError: a joint has `<friction>`, which Drake drops silently.
     """
-    names, mimics, efforts = [], {}, {}
+    names, mimics, efforts, prismatic = [], {}, {}, set()
     for joint in root.findall("model/joint"):
         name = joint.get("name", "")
         if joint.get("type") == "fixed":
@@ -61,6 +63,8 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
         if joint.find(".//friction") is not None:
             raise ArmError(f"joint {name} of the SDF has <friction>, which Drake drops silently; model it elsewhere")
         names.append(name)
+        if joint.get("type") == "prismatic":
+            prismatic.add(name)
         mimic = joint.find(f"{DRAKE}mimic")
         if mimic is not None:
             mimics[name] = (
@@ -71,7 +75,7 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
         effort = joint.findtext("axis/limit/effort")
         if effort is not None:
             efforts[name] = float(effort)
-    return SdfFacts(tuple(names), mimics, efforts)
+    return SdfFacts(tuple(names), mimics, efforts, frozenset(prismatic))
 
 
 def _read(path: Path) -> ElementTree.Element:
