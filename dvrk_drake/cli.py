@@ -98,6 +98,7 @@ def _identify(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_validation
+    from dvrk_drake.analysis.slow_parts import slow_parts
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
     from dvrk_drake.analysis.validation import validate
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -109,8 +110,11 @@ def _validate(options: argparse.Namespace) -> None:
     recording = read_recording(options.recording, arm, options.coordinates)
     if options.json is not None:
         check_output(options.json, options.recording, options.model)
-    validation = validate(model, recording)
     console = make_console()
+    measured = None
+    if options.slow_parts:
+        recording.check_fits(arm)
+        recording, measured = slow_parts(recording, arm)
     if motion := recording.motion(arm):
         console.print(
             f"the arm moves in this recording ({motion}): the model holds poses, and "
@@ -118,6 +122,7 @@ def _validate(options: argparse.Namespace) -> None:
             style="yellow",
             soft_wrap=True,
         )
+    validation = validate(model, recording, measured)
     print_doubts(console, validation.doubts)
     print_validation(console, validation)
     if options.plots is not None:
@@ -229,6 +234,7 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("model", metavar="MODEL.yaml")
     _add_recording(verb)
     verb.add_argument("--json", metavar="FILE", help="write the errors as JSON")
+    verb.add_argument("--slow-parts", action="store_true", help="of a motion, compare where a joint is slow")
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.set_defaults(run=_validate)
 
@@ -245,7 +251,9 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument(
         "--rate", type=float, default=200.0, metavar="HZ", help="samples a second of the CSV; default: 200"
     )
-    verb.add_argument("--arm", help="write joint coordinates of this arm, e.g. psm, instead of actuator coordinates (WPI)")
+    verb.add_argument(
+        "--arm", help="write joint coordinates of this arm, e.g. psm, instead of actuator coordinates (WPI)"
+    )
     verb.add_argument("--skip-invalid", action="store_true", help="leave out rows that are not numbers, and count them")
     verb.set_defaults(run=_convert)
     verb = verbs.add_parser("view", help="show an arm in a browser, with sliders that keep its linkage together")

@@ -19,7 +19,8 @@ SLOW_SPEED, SLOW_ACCELERATION = 0.1, 0.2
 CUT_OFF, ORDER = 10.0, 4
 #: Fewest consecutive samples that make a slow part.
 LEAST_SAMPLES = 3
-#: Slow parts of one joint whose poses agree this well are repetitions of one [rad], [m].
+#: A slow part ends where any joint is further than this from where it began [rad], [m]; those of one joint whose poses
+#: agree this well are repetitions of one.
 SAME_PART = 0.05, 0.005
 
 
@@ -60,7 +61,9 @@ def slow_parts(recording: Recording, arm: Arm) -> SlowParts:
     # The 99 % quantile, not the maximum: one spike must not make everything else slow.
     is_slow = np.abs(v) < SLOW_SPEED * np.quantile(np.abs(v), 0.99, axis=0)
     is_slow &= np.abs(vd) < SLOW_ACCELERATION * np.quantile(np.abs(vd), 0.99, axis=0)
-    parts = [(joint, rows) for joint in range(arm.num_joints) for rows in _parts_of(is_slow[:, joint], joint, moving, arm)]
+    parts = [
+        (joint, rows) for joint in range(arm.num_joints) for rows in _parts_of(is_slow[:, joint], joint, moving, arm)
+    ]
     if not parts:
         raise IdentificationError(
             f"{where}: no joint is slow (below {SLOW_SPEED:.0%} of its speed and {SLOW_ACCELERATION:.0%} of its "
@@ -80,10 +83,17 @@ def slow_parts(recording: Recording, arm: Arm) -> SlowParts:
 
 
 def _parts_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Arm) -> list[NDArray[np.int_]]:
-    """Rows of each slow part of one joint, repetitions joined."""
+    """Rows of each slow part of one joint, repetitions joined; the other joints stay within `SAME_PART` in each."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_slow, [False]]).astype(int)))
-    runs = [np.arange(start, end) for start, end in edges.reshape(-1, 2) if end - start >= LEAST_SAMPLES]
     same = arm.per_joint(*SAME_PART)
+    runs = []
+    for start, end in edges.reshape(-1, 2):
+        while end - start >= LEAST_SAMPLES:
+            away = np.any(np.abs(moving.q[start:end] - moving.q[start]) > same, axis=1)
+            stop = start + int(np.argmax(away)) if np.any(away) else end
+            if stop - start >= LEAST_SAMPLES:
+                runs.append(np.arange(start, stop))
+            start = stop
     parts: list[NDArray[np.int_]] = []
     for run in runs:
         q = moving.q[run].mean(axis=0)

@@ -197,7 +197,11 @@ def _trust(problem: StaticProblem, left_out: NDArray[np.float64], usable: NDArra
     for j in range(arm.num_joints):
         use = usable[:, j]
         measured, predicted = problem.tau[use, j], (problem.tau - left_out)[use, j]
-        if not np.any(use) or np.ptp(problem.q[use, j]) <= least_motion[j] or rms(measured) < LEAST_TORQUE * arm.effort_limits[j]:
+        if (
+            not np.any(use)
+            or np.ptp(problem.q[use, j]) <= least_motion[j]
+            or rms(measured) < LEAST_TORQUE * arm.effort_limits[j]
+        ):
             trust[j] = 0.0
         elif rms(measured - predicted) > LEAST_GAIN_RATIO * rms(measured):
             power = np.sum(predicted**2)

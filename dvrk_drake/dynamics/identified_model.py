@@ -149,7 +149,9 @@ class IdentifiedModel:
             raise ModelError(f"joints must be, in this order: {', '.join(arm.joint_names)}")
         for effect in self.joint_effects:
             if effect.joint not in arm.joint_names:
-                raise ModelError(f"joint effect of an unknown joint {effect.joint}; joints: {', '.join(arm.joint_names)}")
+                raise ModelError(
+                    f"joint effect of an unknown joint {effect.joint}; joints: {', '.join(arm.joint_names)}"
+                )
             kinds = kinds_of(bool(arm.prismatic[arm.joint_names.index(effect.joint)]))
             if effect.kind not in kinds:
                 raise ModelError(f"{effect.joint} cannot have a joint effect {effect.kind}; kinds: {', '.join(kinds)}")

@@ -97,9 +97,7 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
         standard_values=np.array(values),
         base=base,
         regressor=sympy.ImmutableDenseMatrix(GRAVITY * chosen.applyfunc(plant.simplify)),
-        potential=sympy.ImmutableDenseMatrix(
-            [[GRAVITY * energies[column] for column in base.columns]]
-        ),
+        potential=sympy.ImmutableDenseMatrix([[GRAVITY * energies[column] for column in base.columns]]),
     )
 
 
