@@ -263,7 +263,7 @@ def _parser() -> argparse.ArgumentParser:
 
     verb = verbs.add_parser("demo", help="simulate an arm, identify it, compensate it, hold it; writes a folder")
     verb.add_argument("--output", default="demo_output", metavar="DIR", help="default: demo_output")
-    verb.add_argument("--arm", choices=("mtml", "mtmr"), default="mtml", help="default: mtml")
+    verb.add_argument("--arm", choices=("mtml", "mtmr", "psm"), default="mtml", help="default: mtml")
     verb.add_argument("--seed", type=seed, default=0, help="of the simulated arm, its poses and noise; default: 0")
     verb.set_defaults(run=_demo)
     return parser

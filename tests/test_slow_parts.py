@@ -1,5 +1,7 @@
 """The slow parts of a motion: what is taken for a pose, and what it can tell."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,7 @@ def motion(arm, poses, generator, travel=2.0, rest=0.4):
     s = t_travel / travel
     blend = 10 * s**3 - 15 * s**4 + 6 * s**5
     q = [np.tile(poses[0], (len(t_rest), 1))]
-    for a, b in zip(poses[:-1], poses[1:], strict=True):
+    for a, b in itertools.pairwise(poses):
         q += [a + blend[:, None] * (b - a), np.tile(b, (len(t_rest), 1))]
     q = np.vstack(q)
     qd = np.gradient(q, 1 / RATE, axis=0)

@@ -110,7 +110,7 @@ def convert(
 def wpi_in_joint_coordinates(recording: Recording, arm: Arm) -> Recording:
     """A "wpi-csv" recording of `arm`, in actuator coordinates, in joint coordinates.
 
-    Its actuators are the dVRK's but for the roll of a PSM, which is that of the joint (Wang et al. 2019, table of the PSM).
+    Its actuators are the dVRK's but for the roll of a PSM, which is the joint's own (Wang et al. 2019, PSM's table).
 
     Raises:
         RecordingError: wrong number of joints, or poses that the arm cannot have taken.

@@ -1,4 +1,4 @@
-"""The slow parts of a motion as poses: where a joint hardly moves and hardly accelerates, its torque is a static one."""
+"""The slow parts of a motion as poses: where a joint hardly moves or accelerates, its torque is a holding torque."""
 
 from __future__ import annotations
 
@@ -87,7 +87,8 @@ def _parts_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Ar
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_slow, [False]]).astype(int)))
     same = arm.per_joint(*SAME_PART)
     runs = []
-    for start, end in edges.reshape(-1, 2):
+    for first, end in edges.reshape(-1, 2):
+        start = first
         while end - start >= LEAST_SAMPLES:
             away = np.any(np.abs(moving.q[start:end] - moving.q[start]) > same, axis=1)
             stop = start + int(np.argmax(away)) if np.any(away) else end

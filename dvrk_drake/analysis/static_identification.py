@@ -32,8 +32,9 @@ Method = Literal["robust", "paper"]
 LEAST_POSES = 8
 #: Rows whose joints all agree this well are samples of one pose [rad], [m].
 SAME_POSE = 0.01, 0.001
-#: A joint whose measured torque stays below this share of its effort limit says nothing about its model.
-LEAST_TORQUE = 0.02
+#: A joint whose measured torque stays below this share of its effort limit says nothing about its model, unless
+#: leave-one-out explains most of it: less than the second share of it is left.
+LEAST_TORQUE, CLEAR_GAIN_RATIO = 0.02, 0.5
 #: Nor does one that moved by less than this share of its range: its torque elsewhere would be a guess.
 LEAST_MOTION = 0.02
 #: Leave-one-out must lower the RMS error to this share of zero torque's, or the joint's torque is scaled down.
@@ -197,13 +198,11 @@ def _trust(problem: StaticProblem, left_out: NDArray[np.float64], usable: NDArra
     for j in range(arm.num_joints):
         use = usable[:, j]
         measured, predicted = problem.tau[use, j], (problem.tau - left_out)[use, j]
-        if (
-            not np.any(use)
-            or np.ptp(problem.q[use, j]) <= least_motion[j]
-            or rms(measured) < LEAST_TORQUE * arm.effort_limits[j]
-        ):
+        ratio = rms(measured - predicted) / max(rms(measured), 1e-12)
+        small = rms(measured) < LEAST_TORQUE * arm.effort_limits[j]
+        if not np.any(use) or np.ptp(problem.q[use, j]) <= least_motion[j] or (small and ratio > CLEAR_GAIN_RATIO):
             trust[j] = 0.0
-        elif rms(measured - predicted) > LEAST_GAIN_RATIO * rms(measured):
+        elif ratio > LEAST_GAIN_RATIO:
             power = np.sum(predicted**2)
             trust[j] = float(np.clip(measured @ predicted / power, 0.0, 1.0)) if power > 0 else 1.0
     return trust

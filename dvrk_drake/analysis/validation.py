@@ -73,7 +73,7 @@ def validate(
     Args:
         model: the model.
         recording: in either coordinates.
-        measured_joints: (m, n) False where an effort is no holding torque, as `slow_parts` gives it; by default all are.
+        measured_joints: (m, n) False where an effort is no holding torque, as `slow_parts` gives it; default: all are.
 
     Raises:
         RecordingError: the recording does not fit the model's arm, or has no efforts.
