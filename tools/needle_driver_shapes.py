@@ -14,7 +14,7 @@ from pathlib import Path
 
 import build123d as cad
 from home_positions import home_positions
-from shapes import Body, bolts, both, disc, fused, of, plate
+from shapes import Body, both, disc, fused, of, plate
 
 SHAFT = 4.2  # radius
 

@@ -10,7 +10,7 @@ from pydrake.geometry import Meshcat, Role
 
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.arm_view import ArmView, start_meshcat
-from dvrk_drake.systems.camera import ZOOM
+from dvrk_drake.systems.camera import ZOOM, framing
 
 CHROMIUM_FLAGS = (
     "--headless",
@@ -65,7 +65,8 @@ def main() -> None:
     options = parser.parse_args()
     role = Role.kProximity if options.collision else Role.kIllustration
     arm = load_arm(options.arm)
-    meshcat = start_meshcat(arm, camera=options.camera, target=options.target, zoom=options.zoom)
+    camera, target = framing(arm)
+    meshcat = start_meshcat(options.camera or camera, options.target or target, options.zoom)
     ArmView(arm, meshcat, role).show(options.pose)
     picture(meshcat, options.file, *options.size, options.chromium)
 
