@@ -132,7 +132,7 @@ def test_shaft_and_cannula_hold_the_remote_centre_at_every_pose(plant, psm_verti
             around = np.linalg.norm((drawn - center)[:, :2], axis=1)
             assert around.min() < 0.007
     shaft = psm_vertices["roll_link"]
-    assert np.linalg.norm(shaft[:, :2], axis=1).max() == pytest.approx(0.0042, abs=1e-5)
+    assert np.linalg.norm(shaft[:, :2], axis=1).max() == pytest.approx(0.0042, abs=2e-4)
 
 
 #: What touches although no joint of the tree joins it: the top bar's pin in the end link, the instrument in the cannula
