@@ -27,6 +27,7 @@ from dvrk_drake.models.plant import Closure
 from dvrk_drake.models.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.arm_view import start_meshcat
+from dvrk_drake.systems.camera import framing
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 POSES, FRESH_POSES = 40, 15
@@ -150,7 +151,7 @@ def run_demo(
     paper_model = identify_static(poses, arm, "paper").model
     fresh_paper = validate(paper_model, fresh_poses)
 
-    meshcat = start_meshcat()
+    meshcat = start_meshcat(*framing(true_arm.arm))
     t, released = _release(true_arm, model, plan, meshcat, lambda share: progress("releasing and holding", share / 3))
     with atomic_write(output / "arm.html") as stream:
         stream.write(meshcat.StaticHtml())
