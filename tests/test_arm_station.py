@@ -267,9 +267,7 @@ def test_collision_shapes_are_there_when_something_can_be_touched():
 
     def add_table(plant):
         top = RigidTransform([0.0, -0.3, -0.3])
-        plant.RegisterCollisionGeometry(
-            plant.world_body(), top, HalfSpace(), "table", CoulombFriction(0.5, 0.5)
-        )
+        plant.RegisterCollisionGeometry(plant.world_body(), top, HalfSpace(), "table", CoulombFriction(0.5, 0.5))
 
     assert proximity_shapes(ArmStation(ARM)) == 0
     fallen = []
