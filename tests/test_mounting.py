@@ -12,7 +12,7 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 
 def drift(arm, mounted, model):
-    """How far [rad, m] the mounted arm moves in half a second under the model's gravity compensation; and its station."""
+    """How far [rad, m] each joint of the mounted arm moves in half a second under the model's gravity compensation."""
     name = arm.name.lower()
     builder = DiagramBuilder()
     station = builder.AddSystem(ArmStation(arm, plant_arm=mounted, closure="ball"))

@@ -1,4 +1,4 @@
-"""The PSM under GravityPidController with its default gains, loops pinned: holds, steps, follows, and does not wind up."""
+"""The PSM under GravityPidController with its default gains, loops pinned: holds, steps, and does not wind up."""
 
 import dataclasses
 

@@ -81,10 +81,10 @@ def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray
 def _pin(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClosure) -> None:
     """Pins frame_a of the closing bar to frame_b, and holds the bar's length once more as an equation of its own.
 
-    SAP gives each constraint the compliance 5e-10 s^2 / m_eff at 1 ms, m_eff being the mass that the tree without
-    constraints shows at the pin. The pin's three equations share one, and a light bar that is free to swing makes it soft
-    in all directions, along the bar too, where the linkage's load goes. The length alone shows the heavy linkage behind
-    it and is stiff: the PSM's remote centre moves by 1e-8 m under its weight instead of 2e-6 m.
+    SAP gives each constraint the compliance 5e-10 s^2 / m at 1 ms, m being the mass that the tree without constraints
+    shows at the pin. The pin's three equations share one, and a light bar that is free to swing makes it soft in all
+    directions, also along the bar, where the linkage's load goes. The length alone shows the heavy linkage behind it and
+    is stiff: the PSM's remote centre gives by 1e-8 m under its weight, instead of 2e-6 m.
     """
     A, B = (plant.GetFrameByName(name, instance) for name in (loop.frame_a, loop.frame_b))
     p_AP, p_BQ = (frame.GetFixedPoseInBodyFrame().translation() for frame in (A, B))
