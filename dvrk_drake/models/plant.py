@@ -83,7 +83,7 @@ def _pin(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClosure)
 
     SAP gives each constraint the compliance 5e-10 s^2 / m at 1 ms, m being the mass that the tree without constraints
     shows at the pin. The pin's three equations share one, and a light bar that is free to swing makes it soft in all
-    directions, also along the bar, where the linkage's load goes. The length alone shows the heavy linkage behind it and
+    directions, also along the bar, where the linkage's load goes. The length alone shows the linkage behind it and
     is stiff: the PSM's remote centre gives by 1e-8 m under its weight, instead of 2e-6 m.
     """
     A, B = (plant.GetFrameByName(name, instance) for name in (loop.frame_a, loop.frame_b))
