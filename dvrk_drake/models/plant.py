@@ -24,14 +24,16 @@ Closure = Literal["mimic", "ball"]
 def add_arm(plant: MultibodyPlant, arm: Arm, closure: Closure = "mimic") -> ModelInstanceIndex:
     """Adds `arm` to a plant that is not finalized, welds its base to the world and sets gravity and limits.
 
-    Needs a discrete plant with the SAP solver, as all of Drake's joint couplings and ball constraints do.
+    A discrete plant gets the SAP solver, which all of Drake's joint couplings and pins need. A continuous one can only be
+    simulated with the integrator CENIC (its pins need drake 1.56 or newer).
 
     Raises:
         ArmError: no such closure.
     """
     if closure not in get_args(Closure):
         raise ArmError(f'unknown closure "{closure}"; known: {", ".join(get_args(Closure))}')
-    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
+    if plant.time_step() > 0:
+        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
     parser = Parser(plant)
     parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))
     model = compose_sdf(arm.sdf)
