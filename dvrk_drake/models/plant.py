@@ -24,8 +24,8 @@ Closure = Literal["mimic", "ball"]
 def add_arm(plant: MultibodyPlant, arm: Arm, closure: Closure = "mimic") -> ModelInstanceIndex:
     """Adds `arm` to a plant that is not finalized, welds its base to the world and sets gravity and limits.
 
-    A discrete plant gets the SAP solver, which all of Drake's joint couplings and pins need. A continuous one can only be
-    simulated with the integrator CENIC (its pins need drake 1.56 or newer).
+    A discrete plant gets the SAP solver, which all of Drake's joint couplings and pins need. A continuous one can only
+    be simulated with the integrator CENIC (its pins need drake 1.56 or newer).
 
     Raises:
         ArmError: no such closure.
