@@ -37,13 +37,14 @@ def _simulate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.tables import make_console, print_simulation
     from dvrk_drake.models.recording import write_recording
     from dvrk_drake.systems.arm_view import start_meshcat
+    from dvrk_drake.systems.camera import framing
 
     quiet_drake()
     scenario = load_scenario(options.scenario, options.set)
     if options.output is not None:
         check_output(options.output, options.scenario, scenario.controller.model)
     plots = None if options.plots is None else made_folder(options.plots)
-    meshcat = start_meshcat() if options.meshcat else None
+    meshcat = start_meshcat(*framing(scenario.mounted_arm)) if options.meshcat else None
     if meshcat is not None:
         print(f"{scenario.mounted_arm.name} at {meshcat.web_url()}", flush=True)
     with ProgressBar("simulating") as (progress, task):
