@@ -8,7 +8,16 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from dvrk_drake.cli_support import ProgressBar, check_output, import_interruptibly, made_folder, quiet_drake, seed
+from dvrk_drake.cli_simulate import add_simulate
+from dvrk_drake.cli_support import (
+    ProgressBar,
+    check_output,
+    import_interruptibly,
+    made_folder,
+    quiet_drake,
+    seed,
+    until_stopped,
+)
 from dvrk_drake.errors import DvrkDrakeError
 
 # Verbs import what they need when they run: drake and numba take seconds, `--help` should not.
@@ -167,8 +176,6 @@ def _convert(options: argparse.Namespace) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    import time
-
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.systems.arm_view import ArmView, start_meshcat
     from dvrk_drake.systems.camera import framing
@@ -178,13 +185,10 @@ def _view(options: argparse.Namespace) -> None:
     meshcat = start_meshcat(*framing(arm), port=options.port)
     view = ArmView(arm, meshcat)
     view.add_sliders()
-    meshcat.AddButton("Stop", "Escape")
     print(
         f"{arm.name} at {meshcat.web_url()}; sliders under Open Controls; end with Stop, Escape or Ctrl-C", flush=True
     )
-    while meshcat.GetButtonClicks("Stop") == 0:
-        view.follow_sliders()
-        time.sleep(0.03)
+    until_stopped(meshcat, view.follow_sliders)
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -261,6 +265,8 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("arm", help="mtml, mtmr, psm, or the path of an arm's YAML file")
     verb.add_argument("--port", type=int, help="of the page; default: a free one")
     verb.set_defaults(run=_view)
+
+    add_simulate(verbs)
 
     verb = verbs.add_parser("demo", help="simulate an arm, identify it, compensate it, hold it; writes a folder")
     verb.add_argument("--output", default="demo_output", metavar="DIR", help="default: demo_output")

@@ -9,12 +9,18 @@ import os
 import signal
 import sys
 import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from dvrk_drake.errors import DvrkDrakeError
+
+if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat
 
 
 def import_interruptibly() -> None:
@@ -62,6 +68,14 @@ def made_folder(path: str) -> Path:
     except OSError as error:
         raise DvrkDrakeError(f"{path}: cannot be made a folder: {error.strerror}") from error
     return Path(path)
+
+
+def until_stopped(meshcat: Meshcat, meanwhile: Callable[[], object] = lambda: None) -> None:
+    """Serves a Meshcat page until its Stop button or Escape is pressed; `meanwhile` is called all the time."""
+    meshcat.AddButton("Stop", "Escape")
+    while meshcat.GetButtonClicks("Stop") == 0:
+        meanwhile()
+        time.sleep(0.03)
 
 
 def seed(text: str) -> int:

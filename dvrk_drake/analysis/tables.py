@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -11,10 +12,11 @@ from rich.text import Text
 
 from dvrk_drake.analysis.demo import DemoResult
 from dvrk_drake.analysis.doubts import Doubt
+from dvrk_drake.analysis.simulation import Simulation
 from dvrk_drake.analysis.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm import Arm, load_arm
 
 TABLE_WIDTH = 112
 
@@ -91,6 +93,32 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
                 style="yellow",
                 soft_wrap=True,
             )
+
+
+def print_simulation(console: Console, simulation: Simulation, arm: Arm) -> None:
+    """Where each joint was and how far from where it was wanted, over all recorded samples."""
+    recording, desired = simulation.recording, simulation.desired
+    effort = np.abs(recording.measured_effort())
+    table = _table(
+        f"{arm.name}, simulated for {simulation.time[-1]:g} s [rad, N m; m, N if prismatic]",
+        "",
+        "start",
+        "end",
+        "largest error",
+        "error at the end",
+        "largest effort",
+        "effort limit",
+    )
+    for j, name in enumerate(arm.joint_names):
+        errors = ("-", "-")
+        if desired is not None:
+            error = np.abs(recording.q[:, j] - desired[:, j])
+            errors = (f"{error.max():.5f}", f"{error[-1]:.5f}")
+        q = recording.q[:, j]
+        table.add_row(
+            name, f"{q[0]:z.4f}", f"{q[-1]:z.4f}", *errors, f"{effort[:, j].max():.4f}", f"{arm.effort_limits[j]:.4f}"
+        )
+    console.print(table)
 
 
 def print_demo(console: Console, result: DemoResult, folder: str) -> None:
