@@ -118,7 +118,7 @@ def test_a_saturating_step_does_not_wind_up():
         assert np.all(np.any(saturated, axis=0)[:3])
         # Forward, brake: no chatter.
         assert np.all(np.count_nonzero(np.diff(saturated.astype(int), axis=0) > 0, axis=0) <= 2)
-        assert not np.any(saturated[t > 1.0])  # 2.3 rad at the largest torque take 0.7 s, there and to a stop
+        assert not np.any(saturated[t > 1.0])  # 2.3 rad take 0.7 s at the largest torque
         assert np.all(np.abs(q[t > 1.5] - goal) < SETTLED)
         overshoot[integral] = np.max((q - goal) / (goal - start), axis=0)
     assert np.all(overshoot[True] < overshoot[False] + 0.02), "what overshoots is the late brake, not the integrator"

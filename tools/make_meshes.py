@@ -19,7 +19,6 @@ MODELS: dict[str, Callable[[Path], dict[str, Callable[[], Body]]]] = {
 }
 
 
-
 def main() -> None:
     """Write one file per link."""
     parser = ArgumentParser(description=__doc__)
