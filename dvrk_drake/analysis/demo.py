@@ -23,7 +23,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.atomic_file import atomic_write
-from dvrk_drake.models.plant import add_arm
+from dvrk_drake.models.plant import add_arm, set_joint_damping
 from dvrk_drake.models.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.arm_view import start_meshcat
@@ -60,7 +60,11 @@ class TrueArm:
 
     def station(self, meshcat: Meshcat | None = None) -> ArmStation:
         """A station that simulates it, once `prepare` was called with a context."""
-        return ArmStation(self.arm, meshcat=meshcat, modify_plant=self._add_damping)
+        return ArmStation(
+            self.arm,
+            meshcat=meshcat,
+            modify_plant=lambda plant: set_joint_damping(plant, self.arm, self.damping),
+        )
 
     def prepare(self, station: ArmStation, context: Context) -> None:
         """Puts the true inertias into a station's context."""
@@ -69,10 +73,6 @@ class TrueArm:
     def effect_torque(self) -> JointEffectTorque:
         """A new system that plays the joint effects."""
         return JointEffectTorque(self.arm, self.effects, self.coefficients)
-
-    def _add_damping(self, plant: MultibodyPlant) -> None:
-        for name, damping in zip(self.arm.joint_names, self.damping, strict=True):
-            plant.GetJointByName(name).set_default_damping_vector([damping])
 
 
 @dataclass(frozen=True)
