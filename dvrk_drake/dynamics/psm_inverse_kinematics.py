@@ -43,7 +43,9 @@ class PsmInverseKinematics:
         frame = ArmFrame(arm, frame_name)
         self._X_LF = plant.GetFrameByName(frame_name).GetFixedPoseInBodyFrame()
         # The formulas take the axes for granted: try them.
-        q = np.clip([0.3, -0.2, 0.1, 0.5, -0.4, 0.6, *np.zeros(arm.num_joints - 6)], arm.position_lower, arm.position_upper)
+        q = np.clip(
+            [0.3, -0.2, 0.1, 0.5, -0.4, 0.6, *np.zeros(arm.num_joints - 6)], arm.position_lower, arm.position_upper
+        )
         solution = self.solve(frame.pose(q), q)
         if solution is None or not np.allclose(solution, q[:6], rtol=0, atol=1e-9):
             raise not_a_psm

@@ -80,14 +80,19 @@ class TeleoperatedArms(Diagram):
         hand = builder.AddNamedSystem("hand", Hand(master, MASTER_FRAME))
 
         M, F = master.name.lower(), follower.name.lower()
-        state_M, state_F = (self.master.GetOutputPort(f"{M}.state_estimated"), self.follower.GetOutputPort(f"{F}.state_estimated"))
+        state_M, state_F = (
+            self.master.GetOutputPort(f"{M}.state_estimated"),
+            self.follower.GetOutputPort(f"{F}.state_estimated"),
+        )
         connect = builder.Connect
         connect(state_M, carry.GetInputPort("state_estimated"))
         connect(state_M, hand.GetInputPort("state_estimated"))
         connect(carry.GetOutputPort("effort"), self.master.GetInputPort(f"{M}.effort_commanded"))
         connect(hand.GetOutputPort("effort_disturbance"), self.master.GetInputPort(f"{M}.effort_disturbance"))
         connect(self.master.GetOutputPort(f"{M}.position_measured"), self.teleoperation.GetInputPort("master_position"))
-        connect(self.follower.GetOutputPort(f"{F}.position_measured"), self.teleoperation.GetInputPort("follower_position"))
+        connect(
+            self.follower.GetOutputPort(f"{F}.position_measured"), self.teleoperation.GetInputPort("follower_position")
+        )
         connect(self.teleoperation.GetOutputPort("desired_state"), regulate.GetInputPort("desired_state"))
         connect(state_F, regulate.GetInputPort("state_estimated"))
         connect(regulate.GetOutputPort("effort"), self.follower.GetInputPort(f"{F}.effort_commanded"))

@@ -161,9 +161,7 @@ class Teleoperation(LeafSystem):
         state.get_mutable_value(_FOLLOWING)[0] = float(follows)
         state.get_mutable_value(_FAULT)[0] = float(fault)
 
-    def _target(
-        self, q_master: NDArray[np.float64], q_d: NDArray[np.float64], state: DiscreteValues
-    ) -> RigidTransform:
+    def _target(self, q_master: NDArray[np.float64], q_d: NDArray[np.float64], state: DiscreteValues) -> RigidTransform:
         """Wanted X_FT; where the follower did not follow until now, the poses are noted and it is the present one."""
         X_MG = self._master.pose(q_master)
         memory = state.get_mutable_value(_POSES).reshape(2, 3, 4)  # a view
@@ -176,9 +174,7 @@ class Teleoperation(LeafSystem):
             RotationMatrix.ProjectToRotationMatrix(R_FT), p_FT0 + scale * R_FM @ (X_MG.translation() - p_MG0)
         )
 
-    def _rates(
-        self, X_FT: RigidTransform, jaw: NDArray[np.float64], q_d: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _rates(self, X_FT: RigidTransform, jaw: NDArray[np.float64], q_d: NDArray[np.float64]) -> NDArray[np.float64]:
         """Rates (n,) for one period that lead to the pose and jaw angle, inside all limits."""
         solution = self._inverse.solve(X_FT, q_d)
         wanted = np.concatenate([q_d[:6] if solution is None else solution, jaw])
