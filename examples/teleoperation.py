@@ -22,8 +22,8 @@ arms.GetInputPort("engaged").FixValue(context, [1.0])
 arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(X_MG0))
 simulator.AdvanceTo(0.1)
 for t in np.arange(0.1, 3.0, 0.01):  # the hand moves the handle up by 6 cm
-    p_MG = X_MG0.translation() + [0, 0, 0.06 * min(1, (t - 0.1) / 2)]
-    arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(RigidTransform(X_MG0.rotation(), p_MG)))
+    target = RigidTransform([0, 0, 0.06 * min(1, (t - 0.1) / 2)]) @ X_MG0
+    arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(target))
     simulator.AdvanceTo(t)
 
 print(meshcat.web_url())

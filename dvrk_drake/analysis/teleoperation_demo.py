@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +110,7 @@ def play_teleoperation(
 
 
 def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
-    """Simulates in real time with the hand, clutch, jaw and scale on Meshcat's controls, until Stop or `duration` [s]."""
+    """Simulates in real time with hand, clutch, jaw and scale on Meshcat's controls, until Stop or `duration` [s]."""
     arms = _make_arms(meshcat)
     simulator = Simulator(arms)
     context = simulator.get_mutable_context()
@@ -192,7 +193,7 @@ def _segments(following: list[bool]) -> list[range]:
     """Ranges of samples with the same state of the clutch."""
     changes = np.flatnonzero(np.diff(np.array(following, float))) + 1
     bounds = [0, *changes.tolist(), len(following)]
-    return [range(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    return [range(a, b) for a, b in pairwise(bounds)]
 
 
 def _evaluate(samples: _Samples) -> TeleoperationResult:

@@ -95,8 +95,8 @@ class ArmStation(Diagram):
             arm: names the ports, and is the arm that controllers of this station know.
             hardware: the arm itself instead of its simulation.
             time_step: of the plant [s].
-            meshcat: draws the arm there, below a path of the arm's lower-case name; `meshcat.SetTransform("mtml", X_WB)`
-            places it.
+            meshcat: draws the arm there, below the path of its lower-case name: `SetTransform("mtml", X_WB)` places
+            it.
             closure: how the linkage's loops are held, see `add_arm`.
             plant_arm: the arm that is simulated, `arm` by default: another mounting or SDF with the same
             joints.
@@ -133,7 +133,7 @@ class ArmStation(Diagram):
         self._plant.Finalize()
         self._set_default_pose()
         if meshcat is not None:
-            # The visualizer deletes what is below its prefix when it starts: one level down, so that a SetTransform stays.
+            # The visualizer deletes its prefix when it starts: one level down, so that a SetTransform stays.
             parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
             MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
         self._export_inputs(builder)

@@ -20,8 +20,8 @@ from dvrk_drake.systems.gravity_pid_step import ABSURD
 class Grip:
     """How firmly a hand holds: all positive.
 
-    The defaults are of the order that is measured of people: some hundred N/m at the hand (Mussa-Ivaldi, Hogan and Bizzi,
-    J. Neurosci. 5, 1985). Limits are what a person exerts without effort.
+    The defaults are of the order that is measured of people: some hundred N/m at the hand (Mussa-Ivaldi, Hogan and
+    Bizzi, J. Neurosci. 5, 1985). Limits are what a person exerts without effort.
 
     Attributes:
         stiffness: of the position [N/m].
@@ -120,6 +120,10 @@ class Hand(LeafSystem):
         mobility = J @ np.linalg.solve(self._frame.mass_matrix(q), J.T)
         A = np.eye(6) + (h * (self._D + h * self._K))[:, None] * mobility
         F = np.linalg.solve(A, self._K * (e - h * V) - self._D * V)
-        for part, limit in ((F[:3], self._grip.max_torque), (F[3:], self._grip.max_force)):
-            part *= min(1.0, limit / max(np.linalg.norm(part), limit))
-        return F, J
+        return np.concatenate([_limited(F[:3], self._grip.max_torque), _limited(F[3:], self._grip.max_force)]), J
+
+
+def _limited(vector: NDArray[np.float64], limit: float) -> NDArray[np.float64]:
+    """`vector`, shortened to a length of `limit` if it is longer."""
+    length = float(np.linalg.norm(vector))
+    return vector if length <= limit else vector * (limit / length)

@@ -40,8 +40,8 @@ class TeleoperatedArms(Diagram):
 
     `mtml` and `psm` stand for the arms' lower-case names.
 
-    - `X_MG_desired` (RigidTransform): where the hand wants the master's handle, in the master's base. Unconnected: nobody
-      touches the master.
+    - `X_MG_desired` (RigidTransform): where the hand wants the master's handle, in the master's base. Unconnected:
+      nobody touches the master.
     - `engaged`, `jaw_angle`, `desired_state`, `following`, `fault`: those of `Teleoperation`.
     - `state_estimated`: those of the two stations.
     """

@@ -16,7 +16,7 @@ from dvrk_drake.systems.gravity_pid_step import ABSURD
 
 #: Frames that lead and follow: the dVRK's measured_cp of the two arms, at the wrist centre and at the wrist yaw axis.
 MASTER_FRAME, FOLLOWER_FRAME = "dh_7", "dh_6"
-#: The follower's wrist centre stays this far below its remote centre of motion [m]: nearer, yaw and pitch would whirl.
+#: The follower's wrist centre stays this far beyond its remote centre of motion [m]: nearer, yaw and pitch would whirl.
 MIN_DEPTH = 0.02
 #: A follower that is behind its command by more than its fastest joint motion in this time [s] is not following.
 MAX_LAG = 0.1
@@ -55,16 +55,17 @@ class Teleoperation(LeafSystem):
     Engaging therefore never moves the follower, whatever the two orientations are: their difference is kept. (The
     dVRK turns the master's wrist to match instead; a master in gravity compensation has nobody to turn it.)
 
-    **Limits.** Joint positions from `PsmInverseKinematics` are clamped to the arm's limits, and the insertion such that
-    the wrist stays below the remote centre of motion; then each joint moves towards them no faster than its velocity
-    limit. The relation of the poses is kept beyond a limit, so the tip takes it up again where the master comes back.
-    A pose for which there is no solution changes nothing.
+    **Limits.** Joint positions from `PsmInverseKinematics` are clamped to the arm's limits; then each joint moves
+    towards them no faster than its velocity limit. A pose without a solution, as at and above the remote centre of
+    motion, moves nothing but the jaw. The relation of the poses is kept beyond a limit, so the tip takes it up again
+    where the master comes back.
 
     **Hold.** `desired_state` stands still, with zero rates, while the clutch is open, while `master_position` or
     `jaw_angle` is not finite or beyond 1e6, while the follower is farther from the command than its velocity limits
-    cover in `MAX_LAG` (the jaw excepted: it may press on something), and above the remote centre. When that ends the
-    clutch engages anew. With an open clutch a follower that was moved by something else is taken where it is. Before a
-    finite follower_position was seen, `desired_state` is NaN, which the controller refuses.
+    cover in `MAX_LAG` (the jaw excepted: it may press on something), and while the instrument is in its cannula, less
+    than `MIN_DEPTH` beyond the remote centre. When that ends the clutch engages anew. With an open clutch a follower
+    that was moved by something else is taken where it is. Before a finite follower_position was seen, `desired_state`
+    is NaN, which the controller refuses.
 
     A receiver of messages that are late has to open the clutch: ports have no age. Inputs are sampled, and outputs
     change, every `period` seconds and at initialization, which forgets all.
@@ -97,10 +98,9 @@ class Teleoperation(LeafSystem):
             raise ControllerError(f"period must be a positive number of seconds; got {period}")
         self._period = float(period)
         self._master, self._follower = ArmFrame(master, MASTER_FRAME), ArmFrame(follower, FOLLOWER_FRAME)
-        self._inverse = PsmInverseKinematics(follower, FOLLOWER_FRAME)
+        self._inverse = PsmInverseKinematics(follower, FOLLOWER_FRAME, MIN_DEPTH)
         self._R_FM = R_FM or RotationMatrix()
-        self._lower, self._upper = follower.position_lower.copy(), follower.position_upper
-        self._lower[2] = max(self._lower[2], MIN_DEPTH - self._inverse.depth_at_zero)
+        self._lower, self._upper = follower.position_lower, follower.position_upper
         self._speed = _velocity_limits(follower)
         self._max_lag = np.where(np.arange(follower.num_joints) < 6, MAX_LAG * self._speed, np.inf)
 
@@ -152,7 +152,8 @@ class Teleoperation(LeafSystem):
             q_d[:] = q_follower
             lags = False
         fault = lags or not (_usable(q_master) and _usable(jaw) and _usable(engaged))
-        follows = is_engaged and not fault and q_d[2] >= self._lower[2]
+        inserted = q_d[2] + self._inverse.depth_at_zero >= MIN_DEPTH - 1e-6
+        follows = is_engaged and not fault and inserted
         v_d[:] = 0.0
         if follows:
             X_FT = self._target(q_master, q_d, state)
