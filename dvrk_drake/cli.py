@@ -164,7 +164,7 @@ def _view(options: argparse.Namespace) -> None:
 
     quiet_drake()
     arm = load_arm(options.arm)
-    meshcat = start_meshcat(port=options.port)
+    meshcat = start_meshcat(arm, options.port)
     view = ArmView(arm, meshcat)
     view.add_sliders()
     meshcat.AddButton("Stop", "Escape")

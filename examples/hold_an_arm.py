@@ -13,7 +13,7 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 arm = load_arm("mtml")
 model = IdentifiedModel.from_arm(arm)  # or IdentifiedModel.load("model.yaml"), from dvrk-drake identify
 builder = DiagramBuilder()
-meshcat = start_meshcat()
+meshcat = start_meshcat(arm)
 station = builder.AddSystem(ArmStation(arm, meshcat=meshcat))
 controller = builder.AddSystem(GravityPidController(model))
 builder.Connect(station.GetOutputPort("mtml.state_estimated"), controller.GetInputPort("state_estimated"))

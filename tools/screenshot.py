@@ -9,7 +9,8 @@ from pathlib import Path
 from pydrake.geometry import Meshcat, Role
 
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.systems.arm_view import CAMERA, TARGET, ZOOM, ArmView, start_meshcat
+from dvrk_drake.systems.arm_view import ArmView, start_meshcat
+from dvrk_drake.systems.camera import ZOOM
 
 CHROMIUM_FLAGS = (
     "--headless",
@@ -52,17 +53,20 @@ def main() -> None:
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path, help="PNG to write")
     parser.add_argument("--arm", default="mtml", help="which arm")
-    parser.add_argument("--pose", nargs="+", type=float, default=[0.0] * 7, metavar="q", help="independent joints, rad")
-    parser.add_argument("--camera", nargs=3, type=float, default=CAMERA, metavar="m", help="its place")
-    parser.add_argument("--target", nargs=3, type=float, default=TARGET, metavar="m", help="seen point")
+    parser.add_argument(
+        "--pose", nargs="+", type=float, default=[0.0] * 7, metavar="q", help="independent joints, rad or m"
+    )
+    parser.add_argument("--camera", nargs=3, type=float, metavar="m", help="its place; default: frames the arm")
+    parser.add_argument("--target", nargs=3, type=float, metavar="m", help="seen point; default: the arm's middle")
     parser.add_argument("--zoom", type=float, default=ZOOM, help="magnification of Meshcat's 75 degree view")
     parser.add_argument("--collision", action="store_true", help="show the collision shapes instead")
     parser.add_argument("--size", nargs=2, type=int, default=[1200, 900], metavar="pixels", help="width, height")
     parser.add_argument("--chromium", default=shutil.which("chromium") or "chromium", help="the browser")
     options = parser.parse_args()
     role = Role.kProximity if options.collision else Role.kIllustration
-    meshcat = start_meshcat(options.camera, options.target, options.zoom)
-    ArmView(load_arm(options.arm), meshcat, role).show(options.pose)
+    arm = load_arm(options.arm)
+    meshcat = start_meshcat(arm, camera=options.camera, target=options.target, zoom=options.zoom)
+    ArmView(arm, meshcat, role).show(options.pose)
     picture(meshcat, options.file, *options.size, options.chromium)
 
 

@@ -159,7 +159,7 @@ def run_demo(
     paper_model = identify_static(poses, arm, "paper").model
     fresh_paper = validate(paper_model, fresh_poses)
 
-    meshcat = start_meshcat()
+    meshcat = start_meshcat(true_arm)
     t, released = _release(true_arm, model, meshcat, lambda share: progress("releasing and holding", share / 3))
     with atomic_write(output / "arm.html") as stream:
         stream.write(meshcat.StaticHtml())

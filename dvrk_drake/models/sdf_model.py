@@ -33,17 +33,24 @@ class SdfFacts:
 def compose_sdf(urls: Sequence[str]) -> ElementTree.Element:
     """The model of the first file with the links, joints and frames of the others added: an arm and its instrument.
 
+    A link that another file names again gets that file's shapes, so that an instrument's housing is drawn on the arm's
+    carriage without being a body of its own.
+
     Args:
         urls: package URLs or paths.
 
     Raises:
-        ArmError: a file is not an SDF with one model.
+        ArmError: a file is not an SDF with one model, or gives a link that is already there more than shapes.
     """
     root, *others = (_read(Path(str(url).replace(PACKAGE_URL, f"{MODELS_FOLDER}/", 1))) for url in urls)
     (model,) = root.findall("model")
+    links = {link.get("name"): link for link in model.findall("link")}
     for other in others:
-        for part in other.findall("model"):
-            model.extend(part)
+        for part in other.iterfind("model/*"):
+            if part.tag == "link" and part.get("name") in links:
+                _add_shapes(links[part.get("name")], part)
+            else:
+                model.append(part)
     return root
 
 
@@ -82,3 +89,10 @@ def _read(path: Path) -> ElementTree.Element:
     if len(root.findall("model")) != 1:
         raise ArmError(f"{path}: must hold one <model>")
     return root
+
+
+def _add_shapes(link: ElementTree.Element, again: ElementTree.Element) -> None:
+    for shape in again:
+        if shape.tag not in ("visual", "collision"):
+            raise ArmError(f"link {link.get('name')} has <{shape.tag}> in two files; allowed: <visual>, <collision>")
+        link.append(shape)

@@ -13,18 +13,28 @@ from pydrake.systems.framework import DiagramBuilder
 from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, set_arm_positions
-
-#: Where the camera stands and looks by default [m, base frame], with Meshcat's 75 degree view magnified by ZOOM.
-CAMERA, TARGET, ZOOM = (1.1, 0.9, 0.35), (0.0, -0.09, 0.045), 2.8
+from dvrk_drake.systems.camera import ZOOM, framing
 
 
 def start_meshcat(
-    camera: Sequence[float] = CAMERA, target: Sequence[float] = TARGET, zoom: float = ZOOM, port: int | None = None
+    arm: Arm | None = None,
+    port: int | None = None,
+    camera: Sequence[float] | None = None,
+    target: Sequence[float] | None = None,
+    zoom: float = ZOOM,
 ) -> Meshcat:
-    """A Meshcat on localhost with a light ground and the camera on the arm; a free port unless one is given.
+    """A Meshcat on localhost with a light ground and the camera on `arm`; a free port unless one is given.
+
+    Args:
+        arm: what the camera frames where `camera` or `target` [m, base frame] does not say otherwise.
+        port: 1024..65535.
+        camera: where it stands.
+        target: what it looks at.
+        zoom: magnification of Meshcat's 75 degree view.
 
     Raises:
         DvrkDrakeError: the port cannot be opened.
+        ArmError: the arm has nothing to look at.
     """
     if port is not None and not 1024 <= port <= 65535:
         raise DvrkDrakeError(f"port {port} cannot be opened; allowed: 1024..65535")
@@ -37,7 +47,12 @@ def start_meshcat(
     meshcat.SetProperty("/Background", "top_color", [0.86, 0.89, 0.92])
     meshcat.SetProperty("/Background", "bottom_color", [0.97, 0.97, 0.97])
     meshcat.SetProperty("/Cameras/default/rotated/<object>", "zoom", zoom)
-    meshcat.SetCameraPose(np.asarray(camera, float), np.asarray(target, float))
+    if arm is not None and (camera is None or target is None):
+        framed_camera, framed_target = framing(arm)
+        camera = framed_camera if camera is None else camera
+        target = framed_target if target is None else target
+    if camera is not None and target is not None:
+        meshcat.SetCameraPose(np.asarray(camera, float), np.asarray(target, float))
     return meshcat
 
 
@@ -49,7 +64,7 @@ class ArmView:
     """
 
     def __init__(self, arm: Arm, meshcat: Meshcat, role: Role = Role.kIllustration) -> None:
-        """Of `arm` in `meshcat`, at zero.
+        """Of `arm` in `meshcat`, at home: all joints at zero, or as near as their limits allow.
 
         Raises:
             ArmError: the arm has nothing to draw in that role.
