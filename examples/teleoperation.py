@@ -9,7 +9,7 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.arm_view import start_meshcat
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
-meshcat = start_meshcat(camera=(1.7, 0.45, 0.5), target=(0.0, -0.12, 0.05))
+meshcat = start_meshcat(camera=(1.7, 0.45, 0.5), target=(0.0, -0.12, 0.08))
 meshcat.SetTransform("mtml", RigidTransform([0.0, 0.45, 0.05]))
 meshcat.SetTransform("psm", RigidTransform([0.0, -0.22, 0.0]))
 arms = TeleoperatedArms(load_arm("mtml"), load_arm("psm"), scale=1 / 3, meshcat=meshcat)

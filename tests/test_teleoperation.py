@@ -388,10 +388,42 @@ def test_played_hand_lets_go_and_is_followed_within_half_a_millimetre():
     assert "path" in meshcat.StaticHtml()
 
 
-def test_live_scene_follows_its_sliders():
+def pressed(name):
+    """What the browser sends when a button is pressed: msgpack of {type: button, name: name}."""
+    text = [bytes([0xA0 + len(word)]) + word.encode() for word in ("type", "button", "name", name)]
+    return b"\x82" + b"".join(text)
+
+
+def test_live_scene_obeys_its_sliders_and_buttons(monkeypatch):
     meshcat = start_scene()
-    run_live_teleoperation(meshcat, duration=0.1)
-    assert {"hand_x", "hand_roll", "jaw", "scale"} <= set(meshcat.GetSliderNames())
+    plan = {  # time [s]: what the user does
+        0.1: lambda: meshcat.SetSliderValue("hand_z", 0.05),
+        1.1: lambda: meshcat._InjectWebsocketMessage(pressed("Clutch")),
+        1.3: lambda: meshcat.SetSliderValue("hand_z", 0.0),
+        2.1: lambda: meshcat.SetSliderValue("scale", 0.9),
+        2.2: lambda: meshcat.SetSliderValue("hand_x", 0.05),
+        2.9: lambda: meshcat._InjectWebsocketMessage(pressed("Clutch")),
+        3.0: lambda: meshcat.SetSliderValue("hand_x", 0.0),
+        3.5: lambda: meshcat._InjectWebsocketMessage(pressed("Stop")),
+    }
+    tips = {}
+
+    class Watched(Simulator):
+        def AdvanceTo(self, time):
+            arms = self.get_system()
+            self.set_target_realtime_rate(0.0)
+            for due in [due for due in plan if due <= time]:
+                tips[due] = arms.X_FT(self.get_context()).translation()
+                plan.pop(due)()
+            super().AdvanceTo(time)
+
+    monkeypatch.setattr("dvrk_drake.analysis.teleoperation_demo.Simulator", Watched)
+    run_live_teleoperation(meshcat, duration=10.0)
+    assert not plan
+    np.testing.assert_allclose(tips[1.3], tips[0.1], atol=1e-5)  # open, then closed at rest
+    np.testing.assert_allclose(tips[2.1] - tips[1.3], [0, 0, -SCALE * 0.05], atol=3e-4)
+    np.testing.assert_allclose(tips[2.9] - tips[2.2], [0.9 * 0.05, 0, 0], atol=3e-4)
+    np.testing.assert_allclose(tips[3.5], tips[3.0], atol=3e-4)
 
 
 def test_cli_refuses_a_place_that_cannot_be_written(tmp_path, capsys):

@@ -170,13 +170,17 @@ def print_validation(console: Console, validation: Validation) -> None:
 
 def print_teleoperation(console: Console, result: TeleoperationResult, file: str) -> None:
     """How well the tip followed."""
-    table = _table("Tip against the scaled way of the handle since the clutch closed", "", "RMS", "largest")
-    table.add_row("position [mm]", f"{1e3 * result.rms_position_error:.3f}", f"{1e3 * result.max_position_error:.3f}")
-    table.add_row("rotation [mrad]", f"{1e3 * result.rms_rotation_error:.2f}", f"{1e3 * result.max_rotation_error:.2f}")
+    table = _table("Tip against handle", "", "RMS", "largest")
+    table.add_row(
+        escape("position [mm]"), f"{1e3 * result.rms_position_error:.3f}", f"{1e3 * result.max_position_error:.3f}"
+    )
+    table.add_row(
+        escape("rotation [mrad]"), f"{1e3 * result.rms_rotation_error:.2f}", f"{1e3 * result.max_rotation_error:.2f}"
+    )
     console.print(table)
     console.print(
-        f"The handle moved {result.handle_path:.2f} m with a closed clutch; with an open one the tip moved "
-        f"{1e3 * result.max_motion_held:.1g} mm. Open {file} in a browser.",
+        f"The error of the tip against the scaled way of the handle since the clutch closed, over {result.handle_path:.2f} "
+        f"m of it. With an open clutch the tip moved {1e3 * result.max_motion_held:.1g} mm. Open {file} in a browser.",
         markup=False,
         soft_wrap=True,
     )

@@ -28,7 +28,7 @@ START_MASTER = np.array([0.0, 0.25, -0.1, 0.0, 1.2, 0.0, 0.0])
 START_FOLLOWER = np.array([0.0, 0.0, 0.13, 0.0, 0.0, 0.0, 0.5])
 #: Where the bases stand [m], alike in orientation: face to face, so that handle and tip are side by side.
 PLACES = {"mtml": (0.0, 0.45, 0.05), "psm": (0.0, -0.22, 0.0)}
-CAMERA, TARGET, ZOOM = (1.7, 0.45, 0.5), (0.0, -0.12, 0.05), 2.6
+CAMERA, TARGET, ZOOM = (1.7, 0.45, 0.5), (0.0, -0.12, 0.08), 2.6
 #: Of the played motion [s]: the clutch is closed in these intervals.
 ENGAGED = ((0.5, 9.7), (11.2, 16.0))
 DURATION = 16.0
@@ -95,7 +95,7 @@ def play_teleoperation(
 
     samples = _Samples([], [], [])
     if meshcat is not None:
-        meshcat.StartRecording()
+        meshcat.StartRecording(frames_per_second=32)
     for t in np.arange(round(duration / PERIOD) + 1) * PERIOD:
         simulator.AdvanceTo(t)
         samples.following.append(bool(arms.GetOutputPort("following").Eval(context)[0]))
@@ -145,7 +145,7 @@ def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
 
 def start_scene(port: int | None = None) -> Meshcat:
     """A Meshcat with the camera on both arms, and places for them; on a free port unless one is given."""
-    meshcat = start_meshcat(CAMERA, TARGET, ZOOM, port)
+    meshcat = start_meshcat(port=port, camera=CAMERA, target=TARGET, zoom=ZOOM)
     for name, p_WB in PLACES.items():
         meshcat.SetTransform(name, RigidTransform(np.array(p_WB)))
     return meshcat
@@ -172,8 +172,8 @@ def _hand_motion(X_MG0: RigidTransform) -> PiecewisePose:
         eight, circle = 2 * np.pi * _ramp(t, 0.7, 4.5), 2 * np.pi * _ramp(t, 11.5, 15.2)
         back = _ramp(t, 9.9, 11.0)
         p = [
-            0.06 * np.sin(eight) + 0.06 * back + 0.04 * (np.cos(circle) - 1),
-            0.02 * np.sin(eight) + 0.04 * back,
+            0.03 * np.sin(eight) + 0.04 * back,
+            0.06 * np.sin(eight) + 0.05 * back + 0.04 * (np.cos(circle) - 1),
             0.04 * np.sin(2 * eight) - 0.03 * back + 0.04 * np.sin(circle),
         ]
         tilt, swing = np.sin(2 * np.pi * _ramp(t, 4.7, 7.2)), np.sin(2 * np.pi * _ramp(t, 6.9, 9.4))
