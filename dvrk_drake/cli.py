@@ -161,10 +161,11 @@ def _view(options: argparse.Namespace) -> None:
 
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.systems.arm_view import ArmView, start_meshcat
+    from dvrk_drake.systems.camera import framing
 
     quiet_drake()
     arm = load_arm(options.arm)
-    meshcat = start_meshcat(arm, options.port)
+    meshcat = start_meshcat(*framing(arm), port=options.port)
     view = ArmView(arm, meshcat)
     view.add_sliders()
     meshcat.AddButton("Stop", "Escape")

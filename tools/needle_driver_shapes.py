@@ -14,7 +14,7 @@ from pathlib import Path
 
 import build123d as cad
 from home_positions import home_positions
-from shapes import Body, bolts, both, disc, fused, of, plate
+from shapes import Body, both, disc, fused, of, plate
 
 SHAFT = 4.2  # radius
 
@@ -38,7 +38,7 @@ def roll_link(housing: float) -> Body:
     ears = both(lambda side: plate("x", *sorted((side * 2.6, side * 4.2)), [(0, 0, 3.6), (0, 9, 4.2)]) & inside)
     return [
         *of("anodised", disc("z", 9, housing, SHAFT)),
-        *of("steel", disc("z", 7.5, 9.5, SHAFT), ears, disc("x", -4, 4, 1.2)),
+        *of("steel", disc("z", 7.5, 10, SHAFT + 0.15), ears, disc("x", -4, 4, 1.2)),
     ]
 
 

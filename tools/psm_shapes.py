@@ -43,7 +43,7 @@ def base_link(_: Where) -> Body:
     square = [(x, y) for x in (-25.4, 25.4) for y in (-849.4, -798.6)]  # the real bar's four holes, 2 inches apart
     return [
         *fused("casting", disc("y", -788, -756, 76, edge=4), disc("y", -808, -780, 60, edge=3)),
-        *of("cover", disc("y", -757, -751, 70), disc("y", -882, -840, 33, edge=8), disc("y", -845, -838, 40, edge=2)),
+        *of("cover", disc("y", -757, -749, 70), disc("y", -882, -840, 33, edge=8), disc("y", -845, -838, 40, edge=2)),
         *of("graphite", bar),
         *of("casting", plate("z", 228, 240, [(x, y, 10) for x in (-42, 42) for y in (-866, -782)], 3)),
         *of("steel", [disc("z", 218, 229, 4, hole) for hole in square], bolts("y", -843, -837, 36, 6, 2.2)),
@@ -186,12 +186,13 @@ def insertion_link(_: Where) -> Body:
 
 
 def counterweight_link(where: Where) -> Body:
-    """Two slabs that slide on the back crank's rails, each with a cover."""
-    centre = yz(where, "counterweight_link")
-    corners = [(centre[0] + y, centre[1] + z, 5.0) for y in (-15, 15) for z in (-25, 25)]
+    """Block around the back crank's rear, its two slabs slide on the crank's rails."""
+    y, z = yz(where, "counterweight_link")
+    slab_corners = [(y + dy, z + dz, 5.0) for dy in (-31, 15) for dz in (-25, 25)]
+    back = [(y + dy, z + dz, 5.0) for dy in (-31, -30) for dz in (-25, 25)]
     return [
-        *of("graphite", both(lambda side: slab(side, 32.2, 42, corners, 1.5))),
-        *of("steel", both(lambda side: bolts("x", *sorted((side * 41, side * 43)), 17, 4, 2.2, centre))),
+        *fused("graphite", *both(lambda side: slab(side, 32.2, 42, slab_corners, 1.5)), plate("x", -34, 34, back)),
+        *of("steel", both(lambda side: bolts("x", *sorted((side * 41, side * 43)), 17, 4, 2.2, (y - 6, z)))),
     ]
 
 

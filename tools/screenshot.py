@@ -10,7 +10,7 @@ from pydrake.geometry import Meshcat, Role
 
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.arm_view import ArmView, start_meshcat
-from dvrk_drake.systems.camera import ZOOM
+from dvrk_drake.systems.camera import ZOOM, framing
 
 CHROMIUM_FLAGS = (
     "--headless",
@@ -72,7 +72,8 @@ def scene(options: Namespace) -> Meshcat:
     """The arm at its pose."""
     role = Role.kProximity if options.collision else Role.kIllustration
     arm = load_arm(options.arm)
-    meshcat = start_meshcat(arm, camera=options.camera, target=options.target, zoom=options.zoom)
+    camera, target = framing(arm)
+    meshcat = start_meshcat(options.camera or camera, options.target or target, options.zoom)
     ArmView(arm, meshcat, role).show(options.pose)
     return meshcat
 

@@ -23,10 +23,11 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.atomic_file import atomic_write
-from dvrk_drake.models.plant import add_arm, set_joint_damping
+from dvrk_drake.models.plant import add_arm
 from dvrk_drake.models.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.arm_view import start_meshcat
+from dvrk_drake.systems.camera import framing
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 
@@ -60,11 +61,7 @@ class TrueArm:
 
     def station(self, meshcat: Meshcat | None = None) -> ArmStation:
         """A station that simulates it, once `prepare` was called with a context."""
-        return ArmStation(
-            self.arm,
-            meshcat=meshcat,
-            modify_plant=lambda plant: set_joint_damping(plant, self.arm, self.damping),
-        )
+        return ArmStation(self.arm, meshcat=meshcat, modify_plant=self._add_damping)
 
     def prepare(self, station: ArmStation, context: Context) -> None:
         """Puts the true inertias into a station's context."""
@@ -73,6 +70,10 @@ class TrueArm:
     def effect_torque(self) -> JointEffectTorque:
         """A new system that plays the joint effects."""
         return JointEffectTorque(self.arm, self.effects, self.coefficients)
+
+    def _add_damping(self, plant: MultibodyPlant) -> None:
+        for name, damping in zip(self.arm.joint_names, self.damping, strict=True):
+            plant.GetJointByName(name).set_default_damping_vector([damping])
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ def run_demo(
     paper_model = identify_static(poses, arm, "paper").model
     fresh_paper = validate(paper_model, fresh_poses)
 
-    meshcat = start_meshcat(true_arm)
+    meshcat = start_meshcat(*framing(true_arm.arm))
     t, released = _release(true_arm, model, meshcat, lambda share: progress("releasing and holding", share / 3))
     with atomic_write(output / "arm.html") as stream:
         stream.write(meshcat.StaticHtml())

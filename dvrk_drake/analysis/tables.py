@@ -179,8 +179,9 @@ def print_teleoperation(console: Console, result: TeleoperationResult, file: str
     )
     console.print(table)
     console.print(
-        f"The error of the tip against the scaled way of the handle since the clutch closed, over {result.handle_path:.2f} "
-        f"m of it. With an open clutch the tip moved {1e3 * result.max_motion_held:.1g} mm. Open {file} in a browser.",
+        "The error of the tip against the scaled way of the handle since the clutch closed, over "
+        f"{result.handle_path:.2f} m of it. With an open clutch the tip moved {1e3 * result.max_motion_held:.1g} mm. "
+        f"Open {file} in a browser.",
         markup=False,
         soft_wrap=True,
     )

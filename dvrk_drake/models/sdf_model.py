@@ -44,11 +44,11 @@ def compose_sdf(urls: Sequence[str]) -> ElementTree.Element:
     """
     root, *others = (_read(Path(str(url).replace(PACKAGE_URL, f"{MODELS_FOLDER}/", 1))) for url in urls)
     (model,) = root.findall("model")
-    links = {link.get("name"): link for link in model.findall("link")}
+    links = {link.get("name", ""): link for link in model.findall("link")}
     for other in others:
         for part in other.iterfind("model/*"):
-            if part.tag == "link" and part.get("name") in links:
-                _add_shapes(links[part.get("name")], part)
+            if part.tag == "link" and part.get("name", "") in links:
+                _add_shapes(links[part.get("name", "")], part)
             else:
                 model.append(part)
     return root

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import Meshcat, MeshcatParams, MeshcatVisualizer, MeshcatVisualizerParams, Role
@@ -13,28 +11,24 @@ from pydrake.systems.framework import DiagramBuilder
 from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, set_arm_positions
-from dvrk_drake.systems.camera import ZOOM, framing
+from dvrk_drake.systems.camera import ZOOM
 
 
 def start_meshcat(
-    arm: Arm | None = None,
-    port: int | None = None,
-    camera: Sequence[float] | None = None,
-    target: Sequence[float] | None = None,
+    camera: ArrayLike = (2.0, 2.0, 1.0),
+    target: ArrayLike = (0.0, 0.0, 0.0),
     zoom: float = ZOOM,
+    port: int | None = None,
 ) -> Meshcat:
-    """A Meshcat on localhost with a light ground and the camera on `arm`; a free port unless one is given.
+    """A Meshcat on localhost with a light ground; a free port unless one is given.
 
     Args:
-        arm: what the camera frames where `camera` or `target` [m, base frame] does not say otherwise.
-        port: 1024..65535.
-        camera: where it stands.
-        target: what it looks at.
+        camera, target: where the camera stands and what it looks at (3,) [m]; `*framing(arm)` gives both for an arm.
         zoom: magnification of Meshcat's 75 degree view.
+        port: 1024..65535.
 
     Raises:
         DvrkDrakeError: the port cannot be opened.
-        ArmError: the arm has nothing to look at.
     """
     if port is not None and not 1024 <= port <= 65535:
         raise DvrkDrakeError(f"port {port} cannot be opened; allowed: 1024..65535")
@@ -47,12 +41,7 @@ def start_meshcat(
     meshcat.SetProperty("/Background", "top_color", [0.86, 0.89, 0.92])
     meshcat.SetProperty("/Background", "bottom_color", [0.97, 0.97, 0.97])
     meshcat.SetProperty("/Cameras/default/rotated/<object>", "zoom", zoom)
-    if arm is not None and (camera is None or target is None):
-        framed_camera, framed_target = framing(arm)
-        camera = framed_camera if camera is None else camera
-        target = framed_target if target is None else target
-    if camera is not None and target is not None:
-        meshcat.SetCameraPose(np.asarray(camera, float), np.asarray(target, float))
+    meshcat.SetCameraPose(np.asarray(camera, float), np.asarray(target, float))
     return meshcat
 
 
