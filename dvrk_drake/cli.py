@@ -186,8 +186,8 @@ def _teleop(options: argparse.Namespace) -> None:
     if options.html is None:
         meshcat = start_scene(options.port)
         print(
-            f"MTML leads PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale under Open Controls; "
-            "end with Stop, Escape or Ctrl-C",
+            f"MTML leads PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale under Open Controls; the "
+            "arms appear after some seconds; end with Stop, Escape or Ctrl-C",
             flush=True,
         )
         run_live_teleoperation(meshcat)

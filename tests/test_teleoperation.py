@@ -1,10 +1,13 @@
 """A master that leads a PSM: inverse kinematics, the law, the clutch, limits, faults; and both simulated arms."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
+from pydrake.trajectories import PiecewisePose
 
 from dvrk_drake.analysis.teleoperation_demo import (
     SCALE,
@@ -19,6 +22,7 @@ from dvrk_drake.dynamics.psm_inverse_kinematics import PsmInverseKinematics
 from dvrk_drake.errors import ArmError, ControllerError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
+from dvrk_drake.systems.pose_trajectory_source import PoseTrajectorySource
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 from dvrk_drake.systems.teleoperation import MAX_LAG, MIN_DEPTH, Teleoperation, _velocity_limits
 
@@ -424,6 +428,24 @@ def test_live_scene_obeys_its_sliders_and_buttons(monkeypatch):
     np.testing.assert_allclose(tips[2.1] - tips[1.3], [0, 0, -SCALE * 0.05], atol=3e-4)
     np.testing.assert_allclose(tips[2.9] - tips[2.2], [0.9 * 0.05, 0, 0], atol=3e-4)
     np.testing.assert_allclose(tips[3.5], tips[3.0], atol=3e-4)
+
+
+def test_cli_writes_the_recording_and_the_errors(tmp_path, monkeypatch, capsys):
+    short = partial(play_teleoperation, duration=0.6)
+    monkeypatch.setattr("dvrk_drake.analysis.teleoperation_demo.play_teleoperation", short)
+    page = tmp_path / "teleop.html"
+    assert main(["teleop", "--html", str(page)]) == 0
+    assert "<html" in page.read_text()
+    assert "position [mm]" in capsys.readouterr().out
+
+
+def test_pose_stays_at_the_ends_of_its_trajectory():
+    ends = [RigidTransform([0.0, 0, 0]), RigidTransform([2.0, 0, 0])]
+    source = PoseTrajectorySource(PiecewisePose.MakeLinear([1.0, 2.0], ends))
+    context = source.CreateDefaultContext()
+    for time, x in ((0.0, 0.0), (1.5, 1.0), (9.0, 2.0)):
+        context.SetTime(time)
+        assert source.get_output_port().Eval(context).translation()[0] == pytest.approx(x)
 
 
 def test_cli_refuses_a_place_that_cannot_be_written(tmp_path, capsys):

@@ -33,7 +33,7 @@ CAMERA, TARGET, ZOOM = (1.7, 0.45, 0.5), (0.0, -0.12, 0.08), 2.6
 ENGAGED = ((0.5, 9.7), (11.2, 16.0))
 DURATION = 16.0
 PERIOD = 0.02
-BLUE, GREY = Rgba(0.1, 0.35, 0.75), Rgba(0.55, 0.55, 0.55)
+BLUE, GREEN, GREY = Rgba(0.1, 0.35, 0.75), Rgba(0.1, 0.7, 0.2), Rgba(0.55, 0.55, 0.55)
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,10 @@ def play_teleoperation(
 
 
 def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
-    """Simulates in real time with hand, clutch, jaw and scale on Meshcat's controls, until Stop or `duration` [s]."""
+    """Simulates in real time with hand, clutch, jaw and scale on Meshcat's controls, until Stop or `duration` [s].
+
+    A lamp above the master is green while the follower follows.
+    """
     arms = _make_arms(meshcat)
     simulator = Simulator(arms)
     context = simulator.get_mutable_context()
@@ -125,22 +128,21 @@ def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
     meshcat.AddSlider("scale", 0.1, 1.0, 0.05, SCALE)
     meshcat.AddButton("Clutch", "Space")
     meshcat.AddButton("Stop", "Escape")
-    was_engaged, scale = None, SCALE
+    scale, lamp = SCALE, None
     simulator.set_target_realtime_rate(1.0)
     while meshcat.GetButtonClicks("Stop") == 0 and context.get_time() < duration:
-        engaged = meshcat.GetButtonClicks("Clutch") % 2 == 1
-        if engaged != was_engaged:
-            meshcat.SetObject("mtml/clutch", Sphere(0.015), Rgba(0.1, 0.7, 0.2) if engaged else GREY)
-            meshcat.SetTransform("mtml/clutch", RigidTransform([0.0, 0.0, 0.42]))
-            was_engaged = engaged
         if (chosen := meshcat.GetSliderValue("scale")) != scale:
             scale = chosen
             arms.teleoperation.SetScale(arms.teleoperation.GetMyMutableContextFromRoot(context), scale)
         X_MG = _moved(X_MG0, sliders.get_output_port().Eval(sliders_context))
         arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(X_MG))
-        arms.GetInputPort("engaged").FixValue(context, [float(engaged)])
+        arms.GetInputPort("engaged").FixValue(context, [float(meshcat.GetButtonClicks("Clutch") % 2)])
         arms.GetInputPort("jaw_angle").FixValue(context, [meshcat.GetSliderValue("jaw")])
         simulator.AdvanceTo(context.get_time() + PERIOD)
+        if (follows := bool(arms.GetOutputPort("following").Eval(context)[0])) != lamp:
+            lamp = follows
+            meshcat.SetObject("mtml/lamp", Sphere(0.015), GREEN if lamp else GREY)
+            meshcat.SetTransform("mtml/lamp", RigidTransform([0.0, 0.0, 0.42]))
 
 
 def start_scene(port: int | None = None) -> Meshcat:
