@@ -191,6 +191,30 @@ def _view(options: argparse.Namespace) -> None:
     until_stopped(meshcat, view.follow_sliders)
 
 
+def _teleop(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.tables import make_console, print_teleoperation
+    from dvrk_drake.analysis.teleoperation_demo import play_teleoperation, run_live_teleoperation, start_scene
+    from dvrk_drake.models.atomic_file import atomic_write
+
+    quiet_drake()
+    if options.html is None:
+        meshcat = start_scene(options.port)
+        print(
+            f"MTML leads PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale under Open Controls; the "
+            "arms appear after some seconds; end with Stop, Escape or Ctrl-C",
+            flush=True,
+        )
+        run_live_teleoperation(meshcat)
+        return
+    check_output(options.html)
+    meshcat = start_scene(options.port)
+    with ProgressBar("playing") as (progress, task):
+        result = play_teleoperation(meshcat, progress=lambda share: progress.update(task, completed=100 * share))
+    with atomic_write(options.html) as stream:
+        stream.write(meshcat.StaticHtml())
+    print_teleoperation(make_console(), result, options.html)
+
+
 def _demo(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.demo import run_demo
     from dvrk_drake.analysis.tables import make_console, print_demo
@@ -267,6 +291,14 @@ def _parser() -> argparse.ArgumentParser:
     verb.set_defaults(run=_view)
 
     add_simulate(verbs)
+    verb = verbs.add_parser(
+        "teleop", help="simulate a master arm that leads a PSM, with your hand on sliders or a played one"
+    )
+    verb.add_argument(
+        "--html", metavar="FILE", help="play a hand, write the recording and say how well the PSM followed"
+    )
+    verb.add_argument("--port", type=int, help="of the page; default: a free one")
+    verb.set_defaults(run=_teleop)
 
     verb = verbs.add_parser("demo", help="simulate an arm, identify it, compensate it, hold it; writes a folder")
     verb.add_argument("--output", default="demo_output", metavar="DIR", help="default: demo_output")

@@ -297,7 +297,7 @@ def test_meshcat_is_given_the_arm():
     meshcat = Meshcat()
     diagram = ArmStation(ARM, meshcat=meshcat)
     diagram.ForcedPublish(diagram.CreateDefaultContext())
-    assert meshcat.HasPath("/drake/visualizer")
+    assert meshcat.HasPath("/drake/mtml/links")
 
 
 def test_two_stations_in_one_diagram_and_again():

@@ -97,7 +97,7 @@ def test_pins_give_the_same_motion_torque_and_inertia_as_the_couplings():
 def test_same_torques_move_both_alike(q):
     """Holding torque and more, different at every joint, for half a second without control: about 1 rad/s."""
     phase = np.arange(N)
-    push = 0.05 * np.array([1.0, 1.0, 6.0, 0.003, 0.006, 0.015, 0.004])
+    push = 0.05 * np.array([2.0, 2.0, 6.0, 0.003, 0.006, 0.015, 0.004])
     runs = {}
     for closure in ("mimic", "ball"):
         station = ArmStation(ARM, closure=closure)

@@ -94,12 +94,12 @@ def test_a_step_of_each_joint_settles_within_a_second(gravity_factor):
     check_steps(Bench(gravity_factor), step_poses(), 0.12)
 
 
-def test_a_step_settles_on_an_arm_of_twice_the_weight():
-    """Real arms may be heavier than the SDF's estimates; the gravity model knows it here, but for 20 %."""
-    bench = Bench(gravity_factor=0.8 * 2, inertia_factor=2)
-    # Its weight is beyond the effort limits in half of the box: poses where the motors have something left.
+def test_a_step_settles_on_an_arm_with_three_times_the_inertia():
+    """The inertia of a real arm is up to twice that of the SDF; here three times, and the gravity model knows to 20 %."""
+    bench = Bench(gravity_factor=0.8 * 3, inertia_factor=3)
+    # Its weight is beyond the effort limits in a third of the box: poses where the motors have something left.
     poses = ARM.sample_poses(200, np.random.default_rng(5), margin=0.1)
-    light = np.all(np.abs(2 * NOMINAL.holding_torque(poses)) < 0.6 * ARM.effort_limits, axis=1)
+    light = np.all(np.abs(3 * NOMINAL.holding_torque(poses)) < 0.6 * ARM.effort_limits, axis=1)
     check_steps(bench, poses[light][:3], 0.15)
 
 
@@ -113,12 +113,12 @@ def test_a_saturating_step_does_not_wind_up():
         settings = bench.controller.GetMyMutableContextFromRoot(bench.root)
         gains = ARM.gains if integral else dataclasses.replace(ARM.gains, ki=[0.0] * N)
         bench.controller.SetGains(settings, gains)
-        t, q, effort = bench.run(start, goal, 2.2)
+        t, q, effort = bench.run(start, goal, 2.0)
         saturated = np.abs(effort) >= ARM.effort_limits * (1 - 1e-12)
         assert np.all(np.any(saturated, axis=0)[:3])
         # Forward, brake: no chatter.
         assert np.all(np.count_nonzero(np.diff(saturated.astype(int), axis=0) > 0, axis=0) <= 2)
-        assert not np.any(saturated[t > 1.0])
-        assert np.all(np.abs(q[t > 1.8] - goal) < SETTLED)
+        assert not np.any(saturated[t > 1.0])  # 2.3 rad take 0.7 s at the largest torque
+        assert np.all(np.abs(q[t > 1.5] - goal) < SETTLED)
         overshoot[integral] = np.max((q - goal) / (goal - start), axis=0)
     assert np.all(overshoot[True] < overshoot[False] + 0.02), "what overshoots is the late brake, not the integrator"

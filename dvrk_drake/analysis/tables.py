@@ -13,6 +13,7 @@ from rich.text import Text
 from dvrk_drake.analysis.demo import DemoResult
 from dvrk_drake.analysis.doubts import Doubt
 from dvrk_drake.analysis.simulation import Simulation
+from dvrk_drake.analysis.teleoperation_demo import TeleoperationResult
 from dvrk_drake.analysis.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity
@@ -205,6 +206,25 @@ def print_validation(console: Console, validation: Validation) -> None:
             style="red" if worse else "",
         )
     console.print(table)
+
+
+def print_teleoperation(console: Console, result: TeleoperationResult, file: str) -> None:
+    """How well the tip followed."""
+    table = _table("Tip against handle", "", "RMS", "largest")
+    table.add_row(
+        escape("position [mm]"), f"{1e3 * result.rms_position_error:.3f}", f"{1e3 * result.max_position_error:.3f}"
+    )
+    table.add_row(
+        escape("rotation [mrad]"), f"{1e3 * result.rms_rotation_error:.2f}", f"{1e3 * result.max_rotation_error:.2f}"
+    )
+    console.print(table)
+    console.print(
+        "The error of the tip against the scaled way of the handle since the clutch closed, over "
+        f"{result.handle_path:.2f} m of it. With an open clutch the tip moved {1e3 * result.max_motion_held:.1g} mm. "
+        f"Open {file} in a browser.",
+        markup=False,
+        soft_wrap=True,
+    )
 
 
 def _table(title: str, *columns: str) -> Table:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.geometry import Meshcat, MeshcatVisualizer, Role
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
@@ -96,7 +96,8 @@ class ArmStation(Diagram):
             arm: names the ports, and is the arm that controllers of this station know.
             hardware: the arm itself instead of its simulation.
             time_step: of the plant [s].
-            meshcat: draws the arm there.
+            meshcat: draws the arm there, below the path of its lower-case name: `SetTransform("mtml", X_WB)` places
+            it.
             closure: how the linkage's loops are held, see `add_arm`.
             plant_arm: the arm that is simulated, `arm` by default: another mounting or SDF with the same
             joints.
@@ -134,7 +135,9 @@ class ArmStation(Diagram):
         self._drop_idle_shapes()
         self._set_default_pose()
         if meshcat is not None:
-            MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat)
+            # The visualizer deletes its prefix when it starts: one level down, so that a SetTransform stays.
+            parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
+            MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
         self._export_inputs(builder)
         self._export_outputs(builder)
         builder.BuildInto(self)
