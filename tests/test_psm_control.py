@@ -90,14 +90,14 @@ def check_steps(bench, poses, largest_overshoot):
 
 @pytest.mark.parametrize("gravity_factor", [1.0, 0.8, 1.2])
 def test_a_step_of_each_joint_settles_within_a_second(gravity_factor):
-    # Measured: 9 % at most, on the roll; 0.76 s at most, on the insertion.
+    # Measured: 9 % at most, on the roll; 0.82 s at most, on the yaw.
     check_steps(Bench(gravity_factor), step_poses(), 0.12)
 
 
 def test_a_step_settles_on_an_arm_with_three_times_the_inertia():
-    """The inertia of a real arm is up to twice that of the SDF; here three times, and the gravity model knows to 20 %."""
+    """A real arm has up to twice the inertia of the SDF; here three times, and the gravity model knows it to 20 %."""
     bench = Bench(gravity_factor=0.8 * 3, inertia_factor=3)
-    # Its weight is beyond the effort limits in a third of the box: poses where the motors have something left.
+    # Its weight is beyond the effort limits in some of the box: poses where the motors have something left.
     poses = ARM.sample_poses(200, np.random.default_rng(5), margin=0.1)
     light = np.all(np.abs(3 * NOMINAL.holding_torque(poses)) < 0.6 * ARM.effort_limits, axis=1)
     check_steps(bench, poses[light][:3], 0.15)
