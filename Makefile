@@ -9,7 +9,7 @@ demo: $(VENV)/.installed
 	$(BIN)/dvrk-drake demo --output demo_output
 
 test: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(VENV)/.installed-lint
 	$(BIN)/ruff check .

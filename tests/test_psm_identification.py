@@ -16,7 +16,7 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 from dvrk_drake.models.recording import Recording, write_recording
 
-COUNT = 24
+COUNT = 16
 
 
 @pytest.fixture(scope="module")

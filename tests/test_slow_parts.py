@@ -38,7 +38,7 @@ def motion(arm, poses, generator, travel=2.0, rest=0.4):
 
 def test_rests_of_a_motion_are_found_and_identify_the_arm(arm):
     generator = np.random.default_rng(0)
-    poses = arm.sample_poses(40, generator, margin=0.1)
+    poses = arm.sample_poses(16, generator, margin=0.1)
     recording = motion(arm, poses, generator)
     parts, measured = slow_parts(recording, arm)
     assert np.all(measured.sum(axis=1) == 1)

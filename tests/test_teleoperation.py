@@ -406,9 +406,9 @@ def test_live_scene_obeys_its_sliders_and_buttons(monkeypatch):
         1.3: lambda: meshcat.SetSliderValue("hand_z", 0.0),
         2.1: lambda: meshcat.SetSliderValue("scale", 0.9),
         2.2: lambda: meshcat.SetSliderValue("hand_x", 0.05),
-        2.9: lambda: meshcat._InjectWebsocketMessage(pressed("Clutch")),
-        3.0: lambda: meshcat.SetSliderValue("hand_x", 0.0),
-        3.5: lambda: meshcat._InjectWebsocketMessage(pressed("Stop")),
+        3.4: lambda: meshcat._InjectWebsocketMessage(pressed("Clutch")),
+        3.5: lambda: meshcat.SetSliderValue("hand_x", 0.0),
+        4.0: lambda: meshcat._InjectWebsocketMessage(pressed("Stop")),
     }
     tips = {}
 
@@ -426,8 +426,8 @@ def test_live_scene_obeys_its_sliders_and_buttons(monkeypatch):
     assert not plan
     np.testing.assert_allclose(tips[1.3], tips[0.1], atol=1e-5)  # open, then closed at rest
     np.testing.assert_allclose(tips[2.1] - tips[1.3], [0, 0, -SCALE * 0.05], atol=3e-4)
-    np.testing.assert_allclose(tips[2.9] - tips[2.2], [0.9 * 0.05, 0, 0], atol=3e-4)
-    np.testing.assert_allclose(tips[3.5], tips[3.0], atol=3e-4)
+    np.testing.assert_allclose(tips[3.4] - tips[2.2], [0.9 * 0.05, 0, 0], atol=3e-4)
+    np.testing.assert_allclose(tips[4.0], tips[3.5], atol=3e-4)
 
 
 def test_cli_writes_the_recording_and_the_errors(tmp_path, monkeypatch, capsys):
