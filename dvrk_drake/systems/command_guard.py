@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import copy
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,9 @@ from numpy.typing import ArrayLike
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.systems.command_check import is_finite, refusal_by_itself
 from dvrk_drake.systems.command_stream import CommandStream
-from dvrk_drake.systems.guard_limits import Flags, GuardLimits, GuardSettings, Vector
+from dvrk_drake.systems.guard_limits import GuardLimits, Vector
+from dvrk_drake.systems.guard_output import GuardCounts, GuardOutput
+from dvrk_drake.systems.guard_settings import GuardSettings
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
@@ -24,35 +27,6 @@ _ACTIVE = {
     lcmt_dvrk_command.POSITION: lcmt_dvrk_status.STATE_POSITION,
     lcmt_dvrk_command.EFFORT: lcmt_dvrk_status.STATE_EFFORT,
 }
-
-
-@dataclass
-class GuardOutput:
-    """What the arm shall do until the next step; n joints in the arm's order, always finite and inside the limits.
-
-    Attributes:
-        control_mode: lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT.
-        position: (n,) where to regulate to in HOLD and POSITION; else the measured pose [rad, m].
-        velocity: (n,) feed-forward in POSITION; else zero [rad/s, m/s].
-        effort: (n,) what the motors shall apply in EFFORT; else zero [N m, N].
-        joint_flags: (n,) lcmt_dvrk_status.FLAG_* of what was limited.
-    """
-
-    control_mode: int
-    position: Vector
-    velocity: Vector
-    effort: Vector
-    joint_flags: Flags
-
-
-@dataclass
-class GuardCounts:
-    """Commands since the guard was made: taken, missing, refused; and how often one in force expired."""
-
-    accepted: int = 0
-    lost: int = 0
-    refused: int = 0
-    expired: int = 0
 
 
 @dataclass
@@ -131,6 +105,13 @@ class CommandGuard:
         self._q: Vector | None = None
         self._v = self._effort = np.zeros(self.num_joints)
         self._target = self._last_effort = np.zeros(self.num_joints)
+        self.output = self._output(0.0)
+
+    def __deepcopy__(self, memo: object) -> CommandGuard:
+        # A Drake context copies its state before every update, so this must be quick. No array is changed in place.
+        other = copy.copy(self)
+        other.counts, other._stream, other._force = replace(self.counts), copy.copy(self._stream), replace(self._force)
+        return other
 
     @property
     def accepted_modes(self) -> int:
@@ -185,7 +166,8 @@ class CommandGuard:
         self._expire(utime)
         if self.state == lcmt_dvrk_status.STATE_EFFORT and (excess := self.limits.beyond(self._measured_q())):
             self.report_fault(excess, lcmt_dvrk_status.FAULT_POSITION_LIMIT)
-        return self._output(min(max(dt, 0.0), _LONGEST_STEP))
+        self.output = self._output(min(max(dt, 0.0), _LONGEST_STEP))
+        return self.output
 
     def report_fault(self, text: str, code: int = lcmt_dvrk_status.FAULT_DRIVER) -> None:
         """Latches a fault, for drivers whose arm reports one; the first one stays until it is reset."""
@@ -224,9 +206,7 @@ class CommandGuard:
 
     def _refusal_now(self, command: lcmt_dvrk_command, utime: int) -> int:
         """REFUSAL_* of a command that is good by itself, given who sent what before and what the arm is doing."""
-        if self._utime is None or command.status_utime > min(utime, self._utime):
-            return lcmt_dvrk_status.REFUSAL_STALE
-        if utime - command.status_utime > self._expiry:
+        if self._utime is None or not 0 <= utime - command.status_utime <= self._expiry:
             return lcmt_dvrk_status.REFUSAL_STALE
         before, code = self._stream.sender_id, self._stream.refusal(command, utime)
         if code == lcmt_dvrk_status.REFUSAL_OTHER_SENDER:

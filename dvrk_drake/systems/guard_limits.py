@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.systems.guard_settings import GuardSettings
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
@@ -20,32 +20,6 @@ Flags = NDArray[np.int8]
 _WALL_RATE = 20.0
 
 _ROUNDING = 1e-12
-
-
-@dataclass(frozen=True)
-class GuardSettings:
-    """What a command guard allows.
-
-    Attributes:
-        expiry: age at which a command is not obeyed any more [s].
-        start_time: how long commands must be good before they act [s].
-        clock_tolerance: by how much a sender's clock and the arm's may differ between two commands [s].
-        start_effort: how far from the present effort effort commands may start, as a fraction of the effort limit.
-        margin: width of the soft wall before each position limit [rad], and how far from the present pose position
-            commands may start; at most `margin_fraction` of the range, which counts on short or prismatic joints.
-        margin_fraction: see margin.
-        effort_rise_time: in which the commanded effort may grow from zero to its limit [s].
-        traverse_time: in which the commanded position may cross a joint's range [s].
-    """
-
-    expiry: float = 0.05
-    start_time: float = 0.25
-    clock_tolerance: float = 0.05
-    start_effort: float = 0.1
-    margin: float = 0.05
-    margin_fraction: float = 0.05
-    effort_rise_time: float = 0.02
-    traverse_time: float = 1.0
 
 
 class GuardLimits:
