@@ -33,8 +33,8 @@ class SimDvrkDriver(Diagram):
         - effort_commanded
         - lcmt_dvrk_status
 
-    Ports as in DvrkCommandReceiver and DvrkStatusSender. The position controller, which holds the arm whenever no command
-    acts, is a GravityPidController that knows the arm's true gravity; a real arm's has friction instead.
+    Ports as in DvrkCommandReceiver and DvrkStatusSender. The position controller, which holds the arm whenever no
+    command acts, is a GravityPidController that knows the arm's true gravity; a real arm's has friction instead.
     """
 
     def __init__(
@@ -69,8 +69,7 @@ class SimDvrkDriver(Diagram):
             ),
         )
         receiver = self._receiver
-        for port, name in (("desired_state", "desired_state"),):
-            builder.Connect(receiver.GetOutputPort(port), position_controller.GetInputPort(name))
+        builder.Connect(receiver.GetOutputPort("desired_state"), position_controller.GetInputPort("desired_state"))
         builder.Connect(position_controller.GetOutputPort("effort"), receiver.GetInputPort("position_control_effort"))
         if driver.gravity_compensation:
             builder.Connect(
