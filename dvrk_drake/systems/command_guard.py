@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -109,8 +108,13 @@ class CommandGuard:
 
     def __deepcopy__(self, memo: object) -> CommandGuard:
         # A Drake context copies its state before every update, so this must be quick. No array is changed in place.
-        other = copy.copy(self)
-        other.counts, other._stream, other._force = replace(self.counts), copy.copy(self._stream), replace(self._force)
+        other = object.__new__(CommandGuard)
+        other.__dict__.update(self.__dict__)
+        for name in ("counts", "_stream", "_force"):
+            part = getattr(self, name)
+            twin = object.__new__(type(part))
+            twin.__dict__.update(part.__dict__)
+            setattr(other, name, twin)
         return other
 
     @property
