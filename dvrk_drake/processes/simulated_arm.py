@@ -41,9 +41,9 @@ def load_driver(path: str | Path) -> DvrkDriver:
         StationError: it cannot be read, or holds something that is not allowed.
     """
     try:
-        return yaml_load_typed(schema=DvrkDriver, filename=str(path), defaults=DvrkDriver())
-    except StationError as error:
-        raise StationError(f"{path}: {error}") from error
+        driver = yaml_load_typed(schema=DvrkDriver, filename=str(path), defaults=DvrkDriver())
+        driver.check()
+        return driver
     except Exception as error:
         # yaml_load_typed raises many types, from YAML's to KeyError; each text names the field.
         raise StationError(f"{path}: {error}") from error

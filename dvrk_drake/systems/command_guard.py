@@ -89,6 +89,7 @@ class CommandGuard:
             modes: which of POSITION and EFFORT are accepted; both if empty.
         """
         self.settings = settings or GuardSettings()
+        self.settings.check()
         self.limits = GuardLimits(arm, self.settings)
         self.arm_name, self.num_joints, self.session_id = arm.name, arm.num_joints, session_id
         self.state = lcmt_dvrk_status.STATE_HOLD
