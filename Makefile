@@ -19,6 +19,7 @@ lint: $(VENV)/.installed-lint
 benchmark: $(VENV)/.installed-benchmark
 	$(BIN)/python benchmarks/gravity_regressor.py
 	$(BIN)/python benchmarks/control_step.py
+	$(BIN)/python benchmarks/psm_simulation.py
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -8,7 +8,19 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from dvrk_drake.cli_support import ProgressBar, check_output, import_interruptibly, made_folder, quiet_drake, seed
+from dvrk_drake.cli_lcm import add_arm
+from dvrk_drake.cli_simulate import add_simulate
+from dvrk_drake.cli_support import (
+    ProgressBar,
+    add_gravity,
+    check_output,
+    import_interruptibly,
+    made_folder,
+    mounted,
+    quiet_drake,
+    seed,
+    until_stopped,
+)
 from dvrk_drake.errors import DvrkDrakeError
 
 # Verbs import what they need when they run: drake and numba take seconds, `--help` should not.
@@ -45,7 +57,7 @@ def _model(options: argparse.Namespace) -> None:
         if options.format is None:
             raise DvrkDrakeError("--output needs to know what to write: --latex, --python or --c")
         check_output(options.output)
-    arm = _mounted(load_arm(options.arm), options.gravity)
+    arm = mounted(load_arm(options.arm), options.gravity)
     gravity = derive_gravity(arm, options.frames, options.serial)
     writers = {
         "latex": lambda gravity: export.to_latex(gravity, SymbolicPlant(arm, options.frames).frame_poses()),
@@ -65,17 +77,22 @@ def _model(options: argparse.Namespace) -> None:
 
 def _identify(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_identification
+    from dvrk_drake.analysis.slow_parts import slow_parts
     from dvrk_drake.analysis.static_identification import identify_static
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_model
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.recording import read_recording
 
-    arm = _mounted(load_arm(options.arm), options.gravity)
-    recording = read_recording(options.recording, arm.num_joints, options.coordinates)
+    arm = mounted(load_arm(options.arm), options.gravity)
+    recording = read_recording(options.recording, arm, options.coordinates)
     check_output(options.output, options.recording)
+    measured = None
+    if options.slow_parts:
+        recording.check_fits(arm)
+        recording, measured = slow_parts(recording, arm)
     with ProgressBar("identifying") as (progress, task):
         result = identify_static(
-            recording, arm, options.method, lambda share: progress.update(task, completed=100 * share)
+            recording, arm, options.method, lambda share: progress.update(task, completed=100 * share), measured
         )
     console = make_console()
     print_doubts(console, result.doubts)
@@ -93,7 +110,7 @@ def _identify(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_validation
-    from dvrk_drake.analysis.static_identification import REST_SPEED
+    from dvrk_drake.analysis.slow_parts import slow_parts
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
     from dvrk_drake.analysis.validation import validate
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -102,19 +119,22 @@ def _validate(options: argparse.Namespace) -> None:
 
     model = IdentifiedModel.load(options.model)
     arm = model.load_arm()
-    recording = read_recording(options.recording, arm.num_joints, options.coordinates)
+    recording = read_recording(options.recording, arm, options.coordinates)
     if options.json is not None:
         check_output(options.json, options.recording, options.model)
-    validation = validate(model, recording)
     console = make_console()
-    joint, speed = recording.fastest_joint()
-    if speed > REST_SPEED:
+    measured = None
+    if options.slow_parts:
+        recording.check_fits(arm)
+        recording, measured = slow_parts(recording, arm)
+    if motion := recording.motion(arm):
         console.print(
-            f"the arm moves in this recording (joint {joint + 1} at {speed:.2g} rad/s RMS): the model holds poses, and "
+            f"the arm moves in this recording ({motion}): the model holds poses, and "
             "knows nothing of inertia and of moving friction",
             style="yellow",
             soft_wrap=True,
         )
+    validation = validate(model, recording, measured)
     print_doubts(console, validation.doubts)
     print_validation(console, validation)
     if options.plots is not None:
@@ -133,7 +153,7 @@ def _predict(options: argparse.Namespace) -> None:
 
     check_output(options.output, options.recording, options.model)
     model = IdentifiedModel.load(options.model)
-    recording = read_recording(options.recording, model.load_arm().num_joints, options.coordinates)
+    recording = read_recording(options.recording, model.load_arm(), options.coordinates)
     tau = predict(model, recording)
     write_csv(options.output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
 
@@ -141,6 +161,7 @@ def _predict(options: argparse.Namespace) -> None:
 def _convert(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.convert import convert
     from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.models.arm import load_arm
 
     console = make_console()
     recording, notes = convert(
@@ -149,6 +170,7 @@ def _convert(options: argparse.Namespace) -> None:
         format=options.format,
         variable=options.variable,
         rate=options.rate,
+        arm=None if options.arm is None else load_arm(options.arm),
         skip_invalid=options.skip_invalid,
     )
     for note in notes:
@@ -157,23 +179,43 @@ def _convert(options: argparse.Namespace) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    import time
-
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.systems.arm_view import ArmView, start_meshcat
+    from dvrk_drake.systems.camera import framing
 
     quiet_drake()
     arm = load_arm(options.arm)
-    meshcat = start_meshcat(port=options.port)
+    meshcat = start_meshcat(*framing(arm), port=options.port)
     view = ArmView(arm, meshcat)
     view.add_sliders()
-    meshcat.AddButton("Stop", "Escape")
     print(
         f"{arm.name} at {meshcat.web_url()}; sliders under Open Controls; end with Stop, Escape or Ctrl-C", flush=True
     )
-    while meshcat.GetButtonClicks("Stop") == 0:
-        view.follow_sliders()
-        time.sleep(0.03)
+    until_stopped(meshcat, view.follow_sliders)
+
+
+def _teleop(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.tables import make_console, print_teleoperation
+    from dvrk_drake.analysis.teleoperation_demo import play_teleoperation, run_live_teleoperation, start_scene
+    from dvrk_drake.models.atomic_file import atomic_write
+
+    quiet_drake()
+    if options.html is None:
+        meshcat = start_scene(options.port)
+        print(
+            f"MTML leads PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale under Open Controls; the "
+            "arms appear after some seconds; end with Stop, Escape or Ctrl-C",
+            flush=True,
+        )
+        run_live_teleoperation(meshcat)
+        return
+    check_output(options.html)
+    meshcat = start_scene(options.port)
+    with ProgressBar("playing") as (progress, task):
+        result = play_teleoperation(meshcat, progress=lambda share: progress.update(task, completed=100 * share))
+    with atomic_write(options.html) as stream:
+        stream.write(meshcat.StaticHtml())
+    print_teleoperation(make_console(), result, options.html)
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -192,31 +234,6 @@ def _demo(options: argparse.Namespace) -> None:
     print_demo(make_console(), result, options.output)
 
 
-def _arm(options: argparse.Namespace) -> None:
-    from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.processes.lcm_network import open_lcm
-    from dvrk_drake.processes.pace import make_realtime, settle_memory
-    from dvrk_drake.processes.simulated_arm import SimulatedArm, load_driver, start_pose, stop_on_signals
-    from dvrk_drake.systems.arm_view import start_meshcat
-    from dvrk_drake.systems.dvrk_driver import DvrkDriver
-
-    quiet_drake()
-    arm = _mounted(load_arm(options.arm), options.gravity)
-    driver = DvrkDriver() if options.driver is None else load_driver(options.driver)
-    pose = start_pose(arm, options.pose)
-    network = open_lcm(options.lcm_url or driver.lcm_url)
-    meshcat = start_meshcat() if options.meshcat else None
-    simulated = SimulatedArm(arm, driver, network, pose, meshcat)
-    stopped = stop_on_signals()
-    if options.realtime and (warning := make_realtime()):
-        print(f"dvrk-drake: warning: {warning}", file=sys.stderr)
-    settle_memory()
-    where = f"; {meshcat.web_url()}" if meshcat else ""
-    print(f"simulated {arm.name} on LCM {network.get_lcm_url()}{where}; end with Ctrl-C", flush=True)
-    pace = simulated.run(stopped, lambda line: print(line, flush=True))
-    print(f"ended; {pace.late} ticks began more than a period late", flush=True)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="dvrk-drake", description="Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."
@@ -225,29 +242,31 @@ def _parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(required=True, metavar="VERB")
 
     verb = verbs.add_parser("model", help="show an arm's gravity torque and regressor", description=_model_help)
-    verb.add_argument("arm", help="mtml, mtmr, or the path of an arm's YAML file")
+    verb.add_argument("arm", help="mtml, mtmr, psm, or the path of an arm's YAML file")
     shown = verb.add_mutually_exclusive_group()
     for name in ("latex", "python", "c"):
         shown.add_argument(f"--{name}", dest="format", action="store_const", const=name, help=f"write {name} source")
     verb.add_argument("--frames", default="dh", help="link frames of the parameters: dh (dVRK) or paper (Table I)")
     verb.add_argument("--serial", action="store_true", help="leave out the links of the linkage, as the paper does")
     verb.add_argument("--output", metavar="FILE", help="write to a file instead of standard output")
-    _add_gravity(verb)
+    add_gravity(verb)
     verb.set_defaults(run=_model)
 
     verb = verbs.add_parser("identify", help="identify a model from a recording of poses and holding torques")
     _add_recording(verb)
-    verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, or a YAML file")
+    verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, psm, or a YAML file")
     verb.add_argument("--output", required=True, metavar="MODEL.yaml", help="the model file to write")
     verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="default: robust")
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
-    _add_gravity(verb)
+    verb.add_argument("--slow-parts", action="store_true", help="of a motion, take where a joint is slow as poses")
+    add_gravity(verb)
     verb.set_defaults(run=_identify)
 
     verb = verbs.add_parser("validate", help="compare a model with a recording that it was not made from")
     verb.add_argument("model", metavar="MODEL.yaml")
     _add_recording(verb)
     verb.add_argument("--json", metavar="FILE", help="write the errors as JSON")
+    verb.add_argument("--slow-parts", action="store_true", help="of a motion, compare where a joint is slow")
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.set_defaults(run=_validate)
 
@@ -264,26 +283,30 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument(
         "--rate", type=float, default=200.0, metavar="HZ", help="samples a second of the CSV; default: 200"
     )
+    verb.add_argument(
+        "--arm", help="write joint coordinates of this arm, e.g. psm, instead of actuator coordinates (WPI)"
+    )
     verb.add_argument("--skip-invalid", action="store_true", help="leave out rows that are not numbers, and count them")
     verb.set_defaults(run=_convert)
     verb = verbs.add_parser("view", help="show an arm in a browser, with sliders that keep its linkage together")
-    verb.add_argument("arm", help="mtml, mtmr, or the path of an arm's YAML file")
+    verb.add_argument("arm", help="mtml, mtmr, psm, or the path of an arm's YAML file")
     verb.add_argument("--port", type=int, help="of the page; default: a free one")
     verb.set_defaults(run=_view)
 
-    verb = verbs.add_parser("arm", help="play an arm behind LCM: a simulated one with a hardware driver's safeguards")
-    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
-    verb.add_argument("--driver", metavar="FILE.yaml", help="configuration of its driver, fields as in DvrkDriver")
-    verb.add_argument("--lcm-url", metavar="URL", help="default: the driver's, or LCM_DEFAULT_URL, or LCM's own")
-    verb.add_argument("--pose", nargs="+", type=float, metavar="Q", help="where it starts [rad, m]; default: near zero")
-    verb.add_argument("--meshcat", action="store_true", help="draw it in a browser")
-    verb.add_argument("--realtime", action="store_true", help="real-time scheduling, or a warning where not permitted")
-    _add_gravity(verb)
-    verb.set_defaults(run=_arm)
+    add_arm(verbs)
+    add_simulate(verbs)
+    verb = verbs.add_parser(
+        "teleop", help="simulate a master arm that leads a PSM, with your hand on sliders or a played one"
+    )
+    verb.add_argument(
+        "--html", metavar="FILE", help="play a hand, write the recording and say how well the PSM followed"
+    )
+    verb.add_argument("--port", type=int, help="of the page; default: a free one")
+    verb.set_defaults(run=_teleop)
 
     verb = verbs.add_parser("demo", help="simulate an arm, identify it, compensate it, hold it; writes a folder")
     verb.add_argument("--output", default="demo_output", metavar="DIR", help="default: demo_output")
-    verb.add_argument("--arm", choices=("mtml", "mtmr"), default="mtml", help="default: mtml")
+    verb.add_argument("--arm", choices=("mtml", "mtmr", "psm"), default="mtml", help="default: mtml")
     verb.add_argument("--seed", type=seed, default=0, help="of the simulated arm, its poses and noise; default: 0")
     verb.set_defaults(run=_demo)
     return parser
@@ -299,22 +322,6 @@ def _add_recording(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
     )
-
-
-def _add_gravity(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "--gravity",
-        nargs=3,
-        type=float,
-        metavar=("X", "Y", "Z"),
-        help="gravity in the arm's base frame [m/s^2], for other mountings; default: the arm's file, 0 0 -9.81",
-    )
-
-
-def _mounted(arm, gravity):
-    if gravity is None:
-        return arm
-    return arm.with_gravity(gravity)
 
 
 if __name__ == "__main__":

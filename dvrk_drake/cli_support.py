@@ -9,12 +9,20 @@ import os
 import signal
 import sys
 import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from dvrk_drake.errors import DvrkDrakeError
+
+if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat
+
+    from dvrk_drake.models.arm import Arm
 
 
 def import_interruptibly() -> None:
@@ -64,11 +72,37 @@ def made_folder(path: str) -> Path:
     return Path(path)
 
 
+def until_stopped(meshcat: Meshcat, meanwhile: Callable[[], object] = lambda: None) -> None:
+    """Serves a Meshcat page until its Stop button or Escape is pressed; `meanwhile` is called all the time."""
+    meshcat.AddButton("Stop", "Escape")
+    while meshcat.GetButtonClicks("Stop") == 0:
+        meanwhile()
+        time.sleep(0.03)
+
+
 def seed(text: str) -> int:
     """A whole number from 0, for argparse."""
     if not text.isdigit():
         raise argparse.ArgumentTypeError(f'"{text}" is not a whole number from 0')
     return int(text)
+
+
+def add_gravity(verb: argparse.ArgumentParser) -> None:
+    """Adds the option --gravity."""
+    verb.add_argument(
+        "--gravity",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="gravity in the arm's base frame [m/s^2], for other mountings; default: the arm's file, 0 0 -9.81",
+    )
+
+
+def mounted(arm: Arm, gravity: list[float] | None) -> Arm:
+    """The arm as --gravity says that it is mounted."""
+    if gravity is None:
+        return arm
+    return arm.with_gravity(gravity)
 
 
 class ProgressBar:

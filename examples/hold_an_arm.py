@@ -8,12 +8,13 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.arm_view import start_meshcat
+from dvrk_drake.systems.camera import framing
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 arm = load_arm("mtml")
 model = IdentifiedModel.from_arm(arm)  # or IdentifiedModel.load("model.yaml"), from dvrk-drake identify
 builder = DiagramBuilder()
-meshcat = start_meshcat()
+meshcat = start_meshcat(*framing(arm))
 station = builder.AddSystem(ArmStation(arm, meshcat=meshcat))
 controller = builder.AddSystem(GravityPidController(model))
 builder.Connect(station.GetOutputPort("mtml.state_estimated"), controller.GetInputPort("state_estimated"))

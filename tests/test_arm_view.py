@@ -1,10 +1,11 @@
-"""The Meshcat view: the linkage follows, and sliders cannot leave the coupled limit."""
+"""The Meshcat view: the linkage follows, sliders cannot leave the coupled limit, and the camera sees the whole arm."""
 
 import numpy as np
 import pytest
 
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.arm_view import ArmView, start_meshcat
+from dvrk_drake.systems.camera import ASPECT, HALF_HEIGHT, framing, geometry_corners
 
 
 @pytest.fixture(scope="module")
@@ -37,3 +38,43 @@ def test_sliders_cover_each_joint_and_stop_at_the_coupled_limit(view):
     assert q[1] + q[2] <= 0.68 + 2e-3
     assert q[1] + q[2] > 0.6
     assert view.meshcat.GetSliderValue("q3 elbow_pitch") == pytest.approx(q[2])
+
+
+def test_sliders_of_the_psm_move_seven_joints_and_the_linkage_follows():
+    view = ArmView(load_arm("psm"), start_meshcat())
+    view.add_sliders()
+    assert view._slider_names == [
+        "q1 yaw",
+        "q2 pitch",
+        "q3 insertion",
+        "q4 roll",
+        "q5 wrist_pitch",
+        "q6 wrist_yaw",
+        "q7 jaw",
+    ]
+    wanted = [-0.7, 0.6, 0.15, 2.0, -0.5, 0.8, 0.9]
+    for name, value in zip(view._slider_names, wanted, strict=True):
+        view.meshcat.SetSliderValue(name, value)
+    np.testing.assert_allclose(view.follow_sliders(), wanted, atol=6e-3)  # a slider has steps of 1/1000 of its range
+    plant = view._plant
+    context = plant.GetMyContextFromRoot(view._context)
+    for loop in view.arm.loop_closures:
+        A, B = plant.GetFrameByName(loop.frame_a), plant.GetFrameByName(loop.frame_b)
+        assert np.linalg.norm(A.CalcPose(context, B).translation()) < 1e-12
+    q = view._q
+    assert plant.GetJointByName("pitch").get_angle(context) == q[1]
+    assert plant.GetJointByName("top_bar").get_angle(context) == pytest.approx(-q[1])
+    assert plant.GetJointByName("counterweight").get_translation(context) == pytest.approx(q[2])
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_camera_sees_the_whole_arm_and_wastes_no_room(name):
+    arm = load_arm(name)
+    camera, target = framing(arm)
+    forward = (target - camera) / np.linalg.norm(target - camera)
+    right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(np.cross(forward, [0, 0, 1]))
+    seen = geometry_corners(arm) - camera
+    half_height = HALF_HEIGHT * (seen @ forward)
+    share = np.maximum(np.abs(seen @ right) / ASPECT, np.abs(seen @ np.cross(right, forward))) / half_height
+    assert (half_height > 0).all()
+    assert 0.8 < share.max() < 1.0

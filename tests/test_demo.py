@@ -5,6 +5,7 @@ import pytest
 
 from dvrk_drake.analysis import demo
 from dvrk_drake.analysis.collection import visiting_trajectory
+from dvrk_drake.analysis.true_arm import make_true_arm
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.models.arm import load_arm
@@ -68,7 +69,7 @@ def test_demo_drifts_less_than_with_the_nominal_model_and_comes_to_rest(result):
 
 def test_true_arm_is_possible_and_differs():
     arm = load_arm("mtml")
-    true_arm = demo.make_true_arm(arm, np.random.default_rng(3))
+    true_arm = make_true_arm(arm, np.random.default_rng(3))
     plant = make_arm_plant(arm)
     for name, M in true_arm.inertias.items():
         assert M.IsPhysicallyValid(), name
@@ -78,7 +79,7 @@ def test_true_arm_is_possible_and_differs():
 def test_trajectory_rests_at_each_pose_and_stays_inside_the_limits():
     arm = load_arm("mtml")
     poses = arm.sample_poses(6, np.random.default_rng(0), margin=0.02)
-    trajectory, settled = visiting_trajectory(poses)
+    trajectory, settled = visiting_trajectory(arm, poses)
     for t, pose in zip(settled, poses, strict=True):
         np.testing.assert_allclose(trajectory.value(t).ravel(), pose, atol=1e-12)
         np.testing.assert_allclose(trajectory.EvalDerivative(t).ravel(), 0, atol=1e-12)

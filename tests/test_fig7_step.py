@@ -8,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 
-from dvrk_drake.analysis.demo import STEP_START
+from dvrk_drake.analysis.demo import MTM_PLAN
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.arm_station import ArmStation
@@ -45,8 +45,8 @@ def simulate(q0, q_desired, duration, gravity_factor=1.0):
 
 @pytest.mark.parametrize("gravity_factor", [1.0, 0.8, 1.2])
 def test_settles_on_every_joint_and_stays(gravity_factor):
-    t, error, effort = simulate(STEP_START, np.zeros(7), 10.0, gravity_factor)
-    np.testing.assert_allclose(error[0], STEP_START, atol=1e-12)
+    t, error, effort = simulate(np.array(MTM_PLAN.step), np.zeros(7), 10.0, gravity_factor)
+    np.testing.assert_allclose(error[0], MTM_PLAN.step, atol=1e-12)
     late = t >= 3.0
     worst = np.abs(error[late]).max(axis=0)
     assert np.all(worst < 1e-3), f"largest error after 3 s [mrad]: {1e3 * worst}"

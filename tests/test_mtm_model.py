@@ -149,7 +149,7 @@ def test_holding_torque_is_the_gradient_of_potential_energy(arm, plant):
 def test_loop_closed_by_a_pin_needs_the_same_holding_torque(arm, plant):
     """The variant without mimics on the loop: statics by the null space of its numerical constraint Jacobian."""
     loop_plant = make_arm_plant(arm, closure="ball")
-    assert loop_plant.num_constraints() == plant.num_constraints() - 1  # two mimics less, one pin more
+    assert loop_plant.num_constraints() == plant.num_constraints()  # two mimics less; a pin and a length more
     (loop,) = arm.loop_closures
     A, B = (loop_plant.GetFrameByName(name) for name in (loop.frame_a, loop.frame_b))
     context, loop_context = plant.CreateDefaultContext(), loop_plant.CreateDefaultContext()

@@ -145,13 +145,17 @@ def test_errors_name_file_line_and_column_in_one_line(tmp_path, case):
     assert str(caught.value).startswith(str(tmp_path))
 
 
+def six_joint_arm():
+    return replace(load_arm("psm"), joint_names=load_arm("psm").joint_names[:6])
+
+
 def test_six_joints(tmp_path):
     path = write_text(tmp_path, f"{SIX}\n" + ",".join(["0"] * 12))
-    assert read_recording(path, num_joints=6).q.shape == (1, 6)
+    assert read_recording(path, arm=six_joint_arm()).q.shape == (1, 6)
     with pytest.raises(RecordingError, match="missing column q7"):
         read_recording(path)
-    with pytest.raises(RecordingError, match="has q7, but the arm has 6 joints"):
-        read_recording(write_text(tmp_path, f"{HEADER}\n{ROW}"), num_joints=6)
+    with pytest.raises(RecordingError, match="has q7, but the arm has 6 joints; of PSM these are yaw, pitch"):
+        read_recording(write_text(tmp_path, f"{HEADER}\n{ROW}"), arm=six_joint_arm())
 
 
 def test_files_that_are_none(tmp_path):
@@ -188,6 +192,39 @@ def test_degrees_are_suspected():
     q = np.degrees(arm.sample_poses(20, np.random.default_rng(0)))
     with pytest.raises(RecordingError, match=r"of MTML; are these degrees\? Positions must be in radians"):
         Recording(q=q).check_fits(arm)
+
+
+def test_a_psm_counts_six_joints_and_the_jaw(tmp_path):
+    path = write_text(tmp_path, f"{SIX}\n" + ",".join(["0"] * 12))
+    with pytest.raises(RecordingError, match=r"missing column q7; .*of PSM these are yaw, pitch, .*, wrist_yaw, jaw"):
+        read_recording(path, load_arm("psm"))
+
+
+def test_a_prismatic_joint_in_millimetres_is_suspected():
+    arm = load_arm("psm")
+    q = arm.sample_poses(20, np.random.default_rng(0))
+    Recording(q=q).check_fits(arm)
+    q[:, 2] *= 1000
+    with pytest.raises(RecordingError, match=r"insertion \(q3\) = .* 0\.\.0\.24 m of PSM; are these millimetres\?"):
+        Recording(q=q).check_fits(arm)
+
+
+def test_a_prismatic_joint_is_given_millimetres_of_tolerance_where_others_have_milliradians():
+    arm = load_arm("psm")
+    q = np.zeros((1, 7))
+    q[0, 2] = 0.25
+    Recording(q=q).check_fits(arm)
+    q[0, 2] = 0.27
+    with pytest.raises(RecordingError, match=r"insertion \(q3\) = 0\.27 is outside"):
+        Recording(q=q).check_fits(arm)
+
+
+def test_motion_is_judged_by_the_joints_own_kind():
+    arm = load_arm("psm")
+    qd = np.zeros((10, 7))
+    qd[:, 2] = 0.01
+    assert Recording(q=np.zeros((10, 7)), qd=qd).motion(arm) == "joint 3 at 0.01 m/s RMS"
+    assert Recording(q=np.zeros((10, 7)), qd=qd[:, ::-1][:, [0, 1, 2, 4, 3, 5, 6]]).motion(arm) == ""
 
 
 def test_one_bad_pose_is_named_and_not_taken_for_degrees():

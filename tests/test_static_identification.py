@@ -229,7 +229,10 @@ def test_model_file_round_trip_and_refusals(arm, tmp_path):
     text = (tmp_path / "m.yaml").read_text()
     for bad, message in (
         (text.replace("arm: mtmr", "arm: psm9"), 'unknown arm "psm9"'),
-        (text.replace("kind: spring", "kind: sprung"), "unknown joint effect"),
+        (
+            text.replace("kind: spring", "kind: sprung"),
+            "wrist_pitch cannot have a joint effect sprung; kinds: offset, spring",
+        ),
         (text.replace("trust: 1.0", "trust: 2.0"), "trust between 0 and 1"),
         (text.replace("arm: mtmr", "arms: mtmr"), "not a model file"),
         ("]", "not a model file"),

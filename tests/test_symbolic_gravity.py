@@ -77,6 +77,11 @@ def arm():
     return load_arm("mtmr")
 
 
+@pytest.fixture(scope="module", params=["mtmr", "psm"])
+def any_arm(request):
+    return load_arm(request.param)
+
+
 @pytest.fixture(scope="module")
 def random_q():
     return np.random.default_rng(3).uniform(-np.pi, np.pi, (40, 7))
@@ -145,8 +150,8 @@ def test_dvrk_controller_mapping(arm):
 
 
 @pytest.mark.parametrize("direction", [(0, 0, -9.81), (0, 9.81, 0), (3.0, -2.0, -9.0)])
-def test_regressor_times_parameters_is_the_plants_holding_torque(arm, random_q, direction):
-    mounted = arm.with_gravity(direction)
+def test_regressor_times_parameters_is_the_plants_holding_torque(any_arm, random_q, direction):
+    mounted = any_arm.with_gravity(direction)
     model = compile_static_model(mounted)
     plant = make_arm_plant(mounted)
     context = plant.CreateDefaultContext()
@@ -162,8 +167,8 @@ def test_regressor_times_parameters_is_the_plants_holding_torque(arm, random_q, 
     assert np.linalg.matrix_rank(stacked) == len(beta)
 
 
-def test_torque_is_the_gradient_of_the_symbolic_potential_and_the_potential_is_the_plants(arm, random_q):
-    gravity = derive_gravity(arm)
+def test_torque_is_the_gradient_of_the_symbolic_potential_and_the_potential_is_the_plants(any_arm, random_q):
+    arm, gravity = any_arm, derive_gravity(any_arm)
     gradient = sympy.Matrix(gravity.potential).T.jacobian(gravity.q).T
     difference = sympy.lambdify([*gravity.q], (gradient - gravity.regressor).subs(GRAVITY, 9.81), modules="numpy")
     assert max(np.abs(np.array(difference(*q), float)).max() for q in random_q) < 1e-12
@@ -178,11 +183,19 @@ def test_torque_is_the_gradient_of_the_symbolic_potential_and_the_potential_is_t
     assert np.ptp(constants) < 1e-12
 
 
-@pytest.mark.parametrize("frames", ["dh", "paper"])
-def test_symbolic_frames_are_the_plants(arm, random_q, frames):
+@pytest.mark.parametrize(
+    ("name", "frames", "labels"),
+    [
+        ("mtmr", "dh", "1 2 3 4 5 6 7 crank coupler"),
+        ("mtmr", "paper", "1 2 3 4 5 6 7 crank coupler"),
+        ("psm", "dh", "1 2 3 4 5 6 back_crank bottom_bar top_bar front_crank counterweight finger_1 finger_2"),
+    ],
+)
+def test_symbolic_frames_are_the_plants(random_q, name, frames, labels):
+    arm = load_arm(name)
     symbolic = SymbolicPlant(arm, frames)
     poses = symbolic.frame_poses()
-    assert set(poses) == {"1", "2", "3", "4", "5", "6", "7", "crank", "coupler"}
+    assert set(poses) == set(labels.split())
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     zero = plant.GetFrameByName(f"{frames}_0")
@@ -196,26 +209,21 @@ def test_symbolic_frames_are_the_plants(arm, random_q, frames):
             )
 
 
-def test_base_set_is_complete_when_masses_change(arm, random_q):
+def test_base_set_is_complete_when_masses_change(any_arm, random_q):
     """The combination formulas hold for any masses, not only the SDF's: perturb every link and compare."""
-    gravity = derive_gravity(arm)
+    arm, gravity = any_arm, derive_gravity(any_arm)
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     generator = np.random.default_rng(8)
     values = gravity.standard_values.copy()
     labels = [p.label for p in gravity.standard_parameters if not p.axis]
-    bodies = {
-        "2": "upper_arm_link",
-        "3": "forearm_link",
-        "5": "wrist_pitch_link",
-        "crank": "crank_link",
-        "coupler": "coupler_link",
-    }
-    for label, name in bodies.items():
+    # Part of the link that carries it, for gravity.
+    rotors = {"4": [plant.GetBodyByName("motor_4_link")]} if arm.name == "MTMR" else {}
+    for label in labels:
         k = 4 * labels.index(label)
         factor = generator.uniform(0.5, 1.5)
-        body = plant.GetBodyByName(name)
-        body.SetMass(context, body.default_mass() * factor)
+        for body in [plant.GetFrameByName(f"dh_{label}").body(), *rotors.get(label, [])]:
+            body.SetMass(context, body.default_mass() * factor)
         values[k : k + 4] *= factor
     model = compile_static_model(arm)
     for q in random_q:

@@ -1,8 +1,8 @@
-"""Rounded solids (build123d, millimetres) and a glTF writer for them, used by make_mtm_meshes.py."""
+"""Rounded solids (build123d, millimetres) and a glTF writer for them, used by make_meshes.py."""
 
 import json
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import cos, pi, sin
 from pathlib import Path
 
@@ -99,6 +99,17 @@ def bolts(
     return [disc(axis, low, high, radius, place) for place in places]
 
 
+def both(make: Callable[[float], Sequence[cad.Shape] | cad.Shape]) -> list[cad.Shape]:
+    """What `make` returns for either side, +1 and -1, of the plane x = 0."""
+    made = [make(side) for side in (1.0, -1.0)]
+    return [part for one in made for part in (one if isinstance(one, list) else [one])]
+
+
+def moved(body: Body, by: Sequence[float]) -> Body:
+    """The body shifted."""
+    return [(material, cad.Pos(*by) * solid) for material, solid in body]
+
+
 def of(material: str, *solids: cad.Shape | Sequence[cad.Shape]) -> Body:
     """The solids, each marked with a material."""
     flat = [part for solid in solids for part in (solid if isinstance(solid, list) else [solid])]
@@ -106,8 +117,16 @@ def of(material: str, *solids: cad.Shape | Sequence[cad.Shape]) -> Body:
 
 
 def fused(material: str, *solids: cad.Shape) -> Body:
-    """The union of the solids in one material."""
-    return [(material, solids[0].fuse(*solids[1:]))]
+    """The union of the solids in one material.
+
+    Raises:
+        ValueError: the kernel lost a solid, which it does silently where faces all but coincide; move them apart.
+    """
+    union = solids[0].fuse(*solids[1:])
+    bounds, wanted = union.bounding_box(), cad.Compound(children=list(solids)).bounding_box()
+    if (bounds.min - wanted.min).length > 1e-3 or (bounds.max - wanted.max).length > 1e-3:
+        raise ValueError(f"a solid was lost: the union spans {bounds}, the solids {wanted}")
+    return [(material, union)]
 
 
 def triangulated(solid: cad.Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -191,7 +210,7 @@ def write_gltf(body: Body, path: Path) -> None:
         )
     uri = "data:application/octet-stream;base64," + b64encode(data).decode()
     document = {
-        "asset": {"version": "2.0", "generator": "tools/make_mtm_meshes.py"},
+        "asset": {"version": "2.0", "generator": "tools/make_meshes.py"},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))}],
         "nodes": [{"name": mesh["name"], "mesh": index} for index, mesh in enumerate(meshes)],

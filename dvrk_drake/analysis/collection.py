@@ -12,34 +12,40 @@ from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 
-#: Highest joint speed between poses [rad/s or m/s], least time on the way [s], time to settle [s], samples a pose.
-TRAVEL_SPEED, LEAST_TRAVEL, SETTLE, SAMPLES = 4.0, 0.8, 1.0, 10
+#: Highest joint speed between poses [rad/s], [m/s].
+TRAVEL_SPEED = 4.0, 0.2
+#: Least time on the way [s], time to settle [s], samples a pose.
+LEAST_TRAVEL, SETTLE, SAMPLES = 0.8, 1.0, 10
 #: Between two samples of a pose [s].
 SAMPLE_SPACING = 0.01
 
 
-def visiting_trajectory(poses: NDArray[np.float64]) -> tuple[PiecewisePolynomial, NDArray[np.float64]]:
+def visiting_trajectory(arm: Arm, poses: NDArray[np.float64]) -> tuple[PiecewisePolynomial, NDArray[np.float64]]:
     """A trajectory from poses[0] through all others, at rest at each for as long as settling and sampling take.
 
     Straight in joint space, so between poses inside linear limits it stays inside of them.
 
     Args:
+        arm: the arm, for how fast its joints may be.
         poses: (m, n).
 
     Returns:
         The trajectory of q (n,), and the time (m,) at which each pose has settled.
     """
     times, knots, settled = [0.0], [poses[0]], []
+    speed = arm.per_joint(*TRAVEL_SPEED)
     rest = SETTLE + SAMPLES * SAMPLE_SPACING
     for i, pose in enumerate(poses):
         if i:
             # A cubic from rest to rest is 1.5 times as fast in its middle as on average.
-            travel = max(LEAST_TRAVEL, 1.5 * float(np.abs(pose - poses[i - 1]).max()) / TRAVEL_SPEED)
+            travel = max(LEAST_TRAVEL, 1.5 * float(np.max(np.abs(pose - poses[i - 1]) / speed)))
             times.append(times[-1] + travel)
             knots.append(pose)
         settled.append(times[-1] + SETTLE)
@@ -77,18 +83,10 @@ def collect_static_poses(
     """
     arm = station.arm
     name = arm.name.lower()
-    trajectory, settled = visiting_trajectory(poses)
+    trajectory, settled = visiting_trajectory(arm, poses)
     builder = DiagramBuilder()
-    builder.AddSystem(station)
-    controller = builder.AddSystem(GravityPidController(model))
-    desired = builder.AddSystem(TrajectorySource(trajectory, output_derivative_order=1))
-    builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
-    builder.Connect(station.GetOutputPort(f"{name}.state_estimated"), controller.GetInputPort("state_estimated"))
-    builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))
-    if effects is not None:
-        builder.AddSystem(effects)
-        builder.Connect(station.GetOutputPort(f"{name}.state_estimated"), effects.get_input_port())
-        builder.Connect(effects.get_output_port(), station.GetInputPort(f"{name}.effort_disturbance"))
+    desired = TrajectorySource(trajectory, output_derivative_order=1)
+    add_closed_loop(builder, station, GravityPidController(model), desired, effects)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     prepare(station, context)

@@ -8,6 +8,7 @@ Two layouts, both of the WPI AIM lab; `docs/public_recordings.md` says how to ob
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import io
 import os
@@ -20,13 +21,18 @@ import scipy.io
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.csv_rows import is_number, parse_finite, parse_number, read_bytes, read_rows
+from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.recording import Recording, write_recording
 
 Format = Literal["team-mat", "wpi-csv"]
 
 #: Nominal rate of the "wpi-csv" recordings [Hz].
 WPI_RATE = 200.0
+
+#: Joints that "wpi-csv" counts at the joint itself, although a disc drives them.
+WPI_DIRECT_JOINTS = ("roll",)
 
 _NUM_JOINTS = 7
 _WPI_COLUMNS = [f"{prefix}{i + 1}" for prefix in ("q", "qd", "tau") for i in range(_NUM_JOINTS)]
@@ -57,6 +63,7 @@ def convert(
     format: Format | None = None,
     variable: str | None = None,
     rate: float = WPI_RATE,
+    arm: Arm | None = None,
     skip_invalid: bool = False,
 ) -> Conversion:
     """Reads a public recording and writes it as the CSV that `read_recording` reads, at once or not at all.
@@ -67,6 +74,7 @@ def convert(
         format: None to look at the file.
         variable: "team-mat": which variable; needed if several fit.
         rate: "wpi-csv": samples a second [Hz].
+        arm: "wpi-csv": write joint coordinates of this arm; otherwise the file's own, of the actuators.
         skip_invalid: leave out invalid rows (or poses) and count them, instead of refusing the file.
 
     Raises:
@@ -80,13 +88,40 @@ def convert(
     if (format or detect_format(path)) == "team-mat":
         if rate != WPI_RATE:
             raise RecordingError(f"{path}: --rate does not apply to team-mat, whose poses have no time")
+        if arm is not None:
+            raise RecordingError(f"{path}: --arm does not apply to team-mat, which is in joint coordinates")
         conversion = _read_team_mat(Path(path), variable, skip_invalid)
     else:
         if variable is not None:
             raise RecordingError(f"{path}: --variable does not apply to wpi-csv, which has no variables")
         conversion = _read_wpi_csv(Path(path), rate, skip_invalid)
+        if arm is not None:
+            conversion = Conversion(wpi_in_joint_coordinates(conversion.recording, arm), conversion.notes)
+    if conversion.recording.coordinates == "actuator":
+        conversion.notes.insert(
+            1,
+            "in actuator coordinates, which a CSV cannot say: pass --coordinates actuator to every command that reads "
+            "it, or convert with --arm (of a PSM always: its roll is not the dVRK's actuator)",
+        )
     write_recording(conversion.recording, output)
     return conversion
+
+
+def wpi_in_joint_coordinates(recording: Recording, arm: Arm) -> Recording:
+    """A "wpi-csv" recording of `arm`, in actuator coordinates, in joint coordinates.
+
+    Its actuators are the dVRK's but for the roll of a PSM, which is the joint's own (Wang et al. 2019, PSM's table).
+
+    Raises:
+        RecordingError: wrong number of joints, or poses that the arm cannot have taken.
+    """
+    J = arm.transmission.matrix.copy()
+    for joint in set(WPI_DIRECT_JOINTS) & set(arm.joint_names):
+        row = arm.joint_names.index(joint)
+        J[row] = np.eye(arm.num_joints)[row]
+    converted = recording.in_joint_coordinates(dataclasses.replace(arm, transmission=LinearMap(J, np.zeros(len(J)))))
+    converted.check_fits(arm)
+    return converted
 
 
 def detect_format(path: str | Path) -> Format:
@@ -234,7 +269,10 @@ def _read_wpi_csv(path: Path, rate: float, skip_invalid: bool) -> Conversion:
     if not rows:
         raise RecordingError(f"{path}: is empty; needs {_WPI_LAYOUT}")
     first_line, first = rows[0]
-    if not any(is_number(cell) for cell in first):
+    if [cell.strip() for cell in first] == ["t", *_WPI_COLUMNS]:
+        # Ours already, from an earlier conversion: its times are made anew.
+        rows = [(line, cells[1:]) for line, cells in rows[1:]]
+    elif not any(is_number(cell) for cell in first):
         raise RecordingError(
             f"{path}:{first_line}: has a header, which wpi-csv has not ({_WPI_LAYOUT}); "
             "a CSV whose header names q1..q7 needs no conversion"
@@ -254,7 +292,6 @@ def _read_wpi_csv(path: Path, rate: float, skip_invalid: bool) -> Conversion:
     repeats = int(np.sum(np.all(np.diff(kept, axis=0) == 0, axis=1)))
     notes = [
         f"{len(kept)} samples; the file has no time stamps, so t = row / {rate:g} Hz",
-        "in actuator coordinates, which a CSV cannot say: pass --coordinates actuator to every command that reads it",
     ]
     if len(kept) < len(values):
         skipped = _listed(lines[~valid])

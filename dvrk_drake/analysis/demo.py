@@ -2,77 +2,91 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from dvrk_drake.analysis.collection import collect_static_poses
 from dvrk_drake.analysis.plots import plot_identification, plot_positions, plot_torque_error
 from dvrk_drake.analysis.static_identification import StaticIdentification, identify_static
+from dvrk_drake.analysis.true_arm import TrueArm, make_true_arm
 from dvrk_drake.analysis.validation import Validation, validate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.joint_effects import JointEffect
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.atomic_file import atomic_write
-from dvrk_drake.models.plant import add_arm
+from dvrk_drake.models.plant import Closure
 from dvrk_drake.models.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.arm_view import start_meshcat
+from dvrk_drake.systems.camera import framing
+from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 
 POSES, FRESH_POSES = 40, 15
 #: Effort noise of one sample, as a share of the effort limit.
 EFFORT_NOISE = 0.01
 #: Release: pose held, then let go, then driven home; phases end at these times [s].
 HELD_UNTIL, RELEASED_UNTIL, HOME_UNTIL = 0.5, 4.5, 7.5
-RELEASE_POSE = np.array([0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5])
-#: Where the paper's simulation starts (Fig. 7): J5, J3 and J2 off home [rad]; q2 + q3 is beyond a real linkage's stop.
-STEP_START = np.array([0.0, -0.22, -0.79, 0.0, 3.13, 0.0, 0.0])
 STEP_DURATION = 4.0
 
 
 @dataclass(frozen=True)
-class TrueArm:
-    """A simulated arm that its model does not describe exactly.
+class DemoPlan:
+    """What the demo does with one kind of arm; poses in rad and m.
 
     Attributes:
-        arm: its description.
-        inertias: link -> true spatial inertia about the link's origin.
-        effects, coefficients: true joint effects [N m].
-        damping: (n,) viscous friction of the joints [N m s/rad].
+        effects, coefficients: what its true arm has beside the model [N m].
+        release: where it is held, then let go.
+        step: where the step to `home` starts.
+        home: where both end.
+        step_title: of the step's plot.
+        closure: how the loops of the true arm's linkage are held, see `add_arm`.
     """
 
-    arm: Arm
-    inertias: dict[str, SpatialInertia]
     effects: tuple[JointEffect, ...]
     coefficients: tuple[float, ...]
-    damping: NDArray[np.float64]
+    release: tuple[float, ...]
+    step: tuple[float, ...]
+    home: tuple[float, ...]
+    step_title: str
+    closure: Closure = "mimic"
 
-    def station(self, meshcat: Meshcat | None = None) -> ArmStation:
-        """A station that simulates it, once `prepare` was called with a context."""
-        return ArmStation(self.arm, meshcat=meshcat, modify_plant=self._add_damping)
 
-    def prepare(self, station: ArmStation, context: Context) -> None:
-        """Puts the true inertias into a station's context."""
-        station.set_link_inertias(context, self.inertias)
-
-    def effect_torque(self) -> JointEffectTorque:
-        """A new system that plays the joint effects."""
-        return JointEffectTorque(self.arm, self.effects, self.coefficients)
-
-    def _add_damping(self, plant: MultibodyPlant) -> None:
-        for name, damping in zip(self.arm.joint_names, self.damping, strict=True):
-            plant.GetJointByName(name).set_default_damping_vector([damping])
+MTM_PLAN = DemoPlan(
+    effects=(
+        JointEffect("wrist_platform", "offset"),
+        JointEffect("wrist_platform", "spring"),
+        JointEffect("wrist_pitch", "spring"),
+    ),
+    coefficients=(0.02, 0.05, -0.03),
+    release=(0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5),
+    # The paper's Fig. 7: J5, J3 and J2 off home; q2 + q3 is beyond a real linkage's stop.
+    step=(0.0, -0.22, -0.79, 0.0, 3.13, 0.0, 0.0),
+    home=(0.0,) * 7,
+    step_title="Step of the paper's Fig. 7 to zero, gravity + PID",
+)
+PLANS = {
+    "mtml": MTM_PLAN,
+    "mtmr": MTM_PLAN,
+    "psm": DemoPlan(
+        effects=(JointEffect("yaw", "offset"), JointEffect("roll", "spring"), JointEffect("wrist_pitch", "offset")),
+        coefficients=(0.05, 0.03, 0.01),
+        release=(0.4, 0.3, 0.15, 0.6, 0.5, -0.3, 0.5),
+        step=(0.5, -0.4, 0.2, -0.8, 0.6, 0.4, 0.8),
+        home=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0),
+        step_title="Step of all joints, gravity + PID",
+        closure="ball",
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -85,32 +99,6 @@ class DemoResult:
     drift: dict[str, NDArray[np.float64]]
     step_error: NDArray[np.float64]
     files: list[Path]
-
-
-def make_true_arm(arm: Arm, generator: np.random.Generator) -> TrueArm:
-    """An arm whose links are up to 20 % heavier or lighter than the model's, with springs and cables of its own."""
-    plant = MultibodyPlant(1e-3)
-    instance = add_arm(plant, arm)
-    inertias = {}
-    for index in plant.GetBodyIndices(instance):
-        body = plant.get_body(index)
-        M = body.default_spatial_inertia()
-        if body.name() == "base_link":
-            continue
-        # Scaled mass, centre of mass moved by up to 2 mm: still a possible body, as the move adds what it must.
-        shift = generator.uniform(-0.002, 0.002, 3)
-        mass = M.get_mass() * generator.uniform(0.8, 1.2)
-        I_Bcm = M.Shift(M.get_com()).get_unit_inertia()
-        inertias[body.name()] = SpatialInertia(
-            mass, M.get_com() + shift, UnitInertia(I_Bcm.ShiftFromCenterOfMass(-(M.get_com() + shift)))
-        )
-    effects = (
-        JointEffect("wrist_platform", "offset"),
-        JointEffect("wrist_platform", "spring"),
-        JointEffect("wrist_pitch", "spring"),
-    )
-    damping = 0.03 * arm.effort_limits
-    return TrueArm(arm, inertias, effects, (0.02, 0.05, -0.03), damping)
 
 
 def run_demo(
@@ -126,15 +114,20 @@ def run_demo(
         arm_name: which arm.
         seed: of the true arm, the poses and the noise.
         progress: called with what is being done and the finished share of it, 0..1.
+
+    Raises:
+        ArmError: an arm that the demo has no plan for.
     """
     generator = np.random.default_rng(seed)
-    arm = load_arm(arm_name)
+    if arm_name not in PLANS:
+        raise ArmError(f'the demo has no plan for "{arm_name}"; it has for {", ".join(PLANS)}')
+    arm, plan = load_arm(arm_name), PLANS[arm_name]
     nominal = IdentifiedModel.from_arm(arm)
-    true_arm = make_true_arm(arm, generator)
+    true_arm = make_true_arm(arm, generator, plan.effects, plan.coefficients, plan.closure)
 
     def collect(count: int, what: str) -> Recording:
         poses = arm.sample_poses(count, generator, margin=0.1)
-        # A person turns platform and handle by a hand's reach, not by turns.
+        # A person turns platform and handle (or roll) by a hand's reach, not by turns.
         poses[:, [3, 6]] = np.clip(poses[:, [3, 6]], -1.5, 1.5)
         return collect_static_poses(
             true_arm.station(),
@@ -159,14 +152,14 @@ def run_demo(
     paper_model = identify_static(poses, arm, "paper").model
     fresh_paper = validate(paper_model, fresh_poses)
 
-    meshcat = start_meshcat()
-    t, released = _release(true_arm, model, meshcat, lambda share: progress("releasing and holding", share / 3))
+    meshcat = start_meshcat(*framing(true_arm.arm))
+    t, released = _release(true_arm, model, plan, meshcat, lambda share: progress("releasing and holding", share / 3))
     with atomic_write(output / "arm.html") as stream:
         stream.write(meshcat.StaticHtml())
     _, with_nominal = _release(
-        true_arm, nominal, None, lambda share: progress("releasing and holding", (1 + share) / 3)
+        true_arm, nominal, plan, None, lambda share: progress("releasing and holding", (1 + share) / 3)
     )
-    t_step, step = _step(true_arm, model, lambda share: progress("releasing and holding", (2 + share) / 3))
+    t_step, step = _step(true_arm, model, plan, lambda share: progress("releasing and holding", (2 + share) / 3))
 
     progress("drawing", 0.0)
     names = arm.joint_names
@@ -183,17 +176,17 @@ def run_demo(
     )
     plot_positions(
         output / "release.png",
-        names,
+        arm,
         t,
         {"identified model": released, "model as drawn (SDF)": with_nominal},
         f"Held until {HELD_UNTIL} s, released under gravity compensation until {RELEASED_UNTIL} s, then driven home",
     )
     plot_positions(
         output / "step.png",
-        names,
+        arm,
         t_step,
         {"identified model": step},
-        "Step of the paper's Fig. 7 to zero, gravity + PID",
+        plan.step_title,
     )
     progress("drawing", 1.0)
     window = (t >= HELD_UNTIL) & (t <= RELEASED_UNTIL)
@@ -202,24 +195,16 @@ def run_demo(
         for label, q in (("identified", released), ("as drawn", with_nominal))
     }
     files = sorted(path for path in output.iterdir() if path.is_file())
-    return DemoResult(identification, fresh, fresh_paper, drift, np.abs(step[-1]), files)
+    return DemoResult(identification, fresh, fresh_paper, drift, np.abs(step[-1] - plan.home), files)
 
 
 def _closed_loop(
-    true_arm: TrueArm, model: IdentifiedModel, q_start: NDArray[np.float64], meshcat: Meshcat | None
+    true_arm: TrueArm, model: IdentifiedModel, q_start: Sequence[float], meshcat: Meshcat | None
 ) -> tuple[Simulator, ArmStation, GravityPidController, ConstantVectorSource]:
-    name = true_arm.arm.name.lower()
+    station, controller = true_arm.station(meshcat), GravityPidController(model)
+    desired = ConstantVectorSource(_at_rest(q_start))
     builder = DiagramBuilder()
-    station = builder.AddSystem(true_arm.station(meshcat))
-    controller = builder.AddSystem(GravityPidController(model))
-    effects = builder.AddSystem(true_arm.effect_torque())
-    desired = builder.AddSystem(ConstantVectorSource(np.concatenate([q_start, np.zeros_like(q_start)])))
-    state = station.GetOutputPort(f"{name}.state_estimated")
-    builder.Connect(state, controller.GetInputPort("state_estimated"))
-    builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
-    builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))
-    builder.Connect(state, effects.get_input_port())
-    builder.Connect(effects.get_output_port(), station.GetInputPort(f"{name}.effort_disturbance"))
+    add_closed_loop(builder, station, controller, desired, true_arm.effect_torque())
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     true_arm.prepare(station, context)
@@ -227,14 +212,22 @@ def _closed_loop(
     return simulator, station, controller, desired
 
 
+def _at_rest(q: Sequence[float]) -> NDArray[np.float64]:
+    return np.concatenate([q, np.zeros(len(q))])
+
+
 def _release(
-    true_arm: TrueArm, model: IdentifiedModel, meshcat: Meshcat | None, progress: Callable[[float], None]
+    true_arm: TrueArm,
+    model: IdentifiedModel,
+    plan: DemoPlan,
+    meshcat: Meshcat | None,
+    progress: Callable[[float], None],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Holds a pose, releases the arm under gravity compensation, drives it home; t (m,) and q (m, n)."""
-    simulator, station, controller, desired = _closed_loop(true_arm, model, RELEASE_POSE, meshcat)
+    simulator, station, controller, desired = _closed_loop(true_arm, model, plan.release, meshcat)
     root = simulator.get_mutable_context()
     settings = controller.GetMyMutableContextFromRoot(root)
-    home = np.zeros(2 * true_arm.arm.num_joints)
+    home = _at_rest(plan.home)
 
     def at(t: float) -> None:
         if abs(t - HELD_UNTIL) < 1e-9:
@@ -253,11 +246,11 @@ def _release(
 
 
 def _step(
-    true_arm: TrueArm, model: IdentifiedModel, progress: Callable[[float], None]
+    true_arm: TrueArm, model: IdentifiedModel, plan: DemoPlan, progress: Callable[[float], None]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The paper's Fig. 7: from `STEP_START` to zero under gravity + PID."""
-    simulator, station, _, desired = _closed_loop(true_arm, model, STEP_START, None)
-    home = np.zeros(2 * true_arm.arm.num_joints)
+    """From the plan's step to its home under gravity + PID."""
+    simulator, station, _, desired = _closed_loop(true_arm, model, plan.step, None)
+    home = _at_rest(plan.home)
     root = simulator.get_mutable_context()
     desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(home)
     return _sample(simulator, station, STEP_DURATION, lambda t: None, progress)

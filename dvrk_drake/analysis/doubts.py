@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
 
-#: Within this distance of a limit a joint may rest on its stop [rad or m].
-STOP_MARGIN = 0.01
+#: Within this distance of a limit a joint may rest on its stop [rad], [m].
+STOP_MARGIN = 0.01, 0.002
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,9 @@ def find_doubts(recording: Recording, arm: Arm) -> list[Doubt]:
     A, lower, upper = arm.limit_matrix()
     names = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
     values = recording.q @ A.T
-    at_stop = (values < lower + STOP_MARGIN) | (values > upper - STOP_MARGIN)
     # A coupled limit is where contact begins, and stops there are soft: no margin inside of it.
-    coupled = slice(arm.num_joints, None)
-    at_stop[:, coupled] = (values < lower)[:, coupled] | (values > upper)[:, coupled]
+    margin = np.concatenate([arm.per_joint(*STOP_MARGIN), np.zeros(len(arm.coupled_limits))])
+    at_stop = (values < lower + margin) | (values > upper - margin)
     for row, limit in np.argwhere(at_stop):
         joints = tuple(int(j) for j in np.flatnonzero(A[limit]))
         stop = lower[limit] if values[row, limit] < (lower[limit] + upper[limit]) / 2 else upper[limit]

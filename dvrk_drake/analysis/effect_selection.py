@@ -10,7 +10,7 @@ import sympy
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.linear_fit import RobustFit, robust_fit
-from dvrk_drake.dynamics.joint_effects import EFFECT_KINDS, JointEffect
+from dvrk_drake.dynamics.joint_effects import EFFECT_KINDS, JointEffect, kinds_of
 from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
 from dvrk_drake.models.arm import Arm
 
@@ -25,7 +25,7 @@ SIGMA_FLOOR = 2e-3
 LEAST_GAIN = 4.0
 #: And by this many of its own standard errors over poses.
 LEAST_SIGNIFICANCE = 1.5
-#: A position-dependent effect is considered if the joint moved by this much [rad or m]; else it would fit servo error.
+#: A position-dependent effect is considered if the joint moved by this much [rad]; else it would fit servo error.
 LEAST_SPAN = 0.25
 
 
@@ -81,8 +81,10 @@ def select_effects(problem: StaticProblem) -> tuple[JointEffect, ...]:
         best_gain = 0.0
         best: tuple[JointEffect, ...] = ()
         for joint, name in enumerate(problem.arm.joint_names):
-            kinds = [k for k in EFFECT_KINDS if k == "offset" or span[joint] >= LEAST_SPAN]
-            new = [e for e in (JointEffect(name, k) for k in kinds) if e not in chosen]
+            possible = kinds_of(bool(problem.arm.prismatic[joint]))
+            kinds = [k for k in possible if k == "offset" or span[joint] >= LEAST_SPAN]
+            possible_effects = (JointEffect(name, k) for k in kinds)
+            new = [e for e in possible_effects if e not in chosen and not _is_gravity_too(problem.base_model, e)]
             candidates: list[tuple[JointEffect, ...]] = [(e,) for e in new] + ([tuple(new)] if len(new) > 1 else [])
             for candidate in candidates:
                 trial = problem.fit((*chosen, *candidate), iterations=3, start=current.sigma)
@@ -113,6 +115,19 @@ def _largest_base_parameters(model: StaticModel) -> NDArray[np.float64]:
     largest = np.abs(model.regressor(q)).max(axis=0)
     limits = np.where(largest > 1e-9, arm.effort_limits[:, None] / np.maximum(largest, 1e-9), np.inf)
     return limits.min(axis=0)
+
+
+@cache
+def _is_gravity_too(model: StaticModel, effect: JointEffect) -> bool:
+    """Whether no measurement could tell the effect from gravity, as a spring at a yaw joint that lifts weight."""
+    arm = model.gravity.arm
+    poses = arm.sample_poses(100, np.random.default_rng(0))
+    Y = model.regressor(poses).reshape(-1, len(model.gravity.base.names))
+    joint = arm.joint_names.index(effect.joint)
+    column = np.zeros((len(poses), arm.num_joints))
+    column[:, joint] = _numeric(effect.kind)(poses[:, joint])
+    rest = column.ravel() - Y @ np.linalg.lstsq(Y, column.ravel(), rcond=None)[0]
+    return bool(np.linalg.norm(rest) < 1e-9 * np.linalg.norm(column))
 
 
 @cache

@@ -24,18 +24,17 @@ from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.models.recording import REST_SPEED, Recording
 
 Method = Literal["robust", "paper"]
 
 #: Fewest distinct poses that are accepted.
 LEAST_POSES = 8
-#: Rows whose joints all agree this well are samples of one pose [rad or m].
-SAME_POSE = 0.01
-#: RMS joint speed above which a recording counts as a motion [rad/s or m/s].
-REST_SPEED = 0.05
-#: A joint whose measured torque stays below this share of its effort limit says nothing about its model.
-LEAST_TORQUE = 0.02
+#: Rows whose joints all agree this well are samples of one pose [rad], [m].
+SAME_POSE = 0.01, 0.001
+#: A joint whose measured torque stays below this share of its effort limit says nothing about its model, unless
+#: leave-one-out explains most of it: less than the second share of it is left.
+LEAST_TORQUE, CLEAR_GAIN_RATIO = 0.02, 0.5
 #: Nor does one that moved by less than this share of its range: its torque elsewhere would be a guess.
 LEAST_MOTION = 0.02
 #: Leave-one-out must lower the RMS error to this share of zero torque's, or the joint's torque is scaled down.
@@ -59,6 +58,7 @@ def identify_static(
     arm: Arm,
     method: Method = "robust",
     progress: Callable[[float], None] = lambda share: None,
+    measured: NDArray[np.bool_] | None = None,
 ) -> StaticIdentification:
     """Identifies the static model of `arm` from a recording of poses at rest.
 
@@ -73,6 +73,7 @@ def identify_static(
         arm: the arm it was recorded on.
         method: see above.
         progress: called with the finished share, 0..1.
+        measured: (m, n) False where an effort is no holding torque, as `slow_parts` gives it; by default all are.
 
     Raises:
         RecordingError: the recording does not fit the arm or has no efforts.
@@ -80,17 +81,19 @@ def identify_static(
     """
     recording.check_fits(arm)
     recording = recording.in_joint_coordinates(arm)
-    _check_rest(recording)
-    if method == "robust":
-        recording = average_repeated_poses(recording)
+    _check_rest(recording, arm)
+    if method == "robust" and measured is None:
+        recording = average_repeated_poses(recording, arm)
     tau = recording.measured_effort()
     _check_poses(recording, arm)
     gravity_model = compile_static_model(arm)
     Y = gravity_model.regressor(recording.q)
-    stacked = Y.reshape(-1, Y.shape[2])
+    stacked = Y.reshape(-1, Y.shape[2]) if measured is None else Y[measured]
     rank = int(np.linalg.matrix_rank(stacked, tol=1e-9 * np.linalg.norm(stacked, 2)))
     doubts = find_doubts(recording, arm)
-    usable = usable_measurements(tau.shape, doubts)
+    if measured is None:
+        measured = np.ones(tau.shape, dtype=bool)
+    usable = usable_measurements(tau.shape, doubts) & measured
     effects: tuple[JointEffect, ...] = ()
     trust = np.ones(arm.num_joints)
     validated = np.full_like(tau, np.nan)
@@ -100,9 +103,9 @@ def identify_static(
                 f"{recording.source}: {len(recording)} poses determine only {rank} of {Y.shape[2]} base parameters; "
                 "least squares has no unique answer: record more varied poses or use --method robust"
             )
-        fit = weighted_fit(Y, tau, np.ones_like(tau), np.zeros(Y.shape[2]))
+        fit = weighted_fit(Y, tau, measured.astype(float), np.zeros(Y.shape[2]))
         # Unit weights: the covariance takes its scale from the residuals, as the textbook does.
-        variance = np.sum(fit.residuals**2) / (tau.size - Y.shape[2])
+        variance = np.sum(fit.residuals[measured] ** 2) / (np.sum(measured) - Y.shape[2])
         validated, sd = fit.left_out_residuals, np.sqrt(variance * np.diag(fit.covariance))
     else:
         problem = StaticProblem(arm, recording.q, tau, usable)
@@ -127,7 +130,7 @@ def identify_static(
             EffectEstimate(effect.joint, effect.kind, *_estimate(value, error))
             for effect, value, error in zip(effects, fit.theta[Y.shape[2] :], sd[Y.shape[2] :], strict=True)
         ],
-        joints=_statistics(recording, arm, fit, validated, usable, trust),
+        joints=_statistics(recording, arm, fit, validated, measured, usable, trust),
         provenance=Provenance(
             recording=recording.source,
             sha256=recording.sha256,
@@ -141,11 +144,12 @@ def identify_static(
     return StaticIdentification(model, recording, doubts, fit.residuals, fit.left_out_residuals)
 
 
-def average_repeated_poses(recording: Recording) -> Recording:
+def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:
     """One row a pose: rows whose joints agree within `SAME_POSE` with the first of them are its samples."""
+    same = arm.per_joint(*SAME_POSE)
     groups: list[list[int]] = []
     for row, q in enumerate(recording.q):
-        group = next((g for g in groups if np.all(np.abs(recording.q[g[0]] - q) < SAME_POSE)), None)
+        group = next((g for g in groups if np.all(np.abs(recording.q[g[0]] - q) < same)), None)
         if group is None:
             groups.append([row])
         else:
@@ -163,12 +167,11 @@ def average_repeated_poses(recording: Recording) -> Recording:
     )
 
 
-def _check_rest(recording: Recording) -> None:
-    joint, speed = recording.fastest_joint()
-    if speed > REST_SPEED:
+def _check_rest(recording: Recording, arm: Arm) -> None:
+    if motion := recording.motion(arm):
         raise IdentificationError(
-            f"{recording.source}: the arm moves (joint {joint + 1} at {speed:.2g} rad/s RMS); "
-            f"static identification needs poses at rest, below {REST_SPEED} rad/s"
+            f"{recording.source}: the arm moves ({motion}); static identification needs poses at rest, below "
+            f"{REST_SPEED[0]} rad/s, or the slow parts of a motion (--slow-parts)"
         )
 
 
@@ -190,13 +193,16 @@ def _check_poses(recording: Recording, arm: Arm) -> None:
 def _trust(problem: StaticProblem, left_out: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(n,) scale of each joint's torque that leave-one-out supports: 1 unless it is no better than zero torque."""
     arm = problem.arm
-    moved = np.ptp(problem.q, axis=0) > LEAST_MOTION * (arm.position_upper - arm.position_lower)
+    least_motion = LEAST_MOTION * (arm.position_upper - arm.position_lower)
     trust = np.ones(arm.num_joints)
     for j in range(arm.num_joints):
-        measured, predicted = problem.tau[usable[:, j], j], (problem.tau - left_out)[usable[:, j], j]
-        if not moved[j] or rms(measured) < LEAST_TORQUE * arm.effort_limits[j]:
+        use = usable[:, j]
+        measured, predicted = problem.tau[use, j], (problem.tau - left_out)[use, j]
+        ratio = rms(measured - predicted) / max(rms(measured), 1e-12)
+        small = rms(measured) < LEAST_TORQUE * arm.effort_limits[j]
+        if not np.any(use) or np.ptp(problem.q[use, j]) <= least_motion[j] or (small and ratio > CLEAR_GAIN_RATIO):
             trust[j] = 0.0
-        elif rms(measured - predicted) > LEAST_GAIN_RATIO * rms(measured):
+        elif ratio > LEAST_GAIN_RATIO:
             power = np.sum(predicted**2)
             trust[j] = float(np.clip(measured @ predicted / power, 0.0, 1.0)) if power > 0 else 1.0
     return trust
@@ -233,25 +239,26 @@ def _statistics(
     arm: Arm,
     fit: LinearFit,
     validated: NDArray[np.float64],
+    measured: NDArray[np.bool_],
     usable: NDArray[np.bool_],
     trust: NDArray[np.float64],
 ) -> list[JointStatistics]:
     tau = recording.measured_effort()
     statistics = []
     for j, name in enumerate(arm.joint_names):
-        use = usable[:, j]
-        lower, upper = recording.q[:, j].min(), recording.q[:, j].max()
+        every, use = measured[:, j], usable[:, j]
+        lower, upper = (recording.q[every, j].min(), recording.q[every, j].max()) if np.any(every) else (0.0, 0.0)
         statistics.append(
             JointStatistics(
                 name=name,
-                rms_zero_torque=rms(tau[:, j]),
-                rms_fit=rms(fit.residuals[:, j]),
-                rms_leave_one_out=rms(fit.left_out_residuals[:, j]),
+                rms_zero_torque=rms(tau[every, j]),
+                rms_fit=rms(fit.residuals[every, j]),
+                rms_leave_one_out=rms(fit.left_out_residuals[every, j]),
                 rms_zero_torque_undoubted=rms(tau[use, j]),
                 rms_fit_undoubted=rms(fit.residuals[use, j]),
                 rms_leave_one_out_undoubted=rms(fit.left_out_residuals[use, j]),
                 rms_cross_validation_undoubted=rms(validated[use, j]),
-                num_doubted=int(np.sum(~use)),
+                num_doubted=int(np.sum(every & ~use)),
                 trust=float(trust[j]),
                 position_lower=float(lower),
                 position_upper=float(upper),

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from dvrk_drake.analysis.demo import DemoResult
 from dvrk_drake.analysis.doubts import Doubt
+from dvrk_drake.analysis.simulation import Simulation
+from dvrk_drake.analysis.teleoperation_demo import TeleoperationResult
 from dvrk_drake.analysis.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity
+from dvrk_drake.models.arm import Arm, load_arm
 
 TABLE_WIDTH = 112
 
@@ -21,9 +26,9 @@ Open {folder}/arm.html in a browser: the arm is held, released, and driven home.
 
 With a real arm:
   1. Record poses at rest: move it by hand to 40 or more varied poses inside its limits, let position control hold
-     each, coming from changing sides (friction is in every measurement), and write q1..q7, tau1..tau7 [rad, N m] of
-     every settled pose into a CSV (lines for that are in docs/public_recordings.md).
-  2. dvrk-drake identify poses.csv --arm mtml --output model.yaml --plots plots
+     each, coming from changing sides (friction is in every measurement), and write q1..q7, tau1..tau7 of every
+     settled pose into a CSV [rad, N m; m, N] (lines for that are in docs/public_recordings.md).
+  2. dvrk-drake identify poses.csv --arm {arm} --output model.yaml --plots plots
   3. Record some more on another day:  dvrk-drake validate model.yaml other.csv
   4. Only when no joint is worse than zero torque there, let GravityPidController(model) near the arm, with a
      hand on the stop button. Switch the controller's own gravity compensation off first, or it is compensated twice."""
@@ -81,12 +86,40 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
         console.print(table)
     for j in model.joints:
         if j.trust == 0.0:
+            why = "it hardly moved, or what was measured cannot tell its gravity from friction"
+            if j.rms_zero_torque == 0.0:
+                why = "no holding torque of it was measured"
             console.print(
-                f"{j.name}: no torque will be commanded: it hardly moved, or what was measured cannot tell "
-                "its gravity from friction",
+                f"{j.name}: no torque will be commanded: {why}",
                 style="yellow",
                 soft_wrap=True,
             )
+
+
+def print_simulation(console: Console, simulation: Simulation, arm: Arm) -> None:
+    """Where each joint was and how far from where it was wanted, over all recorded samples."""
+    recording, desired = simulation.recording, simulation.desired
+    effort = np.abs(recording.measured_effort())
+    table = _table(
+        f"{arm.name}, simulated for {simulation.time[-1]:g} s [rad, N m; m, N if prismatic]",
+        "",
+        "start",
+        "end",
+        "largest error",
+        "error at the end",
+        "largest effort",
+        "effort limit",
+    )
+    for j, name in enumerate(arm.joint_names):
+        errors = ("-", "-")
+        if desired is not None:
+            error = np.abs(recording.q[:, j] - desired[:, j])
+            errors = (f"{error.max():.5f}", f"{error[-1]:.5f}")
+        q = recording.q[:, j]
+        table.add_row(
+            name, f"{q[0]:z.4f}", f"{q[-1]:z.4f}", *errors, f"{effort[:, j].max():.4f}", f"{arm.effort_limits[j]:.4f}"
+        )
+    console.print(table)
 
 
 def print_demo(console: Console, result: DemoResult, folder: str) -> None:
@@ -94,26 +127,34 @@ def print_demo(console: Console, result: DemoResult, folder: str) -> None:
     print_model(console, result.identification.model)
     fresh = list(zip(result.fresh.joints, result.fresh_paper.joints, strict=True))
     table = _table(
-        f"RMS torque error on {result.fresh.poses} fresh poses [N m]", "", "zero torque", "identified", "paper's method"
+        f"RMS torque error on {result.fresh.poses} fresh poses [N m; N if prismatic]",
+        "",
+        "zero torque",
+        "identified",
+        "paper's method",
     )
     for ours, paper in fresh:
         table.add_row(ours.name, f"{ours.rms_torque:.4f}", f"{ours.rms_error:.4f}", f"{paper.rms_error:.4f}")
     console.print(table)
     table = _table(
-        "Released for 4 s, then a step to zero [rad]", "", *(f"drift, {k}" for k in result.drift), "step error"
+        "Released for 4 s, then a step home [rad; m if prismatic]",
+        "",
+        *(f"drift, {k}" for k in result.drift),
+        "step error",
     )
     for i, (ours, _) in enumerate(fresh):
         drifts = [f"{values[i]:.4f}" for values in result.drift.values()]
         table.add_row(ours.name, *drifts, f"{result.step_error[i]:.5f}")
     console.print(table)
     console.print(f"written to {folder}: {', '.join(path.name for path in result.files)}", soft_wrap=True)
-    console.print(
-        "The simulated arm has no stops in q2 + q3 yet: the step, and the release with the model as drawn, pass where "
-        "a real arm would hit them.",
-        style="dim",
-        soft_wrap=True,
-    )
-    console.print(NEXT_STEPS.format(folder=folder), markup=False, soft_wrap=True)
+    if load_arm(result.identification.model.arm).coupled_limits:
+        console.print(
+            "The simulated arm has no stops in q2 + q3 yet: the step, and the release with the model as drawn, pass "
+            "where a real arm would hit them.",
+            style="dim",
+            soft_wrap=True,
+        )
+    console.print(NEXT_STEPS.format(folder=folder, arm=result.identification.model.arm), markup=False, soft_wrap=True)
 
 
 def print_symbolic_model(console: Console, gravity: SymbolicGravity) -> None:
@@ -167,8 +208,30 @@ def print_validation(console: Console, validation: Validation) -> None:
     console.print(table)
 
 
+def print_teleoperation(console: Console, result: TeleoperationResult, file: str) -> None:
+    """How well the tip followed."""
+    table = _table("Tip against handle", "", "RMS", "largest")
+    table.add_row(
+        escape("position [mm]"), f"{1e3 * result.rms_position_error:.3f}", f"{1e3 * result.max_position_error:.3f}"
+    )
+    table.add_row(
+        escape("rotation [mrad]"), f"{1e3 * result.rms_rotation_error:.2f}", f"{1e3 * result.max_rotation_error:.2f}"
+    )
+    console.print(table)
+    console.print(
+        "The error of the tip against the scaled way of the handle since the clutch closed, over "
+        f"{result.handle_path:.2f} m of it. With an open clutch the tip moved {1e3 * result.max_motion_held:.1g} mm. "
+        f"Open {file} in a browser.",
+        markup=False,
+        soft_wrap=True,
+    )
+
+
 def _table(title: str, *columns: str) -> Table:
-    table = Table(title=escape(title), title_justify="left", title_style="bold", box=None, pad_edge=False, expand=False)
+    # A title may be wider than its table, and would be wrapped.
+    text = Text(title, style="bold", no_wrap=True, overflow="ignore")
+    table = Table(title=text, title_justify="left", box=None, pad_edge=False, expand=False)
     for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
+        # The name of a base parameter may be long; numbers are never cut.
+        table.add_column(column, justify="left" if i == 0 else "right", no_wrap=i > 0, overflow="fold")
     return table

@@ -65,8 +65,15 @@ def predict(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]
     return tau
 
 
-def validate(model: IdentifiedModel, recording: Recording) -> Validation:
+def validate(
+    model: IdentifiedModel, recording: Recording, measured_joints: NDArray[np.bool_] | None = None
+) -> Validation:
     """Compares a model with a recording.
+
+    Args:
+        model: the model.
+        recording: in either coordinates.
+        measured_joints: (m, n) False where an effort is no holding torque, as `slow_parts` gives it; default: all are.
 
     Raises:
         RecordingError: the recording does not fit the model's arm, or has no efforts.
@@ -76,20 +83,27 @@ def validate(model: IdentifiedModel, recording: Recording) -> Validation:
     residuals = measured - predict(model, recording)
     in_joints = recording.in_joint_coordinates(arm)
     doubts = find_doubts(in_joints, arm)
-    usable = usable_measurements(measured.shape, doubts)
+    if measured_joints is None:
+        measured_joints = np.ones(measured.shape, dtype=bool)
+    usable = usable_measurements(measured.shape, doubts) & measured_joints
     if recording.coordinates == "actuator":
         # A doubt about a joint touches every actuator that drives it.
         usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
-    return Validation(_joint_errors(arm, measured, residuals, usable), len(recording), residuals, doubts)
+    errors = _joint_errors(arm, measured, residuals, measured_joints, usable)
+    return Validation(errors, len(recording), residuals, doubts)
 
 
 def _joint_errors(
-    arm: Arm, measured: NDArray[np.float64], residuals: NDArray[np.float64], usable: NDArray[np.bool_]
+    arm: Arm,
+    measured: NDArray[np.float64],
+    residuals: NDArray[np.float64],
+    measured_joints: NDArray[np.bool_],
+    usable: NDArray[np.bool_],
 ) -> list[JointError]:
     errors = []
     for j, name in enumerate(arm.joint_names):
-        use = usable[:, j]
-        torque, error = rms(measured[:, j]), rms(residuals[:, j])
+        every, use = measured_joints[:, j], usable[:, j]
+        torque, error = rms(measured[every, j]), rms(residuals[every, j])
         errors.append(
             JointError(
                 name,
@@ -98,7 +112,7 @@ def _joint_errors(
                 error / torque if torque > 0 else None,
                 rms(measured[use, j]),
                 rms(residuals[use, j]),
-                int(np.sum(~use)),
+                int(np.sum(every & ~use)),
             )
         )
     return errors

@@ -42,7 +42,7 @@ def to_latex(gravity: SymbolicGravity, frame_poses: Mapping[str, sympy.Matrix]) 
     lines.append(r"\end{align*}")
     lines.append(r"\begin{align*}")
     for label, X_0F in frame_poses.items():
-        index = label if label.isdigit() else rf"\mathrm{{{label}}}"
+        index = label if label.isdigit() else r"\mathrm{" + label.replace("_", r"\,") + "}"
         matrix = sympy.latex(sympy.Matrix(X_0F).xreplace(short), mat_str="pmatrix", mat_delim="")
         lines.append(rf"X_{{0,{index}}} &= {matrix} \\")
     return "\n".join([*lines, r"\end{align*}", ""])
@@ -118,7 +118,11 @@ def _short_angles(gravity: SymbolicGravity, *matrices: sympy.Matrix) -> dict[sym
     found = set().union(*(m.atoms(sympy.sin, sympy.cos) for m in (gravity.regressor, gravity.potential, *matrices)))
     for function in found:
         letter = "s" if isinstance(function, sympy.sin) else "c"
-        indices = "".join(sorted(number[q] for q in function.args[0].free_symbols))
+        angle = function.args[0]
+        if all(angle.coeff(q) == 1 for q in angle.free_symbols):
+            indices = "".join(sorted(number[q] for q in angle.free_symbols))
+        else:
+            indices = sympy.latex(angle, symbol_names={q: number[q] for q in gravity.q}, fold_short_frac=True)
         short[function] = sympy.Symbol(f"{letter}_{{{indices}}}")
     return short
 

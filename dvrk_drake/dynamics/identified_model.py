@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
-from dvrk_drake.dynamics.joint_effects import EFFECT_KINDS, JointEffect
+from dvrk_drake.dynamics.joint_effects import JointEffect, kinds_of
 from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ArmError, ModelError
@@ -148,8 +148,13 @@ class IdentifiedModel:
         if tuple(joint.name for joint in self.joints) != arm.joint_names:
             raise ModelError(f"joints must be, in this order: {', '.join(arm.joint_names)}")
         for effect in self.joint_effects:
-            if effect.joint not in arm.joint_names or effect.kind not in EFFECT_KINDS:
-                raise ModelError(f"unknown joint effect {effect.joint} {effect.kind}; kinds: {', '.join(EFFECT_KINDS)}")
+            if effect.joint not in arm.joint_names:
+                raise ModelError(
+                    f"joint effect of an unknown joint {effect.joint}; joints: {', '.join(arm.joint_names)}"
+                )
+            kinds = kinds_of(bool(arm.prismatic[arm.joint_names.index(effect.joint)]))
+            if effect.kind not in kinds:
+                raise ModelError(f"{effect.joint} cannot have a joint effect {effect.kind}; kinds: {', '.join(kinds)}")
         if not np.all(np.isfinite(self.theta)) or not np.all((self.trust >= 0) & (self.trust <= 1)):
             raise ModelError("parameters must be finite numbers and trust between 0 and 1")
 

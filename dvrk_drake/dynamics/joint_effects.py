@@ -13,6 +13,13 @@ EFFECT_KINDS: dict[str, Callable[[sympy.Symbol], sympy.Expr]] = {
     "offset": lambda q: sympy.Integer(1),  # constant: cable preload, current offset [N m]
     "spring": sympy.sin,  # spring or cable hooked on off the axis, slack at zero [N m]
 }
+#: Kinds that only a joint that turns can have.
+REVOLUTE_KINDS = {"spring"}
+
+
+def kinds_of(prismatic: bool) -> list[str]:
+    """The kinds of effect that a joint can have."""
+    return [kind for kind in EFFECT_KINDS if not (prismatic and kind in REVOLUTE_KINDS)]
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -78,9 +79,9 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
     for label in labels:
         parameters += [StandardParameter(label), *(StandardParameter(label, axis) for axis in "xyz")]
         values += _mass_and_moment(plant.numeric, *plant.bodies[label])
-    energies = [energy for link in plant.potential_energy(labels) for energy in link]
-    columns = [[plant.to_sympy(energy.Differentiate(v)) for v in plant.drake_q] for energy in energies]
-    standard = sympy.Matrix(columns).T
+    # Simplified before they are differentiated: a linkage turns its links back and forth, which all drops out here.
+    energies = [plant.simplify(plant.to_sympy(energy)) for link in plant.potential_energy(labels) for energy in link]
+    standard = sympy.Matrix([[energy.diff(q) for q in plant.q] for energy in energies]).T
 
     base = reduce_to_base(
         _evaluate_at_random_poses(standard, plant.q, arm),
@@ -96,9 +97,7 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
         standard_values=np.array(values),
         base=base,
         regressor=sympy.ImmutableDenseMatrix(GRAVITY * chosen.applyfunc(plant.simplify)),
-        potential=sympy.ImmutableDenseMatrix(
-            [[GRAVITY * plant.simplify(plant.to_sympy(energies[column])) for column in base.columns]]
-        ),
+        potential=sympy.ImmutableDenseMatrix([[GRAVITY * energies[column] for column in base.columns]]),
     )
 
 
@@ -150,12 +149,16 @@ def _named_lengths(symbolic_plant: SymbolicPlant, frames: str) -> dict[str, floa
 
 
 def _readable_preference(parameters: list[StandardParameter]) -> list[int]:
-    """First moments of numbered links from the hand inward, then those of the linkage, masses last."""
+    """First moments of numbered links from the hand inward, then those of the linkage, masses last and from the base.
+
+    So a link's mass is read as a first moment of the links before it, and where masses do have a column of their own
+    (those that a prismatic joint lifts) it is that of the first: "(m3+...+m7)".
+    """
 
     def key(index: int) -> tuple:
         p = parameters[index]
         number = int(p.label) if p.label.isdigit() else 0
-        return (not p.axis, -number, p.label, p.axis)
+        return (not p.axis, -number if p.axis else number or math.inf, p.label, p.axis)
 
     return sorted(range(len(parameters)), key=key)
 

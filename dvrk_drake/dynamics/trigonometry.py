@@ -6,6 +6,9 @@ from collections.abc import Sequence
 
 import sympy
 
+#: Coefficients are 1 or lengths in metres: below this one is a difference of equals.
+ROUNDING = 1e-14
+
 
 def simplify_trigonometry(
     expression: sympy.Expr, q: Sequence[sympy.Symbol], parallel: Sequence[tuple[int, int]]
@@ -13,16 +16,22 @@ def simplify_trigonometry(
     """Writes a polynomial in sin and cos of q with the sums of parallel joints as one angle.
 
     For a pair (i, j) in `parallel`, products such as s_i c_j + c_i s_j become sin(q_i + q_j); cos^2 is eliminated, so
-    that what is identically zero becomes 0. The result equals the expression at every q. sympy's own trigsimp does the
-    same by search and takes seconds.
+    that what is identically zero becomes 0. Coefficients of rounding's size are dropped, so the result equals the
+    expression at every q to that. sympy's own trigsimp does the same by search and takes seconds.
     """
-    s = [sympy.Symbol(f"s{i}") for i in range(len(q))]
-    c = [sympy.Symbol(f"c{i}") for i in range(len(q))]
-    whole = {x: sympy.Integer(int(x)) for x in expression.atoms(sympy.Float) if float(x).is_integer()}
-    result = expression.xreplace(whole)
-    names = {sympy.sin(x): y for x, y in zip(q, s, strict=True)} | {sympy.cos(x): y for x, y in zip(q, c, strict=True)}
-    plain = result = sympy.expand(result.xreplace(names))
-    back: dict[sympy.Symbol, sympy.Expr] = dict(zip([*s, *c], [*map(sympy.sin, q), *map(sympy.cos, q)], strict=True))
+    halves = {x: sympy.Rational(int(2 * x), 2) for x in expression.atoms(sympy.Float) if float(2 * x).is_integer()}
+    result = expression.xreplace(halves)
+    # A gripper's finger turns by half of its joint: angles that are no joint's own are variables of their own.
+    others = {function.args[0] for function in result.atoms(sympy.sin, sympy.cos)} - set(q)
+    angles = [*q, *sorted(others, key=str)]
+    s = [sympy.Symbol(f"s{i}") for i in range(len(angles))]
+    c = [sympy.Symbol(f"c{i}") for i in range(len(angles))]
+    back: dict[sympy.Symbol, sympy.Expr] = {
+        **dict(zip(s, map(sympy.sin, angles), strict=True)),
+        **dict(zip(c, map(sympy.cos, angles), strict=True)),
+    }
+    names = {function: symbol for symbol, function in back.items()}
+    plain = result = _without_rounding(sympy.expand(result.xreplace(names)))
     for i, j in parallel:
         S, C = sympy.symbols(f"S{i} C{i}")
         # s_i c_j = S - c_i s_j and c_i c_j = C + s_i s_j, applied to every monomial that holds the left-hand side.
@@ -33,7 +42,12 @@ def simplify_trigonometry(
     if any(result.has(s[j]) or result.has(c[j]) for _, j in parallel):
         # The sum did not absorb the second angle: perhaps a link turns it back, as a coupler does, and it drops out.
         result = min(result, _without_squared_cosines(plain, s, c), key=sympy.count_ops)
-    return _collect(result).xreplace(back)
+    return _collect(_without_rounding(result)).xreplace(back)
+
+
+def _without_rounding(e: sympy.Expr) -> sympy.Expr:
+    """Leaves out the terms with a coefficient that is zero but for rounding, such as -0.4318 + 0.4162 + 0.0156."""
+    return sympy.Add(*(term for term in sympy.Add.make_args(e) if abs(term.as_coeff_Mul()[0]) > ROUNDING))
 
 
 def _without_squared_cosines(e: sympy.Expr, s: Sequence[sympy.Symbol], c: Sequence[sympy.Symbol]) -> sympy.Expr:

@@ -33,6 +33,7 @@ class Arm:
         sdf: package URLs of the model files: the arm's, then its instrument's if it has one.
         position_lower, position_upper: (n,) limits of this arm.
         effort_limits: (n,) limits of the joint torques, from the SDF.
+        prismatic: (n,) True for a joint that slides [m, N], False for one that turns [rad, N m].
         coupled_limits: limits of sums of joint positions.
         linkage: q_tree = G q + c, from the SDF's `drake:mimic` tags.
         transmission: a = J q, actuator from joint positions.
@@ -49,6 +50,7 @@ class Arm:
     position_lower: NDArray[np.float64]
     position_upper: NDArray[np.float64]
     effort_limits: NDArray[np.float64]
+    prismatic: NDArray[np.bool_]
     coupled_limits: tuple[CoupledLimit, ...]
     linkage: LinearMap
     transmission: LinearMap
@@ -60,6 +62,10 @@ class Arm:
     def num_joints(self) -> int:
         """Number of independent joints."""
         return len(self.joint_names)
+
+    def per_joint(self, revolute: float, prismatic: float) -> NDArray[np.float64]:
+        """(n,) one number [rad, rad/s, ...] for the joints that turn, another [m, m/s, ...] for those that slide."""
+        return np.where(self.prismatic, prismatic, revolute)
 
     def limit_matrix(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """All limits as lower <= A q <= upper: the joint box first, then the coupled limits."""
@@ -194,6 +200,7 @@ def _build_arm(
         position_lower=limits[:, 0],
         position_upper=limits[:, 1],
         effort_limits=np.array([facts.effort_limits[j] for j in joints]),
+        prismatic=np.array([j in facts.prismatic for j in joints]),
         coupled_limits=_coupled_limits(path, description, mechanism),
         linkage=LinearMap(G, c),
         transmission=LinearMap(_transmission(joints, mechanism, instrument), np.zeros(len(joints))),

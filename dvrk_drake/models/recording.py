@@ -17,8 +17,10 @@ from dvrk_drake.models.csv_rows import is_number, parse_finite, read_rows
 
 Coordinates = Literal["joint", "actuator"]
 
-#: A pose further than this outside the limits is refused [rad or m]; nearer ones are real: stops give way.
-LIMIT_TOLERANCE = 0.2
+#: A pose further than this outside the limits is refused [rad], [m]; nearer ones are real: stops give way.
+LIMIT_TOLERANCE = 0.2, 0.02
+#: RMS joint speed above which a recording counts as a motion [rad/s], [m/s].
+REST_SPEED = 0.05, 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +55,8 @@ class Recording:
         source = self.source or "recording"
         return f"{source}:{self.lines[row]}" if self.lines is not None else f"{source}: row {row + 1}"
 
-    def fastest_joint(self) -> tuple[int, float]:
-        """The joint with the highest RMS speed, and that speed [rad/s or m/s]; 0 where the recording does not tell.
+    def motion(self, arm: Arm) -> str:
+        """Which joint moves most and how fast, e.g. "joint 1 at 0.2 rad/s RMS"; empty if all rest, or nothing tells.
 
         From qd, or from q over t where samples follow within 0.1 s: between poses the arm may well have moved.
         """
@@ -63,10 +65,12 @@ class Recording:
         elif self.t is not None and len(self) > 1 and np.all(np.diff(self.t) > 0) and np.median(np.diff(self.t)) < 0.1:
             qd = np.diff(self.q, axis=0) / np.diff(self.t)[:, None]
         else:
-            return 0, 0.0
+            return ""
         speed = np.sqrt(np.mean(qd**2, axis=0))
-        joint = int(np.argmax(speed))
-        return joint, float(speed[joint])
+        share = speed / arm.per_joint(*REST_SPEED)
+        joint = int(np.argmax(share))
+        unit = "m/s" if arm.prismatic[joint] else "rad/s"
+        return f"joint {joint + 1} at {speed[joint]:.2g} {unit} RMS" if share[joint] > 1 else ""
 
     def measured_effort(self) -> NDArray[np.float64]:
         """tau (m, n).
@@ -102,23 +106,26 @@ class Recording:
         """Refuses poses that `arm` cannot have taken.
 
         Raises:
-            RecordingError: wrong number of joints, degrees suspected, or a pose far outside the limits.
+            RecordingError: wrong number of joints, a unit suspected to be wrong, or a pose far outside the limits.
         """
         q = self.in_joint_coordinates(arm).q
-        excess = np.maximum(arm.position_lower - q, q - arm.position_upper)
+        excess = np.maximum(arm.position_lower - q, q - arm.position_upper) / arm.per_joint(*LIMIT_TOLERANCE)
         row, joint = np.unravel_index(np.argmax(excess), excess.shape)
-        if excess[row, joint] <= LIMIT_TOLERANCE:
+        if excess[row, joint] <= 1:
             return
         lower, upper = arm.position_lower[joint], arm.position_upper[joint]
         message = (
             f"{self.where(int(row))}: {arm.joint_names[joint]} (q{joint + 1}) = {q[row, joint]:.4g} "
-            f"is outside {lower:.4g}..{upper:.4g} of {arm.name}"
+            f"is outside {lower:.4g}..{upper:.4g}{' m' if arm.prismatic[joint] else ''} of {arm.name}"
         )
-        outside = np.mean(np.any(excess > LIMIT_TOLERANCE, axis=1))
-        share = np.max(np.abs(q) / np.maximum(-arm.position_lower, arm.position_upper))
+        outside = np.mean(np.any(excess > 1, axis=1))
+        shares = np.max(np.abs(q) / np.maximum(-arm.position_lower, arm.position_upper), axis=0)
+        turning = np.max(shares[~arm.prismatic])
         # Another arm or other coordinates exceed the limits by a factor of 2 or 3, degrees by up to 57.
-        if outside > 0.3 and share > 4 and np.radians(share) <= 1.2:
+        if outside > 0.3 and turning > 4 and np.radians(turning) <= 1.2:
             message += "; are these degrees? Positions must be in radians (m on a prismatic joint)"
+        elif arm.prismatic[joint] and shares[joint] > 4:
+            message += "; are these millimetres? A prismatic joint must be in m, its effort in N"
         else:
             message += "; is this the right arm, and are the coordinates (joint or actuator) right?"
         raise RecordingError(message)
@@ -126,11 +133,18 @@ class Recording:
     def _check_joint_count(self, arm: Arm) -> None:
         if self.q.shape[1] != arm.num_joints:
             source = self.source or "recording"
-            raise RecordingError(f"{source}: has {self.q.shape[1]} joints, {arm.name} has {arm.num_joints}")
+            raise RecordingError(
+                f"{source}: has {self.q.shape[1]} joints, {arm.name} has {arm.num_joints}: {', '.join(arm.joint_names)}"
+            )
 
 
-def read_recording(path: str | Path, num_joints: int = 7, coordinates: Coordinates = "joint") -> Recording:
+def read_recording(path: str | Path, arm: Arm | None = None, coordinates: Coordinates = "joint") -> Recording:
     """Reads a CSV with a header: q1..qn, optionally t, qd1..qdn and tau1..taun, in any order; ignores others.
+
+    Args:
+        path: the CSV.
+        arm: whose joints are counted and named in messages; 7 joints without it, as all arms have so far.
+        coordinates: what q, qd and tau are of.
 
     Raises:
         RecordingError: names the file, the line and the column of what is wrong.
@@ -138,6 +152,7 @@ def read_recording(path: str | Path, num_joints: int = 7, coordinates: Coordinat
     if coordinates not in get_args(Coordinates):
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
     path = Path(path)
+    num_joints = arm.num_joints if arm else 7
     numbered, sha256 = read_rows(path)
     if not numbered:
         raise RecordingError(f"{path}: is empty; needs a header with {_wanted(num_joints)}")
@@ -158,11 +173,12 @@ def read_recording(path: str | Path, num_joints: int = 7, coordinates: Coordinat
         if missing:
             raise RecordingError(
                 f"{path}:{header_line}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
-                f"needs {_wanted(num_joints)}"
+                f"needs {_wanted(num_joints)}{_joint_list(arm)}"
             )
         if f"{prefix}{num_joints + 1}" in header:
             raise RecordingError(
                 f"{path}:{header_line}: has {prefix}{num_joints + 1}, but the arm has {num_joints} joints"
+                f"{_joint_list(arm)}"
             )
         blocks[prefix] = [header.index(name) for name in names]
     if len(numbered) == 1:
@@ -214,6 +230,10 @@ def write_csv(path: str | Path, header: list[str], values: NDArray[np.float64]) 
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(header)
         writer.writerows([repr(float(x)) for x in row] for row in values)
+
+
+def _joint_list(arm: Arm | None) -> str:
+    return f"; of {arm.name} these are {', '.join(arm.joint_names)}" if arm else ""
 
 
 def _wanted(num_joints: int) -> str:

@@ -23,27 +23,36 @@ class SdfFacts:
         joint_names: every joint that can move.
         mimics: dependent joint -> (joint it follows, multiplier, offset).
         effort_limits: joint -> `<effort>` [N m or N]; joints without the tag are missing.
+        prismatic: joints that slide; all others turn.
     """
 
     joint_names: tuple[str, ...]
     mimics: dict[str, tuple[str, float, float]]
     effort_limits: dict[str, float]
+    prismatic: frozenset[str]
 
 
 def compose_sdf(urls: Sequence[str]) -> ElementTree.Element:
     """The model of the first file with the links, joints and frames of the others added: an arm and its instrument.
 
+    A link that another file names again gets that file's shapes, so that an instrument's housing is drawn on the arm's
+    carriage without being a body of its own.
+
     Args:
         urls: package URLs or paths.
 
     Raises:
-        ArmError: a file is not an SDF with one model.
+        ArmError: a file is not an SDF with one model, or gives a link that is already there more than shapes.
     """
     root, *others = (_read(Path(str(url).replace(PACKAGE_URL, f"{MODELS_FOLDER}/", 1))) for url in urls)
     (model,) = root.findall("model")
+    links = {link.get("name", ""): link for link in model.findall("link")}
     for other in others:
-        for part in other.findall("model"):
-            model.extend(part)
+        for part in other.iterfind("model/*"):
+            if part.tag == "link" and part.get("name", "") in links:
+                _add_shapes(links[part.get("name", "")], part)
+            else:
+                model.append(part)
     return root
 
 
@@ -53,7 +62,7 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
     Raises:
         ArmError: a joint has `<friction>`, which Drake drops silently.
     """
-    names, mimics, efforts = [], {}, {}
+    names, mimics, efforts, prismatic = [], {}, {}, set()
     for joint in root.findall("model/joint"):
         name = joint.get("name", "")
         if joint.get("type") == "fixed":
@@ -61,6 +70,8 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
         if joint.find(".//friction") is not None:
             raise ArmError(f"joint {name} of the SDF has <friction>, which Drake drops silently; model it elsewhere")
         names.append(name)
+        if joint.get("type") == "prismatic":
+            prismatic.add(name)
         mimic = joint.find(f"{DRAKE}mimic")
         if mimic is not None:
             mimics[name] = (
@@ -71,7 +82,7 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
         effort = joint.findtext("axis/limit/effort")
         if effort is not None:
             efforts[name] = float(effort)
-    return SdfFacts(tuple(names), mimics, efforts)
+    return SdfFacts(tuple(names), mimics, efforts, frozenset(prismatic))
 
 
 def _read(path: Path) -> ElementTree.Element:
@@ -82,3 +93,10 @@ def _read(path: Path) -> ElementTree.Element:
     if len(root.findall("model")) != 1:
         raise ArmError(f"{path}: must hold one <model>")
     return root
+
+
+def _add_shapes(link: ElementTree.Element, again: ElementTree.Element) -> None:
+    for shape in again:
+        if shape.tag not in ("visual", "collision"):
+            raise ArmError(f"link {link.get('name')} has <{shape.tag}> in two files; allowed: <visual>, <collision>")
+        link.append(shape)

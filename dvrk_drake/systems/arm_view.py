@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import Meshcat, MeshcatParams, MeshcatVisualizer, MeshcatVisualizerParams, Role
@@ -13,15 +11,21 @@ from pydrake.systems.framework import DiagramBuilder
 from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, set_arm_positions
-
-#: Where the camera stands and looks by default [m, base frame], with Meshcat's 75 degree view magnified by ZOOM.
-CAMERA, TARGET, ZOOM = (1.1, 0.9, 0.35), (0.0, -0.09, 0.045), 2.8
+from dvrk_drake.systems.camera import ZOOM
 
 
 def start_meshcat(
-    camera: Sequence[float] = CAMERA, target: Sequence[float] = TARGET, zoom: float = ZOOM, port: int | None = None
+    camera: ArrayLike = (2.0, 2.0, 1.0),
+    target: ArrayLike = (0.0, 0.0, 0.0),
+    zoom: float = ZOOM,
+    port: int | None = None,
 ) -> Meshcat:
-    """A Meshcat on localhost with a light ground and the camera on the arm; a free port unless one is given.
+    """A Meshcat on localhost with a light ground; a free port unless one is given.
+
+    Args:
+        camera, target: where the camera stands and what it looks at (3,) [m]; `*framing(arm)` gives both for an arm.
+        zoom: magnification of Meshcat's 75 degree view.
+        port: 1024..65535.
 
     Raises:
         DvrkDrakeError: the port cannot be opened.
@@ -49,7 +53,7 @@ class ArmView:
     """
 
     def __init__(self, arm: Arm, meshcat: Meshcat, role: Role = Role.kIllustration) -> None:
-        """Of `arm` in `meshcat`, at zero.
+        """Of `arm` in `meshcat`, at home: all joints at zero, or as near as their limits allow.
 
         Raises:
             ArmError: the arm has nothing to draw in that role.

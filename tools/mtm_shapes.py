@@ -1,4 +1,4 @@
-"""Make the visual meshes of the MTM, models/sdf/meshes/mtm/<link>.gltf (needs the `geometry` extra).
+"""The shapes of the MTM's links.
 
 All numbers are millimetres in the link's own frame: +X to the operator's left, +Y toward the operator, +Z up.
 The lengths between joints are read from mtm.sdf. Linkage and arm lie in planes side by side along x:
@@ -10,17 +10,15 @@ and the wrist's brackets in shells around the wrist centre, which keeps them apa
     handle < 56 | yaw 56..72 | pitch 72..104 | platform > 105
 """
 
-import xml.etree.ElementTree as ElementTree
-from argparse import ArgumentParser
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from math import atan2, cos, hypot, sin
 from pathlib import Path
 
 import build123d as cad
-from shapes import Body, bolts, disc, fused, of, plate, swept, write_gltf
-
-SDF = Path(__file__).parents[1] / "dvrk_drake/models/sdf/mtm.sdf"
+from home_positions import home_positions
+from shapes import Body, bolts, disc, fused, of, plate, swept
 
 
 @dataclass(frozen=True)
@@ -35,12 +33,7 @@ class Lengths:
     @classmethod
     def read(cls, sdf: Path) -> "Lengths":
         """From the poses of the links at home, which hold no rotation."""
-        model = ElementTree.parse(sdf).getroot().find("model")
-        assert model is not None
-        where = {
-            link.get("name"): [1000 * float(number) for number in link.findtext("pose", "0 0 0").split()[:3]]
-            for link in model.findall("link")
-        }
+        where = home_positions(sdf)
         platform, wrist = where["platform_link"], where["wrist_pitch_link"]
         return cls(-where["forearm_link"][2], -platform[1], wrist[2] - platform[2], -where["coupler_link"][1])
 
@@ -248,20 +241,7 @@ LINKS: tuple[Callable[[Lengths], Body], ...] = (
 )
 
 
-def main() -> None:
-    """Write one file per link."""
-    parser = ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--folder", type=Path, default=SDF.parent / "meshes/mtm", help="where to write")
-    parser.add_argument("--link", action="append", help="only this link (may be repeated)")
-    options = parser.parse_args()
-    options.folder.mkdir(parents=True, exist_ok=True)
-    lengths = Lengths.read(SDF)
-    for link in LINKS:
-        if not options.link or link.__name__ in options.link:
-            path = options.folder / f"{link.__name__}.gltf"
-            write_gltf(link(lengths), path)
-            print(f"{path.name:24} {path.stat().st_size / 1000:6.0f} kB")
-
-
-if __name__ == "__main__":
-    main()
+def bodies(sdf: Path) -> dict[str, Callable[[], Body]]:
+    """What makes each link's body, by the link's name."""
+    lengths = Lengths.read(sdf)
+    return {link.__name__: partial(link, lengths) for link in LINKS}

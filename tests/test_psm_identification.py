@@ -1,0 +1,126 @@
+"""The whole way on the PSM: closed-loop plant, collected poses, identified model, command line."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dvrk_drake.analysis.collection import collect_static_poses
+from dvrk_drake.analysis.static_identification import identify_static
+from dvrk_drake.analysis.true_arm import make_true_arm
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.identified_model import EffectEstimate, IdentifiedModel
+from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.errors import ModelError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
+from dvrk_drake.models.recording import Recording, write_recording
+
+COUNT = 24
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return load_arm("psm")
+
+
+@pytest.fixture(scope="module")
+def true_arm(arm):
+    effects = (JointEffect("yaw", "offset"), JointEffect("roll", "spring"))
+    return make_true_arm(arm, np.random.default_rng(5), effects, (0.05, 0.03), closure="ball")
+
+
+@pytest.fixture(scope="module")
+def recording(arm, true_arm):
+    """Collected with the nominal model, so that the integrator has to make up for what is wrong with it."""
+    generator = np.random.default_rng(6)
+    return collect_static_poses(
+        true_arm.station(),
+        IdentifiedModel.from_arm(arm),
+        arm.sample_poses(COUNT, generator, margin=0.1),
+        effort_noise=0.0,
+        generator=generator,
+        effects=true_arm.effect_torque(),
+        prepare=true_arm.prepare,
+    )
+
+
+def true_torque(arm, true_arm, poses):
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    for name, M in true_arm.inertias.items():
+        plant.GetBodyByName(name).SetSpatialInertiaInBodyFrame(context, M)
+    tau = []
+    for q in poses:
+        set_arm_positions(plant, context, arm, q)
+        tau.append(holding_torque(plant, context, arm))
+    tau = np.array(tau)
+    tau[:, 0] += 0.05
+    tau[:, 3] += 0.03 * np.sin(poses[:, 3])
+    return tau
+
+
+def test_the_true_torque_is_found_through_the_closed_linkage(arm, true_arm, recording):
+    np.testing.assert_allclose(recording.tau, true_torque(arm, true_arm, recording.q), atol=1e-3)
+    model = identify_static(recording, arm).model
+    fresh = arm.sample_poses(100, np.random.default_rng(7), margin=0.1)
+    truth = true_torque(arm, true_arm, fresh)
+    error = np.sqrt(np.mean((model.holding_torque(fresh) - truth) ** 2, axis=0))
+    assert np.all(error < np.maximum(0.03 * np.sqrt(np.mean(truth**2, axis=0)), 1e-3 * arm.effort_limits))
+    assert {(e.joint, e.kind) for e in model.joint_effects} >= {("yaw", "offset"), ("roll", "spring")}
+    # At a yaw joint a spring and lifted weight are the same torque; only one of them may be asked for.
+    assert ("yaw", "spring") not in {(e.joint, e.kind) for e in model.joint_effects}
+
+
+def test_the_verbs_take_a_psm(arm, recording, tmp_path, capsys):
+    poses, model, prediction, errors = (tmp_path / n for n in ("poses.csv", "model.yaml", "tau.csv", "errors.json"))
+    write_recording(recording, poses)
+    assert main(["identify", str(poses), "--arm", "psm", "--output", str(model), "--plots", str(tmp_path)]) == 0
+    assert "insertion" in capsys.readouterr().out
+    assert main(["validate", str(model), str(poses), "--json", str(errors)]) == 0
+    assert all(j["rms_error"] <= j["rms_torque"] + 1e-9 for j in json.loads(errors.read_text())["joints"])
+    assert main(["predict", str(model), str(poses), "--output", str(prediction)]) == 0
+    tau = np.loadtxt(prediction, delimiter=",", skiprows=1)
+    np.testing.assert_allclose(tau, IdentifiedModel.load(model).holding_torque(recording.q), atol=1e-12)
+
+
+def test_a_long_name_of_a_parameter_costs_no_digit(capsys):
+    assert main(["model", "psm"]) == 0
+    text = capsys.readouterr().out
+    assert "…" not in text
+    assert "(m3+...+m6+m_finger_1+m_finger_2) - m_counterweight" in text
+    assert main(["model", "psm", "--latex"]) == 0
+    text = capsys.readouterr().out
+    assert "s_{7 / 2}" in text and "10^{-1" not in text
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda r: Recording(q=r.q[:, :6], tau=r.tau[:, :6]), "missing column q7; "),
+        (lambda r: Recording(q=r.q * [1, 1, 1000, 1, 1, 1, 1], tau=r.tau), "are these millimetres?"),
+        (lambda r: Recording(q=r.q * [3, 1, 1, 1, 1, 1, 1], tau=r.tau), "yaw (q1) = "),
+        (lambda r: Recording(q=r.q, tau=r.tau + 1000 * np.eye(7)[2]), "insertion (tau3) exceed its limit of 9.88"),
+    ],
+)
+def test_bad_recordings_are_refused_in_one_line(recording, tmp_path, capsys, spoil, message):
+    path, model = tmp_path / "bad.csv", tmp_path / "model.yaml"
+    write_recording(spoil(recording), path)
+    assert main(["identify", str(path), "--arm", "psm", "--output", str(model)]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not model.exists()
+
+
+def test_an_instrument_that_does_not_exist_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "arm.yaml").write_text("name: PSM\nmechanism: psm\ninstrument: scissors\nposition_limits: {}\n")
+    assert main(["model", str(tmp_path / "arm.yaml")]) == 2
+    error = capsys.readouterr().err
+    assert 'unknown instrument "scissors"; known instruments: large_needle_driver' in error and error.count("\n") == 1
+
+
+def test_a_joint_that_slides_has_no_spring_in_an_angle(arm):
+    model = IdentifiedModel.from_arm(arm)
+    model.joint_effects = [EffectEstimate("insertion", "spring", 1.0)]
+    with pytest.raises(ModelError, match="insertion cannot have a joint effect spring; kinds: offset"):
+        model.check()

@@ -1,0 +1,200 @@
+"""Visual geometry: every link has some, it is small, and neighbours meet at their pivots."""
+
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+from base64 import b64decode
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.geometry import Role, SceneGraph
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation, MultibodyPlant
+from pydrake.multibody.tree import RevoluteJoint
+from pydrake.systems.framework import DiagramBuilder
+
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import add_arm, make_arm_plant, set_arm_positions
+from dvrk_drake.models.sdf_model import DRAKE, MODELS_FOLDER, compose_sdf
+
+SDF = MODELS_FOLDER / "sdf"
+MESHES = sorted((SDF / "meshes").glob("*/*.gltf"))
+
+
+def vertices(mesh):
+    """Vertices (n, 3) [m] in the link's frame, Z up."""
+    document = json.loads(mesh.read_text())
+    data = b64decode(document["buffers"][0]["uri"].partition(",")[2])
+    parts = []
+    for shape in document["meshes"]:
+        accessor = document["accessors"][shape["primitives"][0]["attributes"]["POSITION"]]
+        start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        parts.append(np.frombuffer(data, "<f4", 3 * accessor["count"], start).reshape(-1, 3))
+    return np.concatenate(parts) @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return make_arm_plant(load_arm("psm"))
+
+
+@pytest.fixture(scope="module")
+def psm_vertices():
+    """Link of the PSM or its instrument -> all vertices drawn on it."""
+    found = {}
+    for link in compose_sdf(load_arm("psm").sdf).iter("link"):
+        meshes = [Path(str(uri.text).replace("package://dvrk_drake", str(MODELS_FOLDER))) for uri in link.iter("uri")]
+        found[link.get("name")] = np.concatenate([vertices(mesh) for mesh in meshes])
+    return found
+
+
+def test_every_mesh_is_used_and_small():
+    named = {
+        SDF.parent / match
+        for sdf in SDF.glob("*.sdf")
+        for match in re.findall(r"package://dvrk_drake/(.*?\.gltf)", sdf.read_text())
+    }
+    assert named == set(MESHES)
+    for model in {mesh.parent for mesh in MESHES}:
+        sizes = [mesh.stat().st_size for mesh in model.glob("*.gltf")]
+        assert max(sizes) < 1e6
+        assert sum(sizes) < 2.5e6
+
+
+def test_every_link_of_psm_and_instrument_is_drawn_and_has_a_collision_shape():
+    arm = load_arm("psm")
+    plant, scene_graph = MultibodyPlant(1e-3), SceneGraph()
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    instance = add_arm(plant, arm)
+    plant.Finalize()
+    inspector = scene_graph.model_inspector()
+    for index in plant.GetBodyIndices(instance):
+        frame = plant.GetBodyFrameIdOrThrow(index)
+        for role in (Role.kIllustration, Role.kProximity):
+            assert inspector.NumGeometriesForFrameWithRole(frame, role) > 0, plant.get_body(index).name()
+
+
+def test_both_links_of_a_pin_are_drawn_around_it(plant, psm_vertices):
+    pins = []
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        if isinstance(joint, RevoluteJoint) and joint.name() not in ("yaw", "roll"):  # shafts, see below
+            pins.append((joint.frame_on_parent(), joint.frame_on_child(), joint.revolute_axis()))
+    for loop in load_arm("psm").loop_closures:
+        pins.append((plant.GetFrameByName(loop.frame_a), plant.GetFrameByName(loop.frame_b), np.array([1.0, 0, 0])))
+    assert len(pins) == 11
+    for A, B, axis in pins:
+        for frame in (A, B):
+            drawn = psm_vertices[frame.body().name()] - frame.GetFixedPoseInBodyFrame().translation()
+            assert (drawn.min(axis=0) < 0).all()
+            assert (drawn.max(axis=0) > 0).all()
+            assert (
+                np.linalg.norm(np.cross(drawn, axis), axis=1).min() < 0.03
+            )  # the largest bearing's bolt circle: 26 mm
+
+
+@pytest.mark.parametrize(
+    ("parent", "child"),
+    [
+        ("base_link", "yaw_link"),
+        ("end_link", "insertion_link"),
+        ("back_crank_link", "counterweight_link"),
+        ("insertion_link", "roll_link"),
+    ],
+)
+def test_links_on_shafts_and_slides_touch_at_both_ends(plant, psm_vertices, parent, child):
+    context = plant.CreateDefaultContext()
+    arm = load_arm("psm")
+    for insertion in (arm.position_lower[2], arm.position_upper[2]):
+        set_arm_positions(plant, context, arm, [0, 0, insertion, 0, 0, 0, 0])  # so all links are parallel
+        drawn = [
+            psm_vertices[name] + plant.GetBodyByName(name).EvalPoseInWorld(context).translation()
+            for name in (parent, child)
+        ]
+        low, high = (np.array([reduce(v, axis=0) for v in drawn]) for reduce in (np.min, np.max))
+        assert (low.max(axis=0) < high.min(axis=0)).all()
+
+
+def test_shaft_and_cannula_hold_the_remote_centre_at_every_pose(plant, psm_vertices):
+    arm, context = load_arm("psm"), plant.CreateDefaultContext()
+    poses = np.random.default_rng(1).uniform(arm.position_lower, arm.position_upper, (50, 7))
+    poses[:, 2] = np.maximum(poses[:, 2], 0.02)  # above, the wrist is inside the cannula
+    for q in poses:
+        set_arm_positions(plant, context, arm, q)
+        for link in ("roll_link", "end_link"):
+            X_LW = plant.GetBodyByName(link).EvalPoseInWorld(context).inverse()
+            drawn, center = psm_vertices[link], X_LW.translation()
+            assert (drawn.min(axis=0) < center).all()
+            assert (drawn.max(axis=0) > center).all()
+            around = np.linalg.norm((drawn - center)[:, :2], axis=1)
+            assert around.min() < 0.007
+    shaft = psm_vertices["roll_link"]
+    assert np.linalg.norm(shaft[:, :2], axis=1).max() == pytest.approx(0.0042, abs=2e-4)
+
+
+#: What touches although no joint of the tree joins it: the top bar's pin in the end link, the instrument in the cannula
+#: and the fingers' hubs, which share a pin with both wrist links.
+NEIGHBOURS = (
+    {"top_bar_link", "end_link"},
+    {"end_link", "roll_link"},
+    *({"end_link", name} for name in ("wrist_pitch_link", "wrist_yaw_link", "finger_1_link", "finger_2_link")),
+    *({"wrist_pitch_link", name} for name in ("finger_1_link", "finger_2_link")),
+    {"wrist_yaw_link", "finger_2_link"},
+)
+
+
+def test_links_keep_apart_over_the_joint_box():
+    """With the collision shapes and without the filter that an arm has; Drake leaves out links that a joint joins."""
+    arm = load_arm("psm")
+    root = compose_sdf(arm.sdf)
+    (model,) = root.findall("model")
+    for group in model.findall(f"{DRAKE}collision_filter_group"):
+        model.remove(group)
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
+    parser = Parser(plant)
+    parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))
+    parser.AddModelsFromString(ElementTree.tostring(root, encoding="unicode"), "sdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link"))
+    plant.Finalize()
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    inspector, met = scene_graph.model_inspector(), set()
+    for q in np.vstack([box_corners(arm), np.random.default_rng(0).uniform(*limits(arm), (200, 7))]):
+        set_arm_positions(plant, plant.GetMyMutableContextFromRoot(context), arm, q)
+        query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+        for pair in query.ComputePointPairPenetration():
+            frames = [inspector.GetFrameId(geometry) for geometry in (pair.id_A, pair.id_B)]
+            met.add(frozenset(plant.GetBodyFromFrameId(frame).name() for frame in frames))
+    assert met <= set(map(frozenset, NEIGHBOURS))
+    assert frozenset({"top_bar_link", "end_link"}) in met
+
+
+def limits(arm):
+    """Lower and upper, the jaw from closed on: below, its fingers press on each other."""
+    return np.append(arm.position_lower[:6], 0.0), arm.position_upper
+
+
+def box_corners(arm):
+    """Corners of the box of yaw, pitch and insertion."""
+    corners = np.zeros((8, 7))
+    corners[:, :3] = list(product(*zip(arm.position_lower[:3], arm.position_upper[:3], strict=True)))
+    return corners
+
+
+def test_an_instrument_gives_the_arms_links_shapes_only(tmp_path):
+    instrument = tmp_path / "instrument.sdf"
+    shape = "<geometry><sphere><radius>0.01</radius></sphere></geometry>"
+    text = '<sdf version="1.9"><model name="i"><link name="insertion_link">{}</link></model></sdf>'
+    instrument.write_text(text.format(f'<visual name="ball">{shape}</visual>'))
+    before = compose_sdf([arm_sdf := "package://dvrk_drake/sdf/psm.sdf"])
+    after = compose_sdf([arm_sdf, str(instrument)])
+    assert len(list(after.iter("link"))) == len(list(before.iter("link")))
+    assert len(list(after.iter("visual"))) == len(list(before.iter("visual"))) + 1
+    instrument.write_text(text.format("<inertial><mass>1</mass></inertial>"))
+    with pytest.raises(ArmError, match=r"insertion_link has <inertial> in two files; allowed: <visual>, <collision>"):
+        compose_sdf([arm_sdf, str(instrument)])
