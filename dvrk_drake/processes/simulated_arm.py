@@ -125,12 +125,13 @@ class SimulatedArm:
 
     def _describe(self) -> str:
         guard = self.guard
-        parts = [_STATES[guard.state]]
-        if guard.fault_text:
-            parts.append(guard.fault_text)
-        if guard.sender_id:
-            parts.append(f"sender {guard.sender_id}")
-        return ": ".join(parts)
+        sender = f", sender {guard.sender_id}" if guard.sender_id else ""
+        return describe_state(guard.state, guard.fault_text) + sender
+
+
+def describe_state(guard_state: int, fault_text: str = "") -> str:
+    """A guard's state in words."""
+    return _STATES.get(guard_state, f"state {guard_state}") + (f": {fault_text}" if fault_text else "")
 
 
 def stop_on_signals() -> Callable[[], bool]:
