@@ -8,12 +8,15 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
+from dvrk_drake.cli_lcm import add_arm, add_run
 from dvrk_drake.cli_simulate import add_simulate
 from dvrk_drake.cli_support import (
     ProgressBar,
+    add_gravity,
     check_output,
     import_interruptibly,
     made_folder,
+    mounted,
     quiet_drake,
     seed,
     until_stopped,
@@ -54,7 +57,7 @@ def _model(options: argparse.Namespace) -> None:
         if options.format is None:
             raise DvrkDrakeError("--output needs to know what to write: --latex, --python or --c")
         check_output(options.output)
-    arm = _mounted(load_arm(options.arm), options.gravity)
+    arm = mounted(load_arm(options.arm), options.gravity)
     gravity = derive_gravity(arm, options.frames, options.serial)
     writers = {
         "latex": lambda gravity: export.to_latex(gravity, SymbolicPlant(arm, options.frames).frame_poses()),
@@ -80,7 +83,7 @@ def _identify(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.recording import read_recording
 
-    arm = _mounted(load_arm(options.arm), options.gravity)
+    arm = mounted(load_arm(options.arm), options.gravity)
     recording = read_recording(options.recording, arm, options.coordinates)
     check_output(options.output, options.recording)
     measured = None
@@ -246,7 +249,7 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("--frames", default="dh", help="link frames of the parameters: dh (dVRK) or paper (Table I)")
     verb.add_argument("--serial", action="store_true", help="leave out the links of the linkage, as the paper does")
     verb.add_argument("--output", metavar="FILE", help="write to a file instead of standard output")
-    _add_gravity(verb)
+    add_gravity(verb)
     verb.set_defaults(run=_model)
 
     verb = verbs.add_parser("identify", help="identify a model from a recording of poses and holding torques")
@@ -256,7 +259,7 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="default: robust")
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.add_argument("--slow-parts", action="store_true", help="of a motion, take where a joint is slow as poses")
-    _add_gravity(verb)
+    add_gravity(verb)
     verb.set_defaults(run=_identify)
 
     verb = verbs.add_parser("validate", help="compare a model with a recording that it was not made from")
@@ -290,6 +293,8 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("--port", type=int, help="of the page; default: a free one")
     verb.set_defaults(run=_view)
 
+    add_arm(verbs)
+    add_run(verbs)
     add_simulate(verbs)
     verb = verbs.add_parser(
         "teleop", help="simulate a master arm that leads a PSM, with your hand on sliders or a played one"
@@ -318,22 +323,6 @@ def _add_recording(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
     )
-
-
-def _add_gravity(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "--gravity",
-        nargs=3,
-        type=float,
-        metavar=("X", "Y", "Z"),
-        help="gravity in the arm's base frame [m/s^2], for other mountings; default: the arm's file, 0 0 -9.81",
-    )
-
-
-def _mounted(arm, gravity):
-    if gravity is None:
-        return arm
-    return arm.with_gravity(gravity)
 
 
 if __name__ == "__main__":

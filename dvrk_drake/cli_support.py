@@ -22,6 +22,8 @@ from dvrk_drake.errors import DvrkDrakeError
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
+    from dvrk_drake.models.arm import Arm
+
 
 def import_interruptibly() -> None:
     """Imports what all verbs need such that Ctrl-C ends the process at once: extension modules turn it into tracebacks.
@@ -83,6 +85,24 @@ def seed(text: str) -> int:
     if not text.isdigit():
         raise argparse.ArgumentTypeError(f'"{text}" is not a whole number from 0')
     return int(text)
+
+
+def add_gravity(verb: argparse.ArgumentParser) -> None:
+    """Adds the option --gravity."""
+    verb.add_argument(
+        "--gravity",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="gravity in the arm's base frame [m/s^2], for other mountings; default: the arm's file, 0 0 -9.81",
+    )
+
+
+def mounted(arm: Arm, gravity: list[float] | None) -> Arm:
+    """The arm as --gravity says that it is mounted."""
+    if gravity is None:
+        return arm
+    return arm.with_gravity(gravity)
 
 
 class ProgressBar:

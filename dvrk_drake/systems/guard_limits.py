@@ -1,0 +1,123 @@
+"""Keeps commands inside an arm's limits of effort, rate and position: what a command guard does with good commands."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.systems.guard_settings import GuardSettings
+
+if TYPE_CHECKING:
+    from dvrk_drake.models.arm import Arm
+
+Vector = NDArray[np.float64]
+Flags = NDArray[np.int8]
+
+_ROUNDING = 1e-12
+
+
+class GuardLimits:
+    """Limits of one arm, for n joints in its order.
+
+    **Effort commands** meet a soft wall in the margin before each position limit lower <= A q <= upper, the joint box
+    and the coupled limits alike: a spring and damper along the limit's own coordinate c = A_k q,
+
+        lambda = 2 F_k clip(depth, 0, 1),  tau -= A_k' lambda,
+
+    F_k the effort that outweighs every motor that can push along c, and depth that of c + T_k dc/dt in the wall: 0
+    where the margin begins, 1 at the limit. So at half of the margin no outward command is left, and at the limit all
+    that the motors have is directed inward; what approaches fast is met earlier, by T_k, the ratio Kd/Kp of the joint's
+    position controller. The arm is never pulled, only pushed back. Without efforts (a falling arm) the wall pushes all
+    the same. Joints that are faster than they may be are braked: above 1.25 times the speed nothing drives them on.
+    Commands are clamped and limited in rate before; what the wall adds is not delayed.
+
+    **Position commands** move a target that is limited in rate and never leaves the limits; a target that starts
+    outside moves no further out.
+    """
+
+    def __init__(self, arm: Arm, settings: GuardSettings) -> None:
+        """Of `arm`."""
+        n = arm.num_joints
+        self.effort_limits = np.array(arm.effort_limits)
+        self.A, self.lower, self.upper = arm.limit_matrix()
+        self.names = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
+        width = self.upper - self.lower
+        self.margin = np.minimum(settings.margin, settings.margin_fraction * width)
+        self.start_position = self.margin[:n]
+        self.start_effort = settings.start_effort * self.effort_limits
+        self.speed = width[:n] / settings.traverse_time
+        self._effort_rate = self.effort_limits / settings.effort_rise_time
+        self._wall_effort = np.array([max(self.effort_limits[row != 0] / np.abs(row[row != 0])) for row in self.A])
+        look_ahead = np.divide(arm.gains.kd, arm.gains.kp)
+        self._look_ahead = np.array([max(look_ahead[row != 0]) for row in self.A])
+        self._wall_flags = np.full(len(self.A), lcmt_dvrk_status.FLAG_COUPLED_LIMIT, np.int8)
+        self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT
+
+    def beyond(self, q: Vector) -> str:
+        """The worst position limit that the pose q (n,) is beyond by more than half of its margin, in words; or ""."""
+        c = self.A @ q
+        excess = np.maximum(c - self.upper, self.lower - c) / self.margin
+        k = int(np.argmax(excess))
+        if not excess[k] > 0.5:
+            return ""
+        return f"{self.names[k]} = {c[k]:.4g} is beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}"
+
+    def follow_effort(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:
+        """Effort (n,) `dt` seconds after `last`, which follows `command` clamped and at a limited rate; joint flags.
+
+        All are (n,) [N m, N] and finite; `last` is inside the effort limits.
+        """
+        clamped = np.clip(command, -self.effort_limits, self.effort_limits)
+        step = self._effort_rate * dt
+        effort = np.clip(clamped, last - step, last + step)
+        flags = np.where(clamped != command, lcmt_dvrk_status.FLAG_EFFORT_CLAMPED, 0).astype(np.int8)
+        flags[effort != clamped] |= lcmt_dvrk_status.FLAG_RATE_LIMITED
+        return effort, flags
+
+    def restrain_effort(self, effort: Vector, q: Vector, v: Vector) -> tuple[Vector, Flags]:
+        """`effort` with what the walls and the speed limit add at q, v, all (n,); joint flags.
+
+        Not limited in rate: it must not come late, and it is continuous in the state.
+        """
+        limit = self.effort_limits
+        flags = np.zeros(len(effort), np.int8)
+        braking = 4 * limit * np.sign(v) * np.clip(np.abs(v) / self.speed - 1, 0, 0.5)
+        flags[braking != 0] |= lcmt_dvrk_status.FLAG_SPEED_LIMIT
+        c = self.A @ q + self._look_ahead * (self.A @ v)
+        to_upper, to_lower = (self.upper - c) / self.margin, (c - self.lower) / self.margin
+        walls = 2 * self._wall_effort * (np.clip(1 - to_lower, 0, 1) - np.clip(1 - to_upper, 0, 1))
+        for k in np.flatnonzero(walls):
+            flags[self.A[k] != 0] |= self._wall_flags[k]
+        return np.clip(effort - braking + walls @ self.A, -limit, limit), flags
+
+    def limit_position(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:
+        """Target (n,) for `command`, `dt` seconds after the target `last`, and the flags of the joints."""
+        n = len(last)
+        step = self.speed * dt
+        target = np.clip(command, last - step, last + step)
+        flags = np.where(target != command, lcmt_dvrk_status.FLAG_RATE_LIMITED, 0).astype(np.int8)
+        c = self.A @ last
+        lower, upper = np.minimum(self.lower, c), np.maximum(self.upper, c)
+        inside = np.clip(target, lower[:n], upper[:n])
+        flags[inside != target] |= lcmt_dvrk_status.FLAG_POSITION_LIMIT
+        for k in range(n, len(self.A)):
+            row = self.A[k]
+            change = row @ inside - c[k]
+            allowed = np.clip(change, lower[k] - c[k], upper[k] - c[k])
+            if allowed != change:
+                # The joints of this limit go the same part of their way, so that they stop on it together.
+                part = np.where(row != 0, allowed / change, 1.0)
+                inside = last + part * (inside - last)
+                flags[row != 0] |= lcmt_dvrk_status.FLAG_COUPLED_LIMIT
+        c = self.A @ inside
+        if np.any((c > upper + _ROUNDING) | (c < lower - _ROUNDING)):
+            # Coupled limits that share joints can undo one another's correction: then stay.
+            return last.copy(), flags
+        return inside, flags
+
+    def limit_velocity(self, command: Vector, flags: Flags) -> Vector:
+        """Feed-forward velocity (n,): of the command where its position is followed as it is, else zero."""
+        return np.where(flags == 0, np.clip(command, -self.speed, self.speed), 0.0)
