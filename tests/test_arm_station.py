@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from pydrake.geometry import HalfSpace, Meshcat, Role
+from pydrake.lcm import DrakeLcm
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CoulombFriction
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
@@ -16,6 +17,7 @@ from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import tree_selector
 from dvrk_drake.systems.arm_station import ArmStation, station_ports
+from dvrk_drake.systems.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 ARM = load_arm("mtml")
@@ -69,6 +71,17 @@ def test_port_names_and_sizes(name):
     assert expected.outputs.items() <= outputs.items()
     assert set(inputs) - set(expected.inputs) == {f"{name}.effort_disturbance"}
     assert set(outputs) - set(expected.outputs) == {"plant_state", "body_poses", "query_object"}
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_hardware_has_exactly_the_ports_of_the_arm(name):
+    arm = load_arm(name)
+    station = ArmStation(arm, hardware=True, lcm=DrakeLcm("memq://"))
+    inputs = {p.get_name(): p.size() for p in map(station.get_input_port, range(station.num_input_ports()))}
+    outputs = {p.get_name(): p.size() for p in map(station.get_output_port, range(station.num_output_ports()))}
+    assert (inputs, outputs) == (station_ports(arm).inputs, station_ports(arm).outputs)
+    with pytest.raises(StationError, match="it has no plant"):
+        station.set_positions(station.CreateDefaultContext(), np.zeros(7))
 
 
 @pytest.mark.parametrize("q", POSES)
@@ -282,8 +295,10 @@ def test_collision_shapes_are_there_when_something_can_be_touched():
 
 
 def test_errors_say_what_to_do():
-    with pytest.raises(StationError, match="comes with the LCM interface"):
-        ArmStation(ARM, hardware=True)
+    with pytest.raises(StationError, match="plant_arm and modify_plant are of a simulation"):
+        ArmStation(ARM, hardware=True, plant_arm=ARM)
+    with pytest.raises(StationError, match="driver and lcm are of hardware"):
+        ArmStation(ARM, driver=DvrkDriver())
     with pytest.raises(StationError, match=r"time_step must be above 0 and at most 0.01 s"):
         ArmStation(ARM, time_step=0.0)
     with pytest.raises(StationError, match="plant_arm must have the joints of MTML"):

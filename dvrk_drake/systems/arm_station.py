@@ -1,4 +1,4 @@
-"""One arm behind the ports that its driver has: in simulation now, the same names on hardware."""
+"""One arm behind the ports that its driver has: the same names in simulation and on hardware."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import Meshcat, MeshcatVisualizer, Role
+from pydrake.lcm import DrakeLcmInterface
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
@@ -16,6 +17,8 @@ from pydrake.systems.primitives import MatrixGain, PassThrough, Saturation
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import Closure, add_arm, set_arm_positions, tree_selector
+from dvrk_drake.systems.arm_connection import connect_arm
+from dvrk_drake.systems.dvrk_driver import DvrkDriver
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ def station_ports(arm: Arm) -> StationPorts:
 
 
 class ArmStation(Diagram):
-    """A simulated arm with the ports of its driver.
+    """An arm with the ports of its driver: simulated, or the arm itself over LCM.
 
     .. pydrake_system::
 
@@ -77,6 +80,10 @@ class ArmStation(Diagram):
     holds the linkage to about 1e-8 m at 1 ms with either `closure`, and each joint in its position limits; the
     coupled limits of the linkage are not there. An arm's shapes never touch each other: they are collision shapes
     only where `modify_plant` adds one that they can touch.
+
+    **On hardware** the ports of `station_ports` are all there are. Measured values are those of the last DVRK_STATUS
+    message, NaN before the first. Efforts go out in DVRK_COMMAND messages every `driver.status_period` and on forced
+    publishing, and the arm's command guard decides what becomes of them; unconnected, the arm is told to hold.
     """
 
     def __init__(
@@ -89,12 +96,14 @@ class ArmStation(Diagram):
         closure: Closure = "mimic",
         plant_arm: Arm | None = None,
         modify_plant: Callable[[MultibodyPlant], None] | None = None,
+        driver: DvrkDriver | None = None,
+        lcm: DrakeLcmInterface | None = None,
     ) -> None:
         """Builds the station; the arm starts at zero, or at the nearest pose inside its limits.
 
         Args:
             arm: names the ports, and is the arm that controllers of this station know.
-            hardware: the arm itself instead of its simulation.
+            hardware: the arm itself instead of its simulation: of the other arguments only `driver` and `lcm` count.
             time_step: of the plant [s].
             meshcat: draws the arm there.
             closure: how the linkage's loops are held, see `add_arm`.
@@ -104,41 +113,66 @@ class ArmStation(Diagram):
             other effort limits.
                 Drake can change the inertia of links that are already there only in a Context:
                 `set_link_inertias`.
+            driver: how the hardware is driven; `DvrkDriver()` by default.
+            lcm: whose `HandleSubscriptions` somebody else calls, for loops that are driven by messages; by default one
+                at `driver.lcm_url` that a Simulator of this station handles.
 
         Raises:
-            StationError: hardware is asked for, the time step is not positive, or `plant_arm` has other
-            joints.
+            StationError: something that only a simulation has is asked of the hardware or the other way round, the time
+            step is not positive, or `plant_arm` has other joints.
         """
         super().__init__()
+        self._arm = arm
+        self._true_arm = plant_arm or arm
+        self._plant: MultibodyPlant | None = None
+        builder = DiagramBuilder()
         if hardware:
-            raise StationError("hardware=True is not there yet: it comes with the LCM interface. Use hardware=False")
+            if meshcat is not None or plant_arm is not None or modify_plant is not None:
+                raise StationError("meshcat, plant_arm and modify_plant are of a simulation: use hardware=False")
+            self._connect_hardware(builder, driver or DvrkDriver(), lcm)
+        else:
+            if driver is not None or lcm is not None:
+                raise StationError("driver and lcm are of hardware; apply_driver_config puts a simulation behind LCM")
+            self._simulate(builder, time_step, meshcat, closure, modify_plant)
+        builder.BuildInto(self)
+        self.set_name(f"{arm.name.lower()}_station")
+
+    def _connect_hardware(self, builder: DiagramBuilder, driver: DvrkDriver, lcm: DrakeLcmInterface | None) -> None:
+        receiver, sender = connect_arm(builder, self._arm, driver, lcm)
+        name, ports = self._arm.name.lower(), station_ports(self._arm)
+        builder.ExportInput(sender.GetInputPort("effort"), f"{name}.effort_commanded")
+        for port in ports.outputs:
+            builder.ExportOutput(receiver.GetOutputPort(port.removeprefix(f"{name}.")), port)
+
+    def _simulate(
+        self,
+        builder: DiagramBuilder,
+        time_step: float,
+        meshcat: Meshcat | None,
+        closure: Closure,
+        modify_plant: Callable[[MultibodyPlant], None] | None,
+    ) -> None:
+        arm, true_arm = self._arm, self._true_arm
         if not 0 < time_step <= 0.01:
             raise StationError(
                 f"time_step must be above 0 and at most 0.01 s: the wrist is lost above; got {time_step}"
             )
-        true_arm = plant_arm or arm
         if true_arm.joint_names != arm.joint_names:
             raise StationError(
                 f"plant_arm must have the joints of {arm.name}: {', '.join(arm.joint_names)}; "
                 f"{true_arm.name} has {', '.join(true_arm.joint_names)}"
             )
-        self._arm = arm
-        self._true_arm = true_arm
-
-        builder = DiagramBuilder()
         self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=time_step)
-        self._instance = add_arm(self._plant, true_arm, closure)
+        self._instance = add_arm(self.plant, true_arm, closure)
         if modify_plant is not None:
             modify_plant(self._plant)
-        self._plant.Finalize()
+        self.plant.Finalize()
         self._drop_idle_shapes()
         self._set_default_pose()
         if meshcat is not None:
             MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat)
         self._export_inputs(builder)
         self._export_outputs(builder)
-        builder.BuildInto(self)
-        self.set_name(f"{arm.name.lower()}_station")
 
     @property
     def arm(self) -> Arm:
@@ -147,7 +181,13 @@ class ArmStation(Diagram):
 
     @property
     def plant(self) -> MultibodyPlant:
-        """The simulated plant."""
+        """The simulated plant.
+
+        Raises:
+            StationError: this station is the hardware, which has none.
+        """
+        if self._plant is None:
+            raise StationError("this station is the hardware: it has no plant, and its state cannot be set")
         return self._plant
 
     def set_positions(self, context: Context, q: ArrayLike) -> None:
@@ -158,19 +198,18 @@ class ArmStation(Diagram):
             q: pose; it need not be inside the limits.
 
         Raises:
-            StationError: q is not n finite numbers.
+            StationError: q is not n finite numbers, or this station is the hardware.
         """
         q = np.asarray(q, float)
         if q.shape != (self._arm.num_joints,) or not np.all(np.isfinite(q)):
             raise StationError(f"a pose of {self._arm.name} is {self._arm.num_joints} finite numbers; got {q.tolist()}")
-        plant_context = self.GetMutableSubsystemContext(self._plant, context)
-        set_arm_positions(self._plant, plant_context, self._true_arm, q)
-        self._plant.SetVelocities(plant_context, np.zeros(self._plant.num_velocities()))
+        plant_context = self.GetMutableSubsystemContext(self.plant, context)
+        set_arm_positions(self.plant, plant_context, self._true_arm, q)
+        self.plant.SetVelocities(plant_context, np.zeros(self.plant.num_velocities()))
 
     def get_positions(self, context: Context) -> NDArray[np.float64]:
         """Pose (n,) of the independent joints in this station's context."""
-        q_plant = self._plant.GetPositions(self.GetSubsystemContext(self._plant, context))
-        return q_plant[self._independent()]
+        return self.GetOutputPort(f"{self._arm.name.lower()}.position_measured").Eval(context)
 
     def set_link_inertias(self, context: Context, inertias: Mapping[str, SpatialInertia]) -> None:
         """Gives links another inertia in this station's context: an arm that differs from its model.
@@ -181,19 +220,19 @@ class ArmStation(Diagram):
             m^2].
 
         Raises:
-            StationError: a link that the arm does not have.
+            StationError: a link that the arm does not have, or this station is the hardware.
         """
-        plant_context = self.GetMutableSubsystemContext(self._plant, context)
-        bodies = {self._plant.get_body(i).name(): i for i in self._plant.GetBodyIndices(self._instance)}
+        plant_context = self.GetMutableSubsystemContext(self.plant, context)
+        bodies = {self.plant.get_body(i).name(): i for i in self.plant.GetBodyIndices(self._instance)}
         if unknown := sorted(set(inertias) - set(bodies)):
             raise StationError(f"unknown link {', '.join(unknown)}; links: {', '.join(bodies)}")
         for name, M_LLo_L in inertias.items():
-            self._plant.get_body(bodies[name]).SetSpatialInertiaInBodyFrame(plant_context, M_LLo_L)
+            self.plant.get_body(bodies[name]).SetSpatialInertiaInBodyFrame(plant_context, M_LLo_L)
 
     def _independent(self) -> NDArray[np.int_]:
         """Index into the plant's q and v of each independent joint."""
         names = list(self._true_arm.tree_joint_names)
-        tree = tree_selector(self._plant, self._true_arm, self._instance)
+        tree = tree_selector(self.plant, self._true_arm, self._instance)
         return tree[[names.index(joint) for joint in self._arm.joint_names]]
 
     def _drop_idle_shapes(self) -> None:
@@ -207,13 +246,13 @@ class ArmStation(Diagram):
 
     def _set_default_pose(self) -> None:
         home = np.clip(0.0, self._true_arm.position_lower, self._true_arm.position_upper)
-        q_plant = self._plant.GetDefaultPositions()
-        tree = tree_selector(self._plant, self._true_arm, self._instance)
+        q_plant = self.plant.GetDefaultPositions()
+        tree = tree_selector(self.plant, self._true_arm, self._instance)
         q_plant[tree] = self._true_arm.linkage.position(home)
-        self._plant.SetDefaultPositions(q_plant)
+        self.plant.SetDefaultPositions(q_plant)
 
     def _export_inputs(self, builder: DiagramBuilder) -> None:
-        plant, name, n = self._plant, self._arm.name.lower(), self._arm.num_joints
+        plant, name, n = self.plant, self._arm.name.lower(), self._arm.num_joints
         # The plant clamps as well, but silently: clamp here, at the plant's limits, to know what is applied.
         actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(self._instance)]
         driven = [actuator.joint().name() for actuator in actuators]
@@ -243,7 +282,7 @@ class ArmStation(Diagram):
         builder.ExportInput(disturbance.get_input_port(), f"{name}.effort_disturbance")
 
     def _export_outputs(self, builder: DiagramBuilder) -> None:
-        plant, name = self._plant, self._arm.name.lower()
+        plant, name = self.plant, self._arm.name.lower()
         S = self._tree_selection().T
         zero = np.zeros_like(S)
         for port, D in {
@@ -261,8 +300,8 @@ class ArmStation(Diagram):
     def _tree_selection(self) -> NDArray[np.float64]:
         """(nv, n): efforts on the independent joints to efforts on the plant; its transpose picks their
         positions."""
-        if self._plant.num_positions() != self._plant.num_velocities():
+        if self.plant.num_positions() != self.plant.num_velocities():
             raise StationError("modify_plant must not add floating bodies: weld them to the arm")
-        selection = np.zeros((self._plant.num_velocities(), self._arm.num_joints))
+        selection = np.zeros((self.plant.num_velocities(), self._arm.num_joints))
         selection[self._independent(), range(self._arm.num_joints)] = 1.0
         return selection

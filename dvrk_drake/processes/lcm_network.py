@@ -1,0 +1,37 @@
+"""Opens an LCM network, or says why it cannot be used: LCM itself only writes to stderr and goes on without."""
+
+from __future__ import annotations
+
+import secrets
+
+import lcm
+from pydrake.lcm import DrakeLcm
+
+from dvrk_drake.errors import DvrkDrakeError
+
+#: How long a message to oneself may take [ms].
+_OWN_MESSAGE = 500
+
+
+def open_lcm(url: str = "") -> DrakeLcm:
+    """The network at `url`; empty: the environment's LCM_DEFAULT_URL, or LCM's own default.
+
+    Raises:
+        DvrkDrakeError: LCM does not know such a network, or a message to oneself does not come back.
+    """
+    network = DrakeLcm(url)
+    name = network.get_lcm_url()
+    try:
+        own = lcm.LCM(name)
+        channel, heard = f"DVRK_SELF_TEST_{secrets.token_hex(8)}", []
+        own.subscribe(channel, lambda channel, data: heard.append(data))
+        own.publish(channel, b"")
+        own.handle_timeout(_OWN_MESSAGE)
+    except (RuntimeError, OSError) as error:
+        raise DvrkDrakeError(f'LCM network "{name}" cannot be used: {error}; e.g. udpm://239.255.76.67:7667') from error
+    if not heard:
+        raise DvrkDrakeError(
+            f'LCM network "{name}" carries no message: is there a route for its multicast address? On one machine: '
+            "ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo"
+        )
+    return network

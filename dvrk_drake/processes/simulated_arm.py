@@ -1,0 +1,128 @@
+"""A process that plays one arm behind LCM: `dvrk-drake arm`."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.common.yaml import yaml_load_typed
+from pydrake.geometry import Meshcat
+from pydrake.lcm import DrakeLcmInterface
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from dvrk_drake.errors import StationError
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.processes.pace import Pace
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.command_guard import CommandGuard
+from dvrk_drake.systems.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.sim_dvrk_driver import apply_driver_config
+
+_STATES = {
+    value: name.removeprefix("STATE_").lower() for name, value in vars(lcmt_dvrk_status).items() if "STATE_" in name
+}
+
+
+def load_driver(path: str | Path) -> DvrkDriver:
+    """A driver's configuration from its YAML file; what it leaves out has its default.
+
+    Raises:
+        StationError: it cannot be read, or holds something that is not allowed.
+    """
+    try:
+        return yaml_load_typed(schema=DvrkDriver, filename=str(path), defaults=DvrkDriver())
+    except StationError as error:
+        raise StationError(f"{path}: {error}") from error
+    except Exception as error:
+        # yaml_load_typed raises many types, from YAML's to KeyError; each text names the field.
+        raise StationError(f"{path}: {error}") from error
+
+
+def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.float64]:
+    """The pose (n,) at which a simulated arm starts: `pose`, or the one nearest to zero that is well inside the limits.
+
+    Raises:
+        StationError: `pose` is not n numbers inside the arm's limits.
+    """
+    if pose is None:
+        inset = 0.1 * (arm.position_upper - arm.position_lower)
+        return np.clip(0.0, arm.position_lower + inset, arm.position_upper - inset)
+    q = np.asarray(pose, float)
+    if q.shape != (arm.num_joints,) or not np.all(np.isfinite(q)):
+        raise StationError(f"a pose of {arm.name} is {arm.num_joints} numbers [rad, m]; got {len(q)}")
+    if violations := arm.limit_violations(q):
+        raise StationError(f"{arm.name} cannot start there: {'; '.join(violations)}")
+    return q
+
+
+class SimulatedArm:
+    """A simulated arm with its driver, guard included, that is stepped by the wall clock."""
+
+    def __init__(
+        self,
+        arm: Arm,
+        driver: DvrkDriver,
+        lcm: DrakeLcmInterface,
+        q: ArrayLike,
+        meshcat: Meshcat | None = None,
+    ) -> None:
+        """At rest at the pose q (n,); the arm's clock starts at the time of day."""
+        self.arm, self.driver, self._lcm = arm, driver, lcm
+        self._ticks = 0
+        builder = DiagramBuilder()
+        station = builder.AddSystem(ArmStation(arm, meshcat=meshcat))
+        self._driver = apply_driver_config(driver, station, lcm, builder, start_utime=time.time_ns() // 1000)
+        self._simulator = Simulator(builder.Build())
+        context = self._simulator.get_mutable_context()
+        station.set_positions(station.GetMyMutableContextFromRoot(context), q)
+        self._simulator.Initialize()
+
+    @property
+    def guard(self) -> CommandGuard:
+        """The guard as it is now, to be read only."""
+        return self._driver.GetGuard(self._driver.GetMyContextFromRoot(self._simulator.get_context()))
+
+    def step(self) -> None:
+        """Takes what has arrived, moves on by one period of the driver, and tells of it."""
+        self._lcm.HandleSubscriptions(0)
+        self._ticks += 1
+        self._simulator.AdvanceTo(self._ticks * self.driver.status_period)
+
+    def run(self, stopped: Callable[[], bool], tell: Callable[[str], None]) -> Pace:
+        """Steps by the wall clock until `stopped`, and tells of every change of the guard's state.
+
+        Returns:
+            The pace, with the count of late ticks.
+        """
+        pace = Pace(self.driver.status_period)
+        told = ""
+        while not stopped():
+            pace.wait()
+            self.step()
+            if (state := self._describe()) != told:
+                tell(f"{self._simulator.get_context().get_time():9.3f} s  {state}")
+                told = state
+        return pace
+
+    def _describe(self) -> str:
+        guard = self.guard
+        parts = [_STATES[guard.state]]
+        if guard.fault_text:
+            parts.append(guard.fault_text)
+        if guard.sender_id:
+            parts.append(f"sender {guard.sender_id}")
+        return ": ".join(parts)
+
+
+def stop_on_signals() -> Callable[[], bool]:
+    """Whether SIGINT or SIGTERM came since: for loops that end in order."""
+    came: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, frame: came.append(number))
+    return lambda: bool(came)

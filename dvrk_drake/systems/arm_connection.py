@@ -1,0 +1,46 @@
+"""The systems that connect a Diagram with one arm over LCM."""
+
+from __future__ import annotations
+
+from pydrake.lcm import DrakeLcm, DrakeLcmInterface
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubscriberSystem
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.systems.dvrk_command_sender import DvrkCommandSender
+from dvrk_drake.systems.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.dvrk_status_receiver import DvrkStatusReceiver
+from dvrk_drake.systems.lcm_serializer import TolerantSerializer, command_channel, is_status_of, status_channel
+
+
+def connect_arm(
+    builder: DiagramBuilder, arm: Arm, driver: DvrkDriver, lcm: DrakeLcmInterface | None = None
+) -> tuple[DvrkStatusReceiver, DvrkCommandSender]:
+    """Adds the controller's end of both channels of `arm`; a command goes out every `driver.status_period`.
+
+    Args:
+        builder: of the Diagram.
+        arm: whose channels they are; messages that are not of it are ignored.
+        driver: its configuration.
+        lcm: whose `HandleSubscriptions` somebody else calls; None: one at `driver.lcm_url` that a Simulator handles.
+
+    Returns:
+        What receives the status, and what sends the command.
+    """
+    if lcm is None:
+        lcm = builder.AddNamedSystem("lcm", LcmInterfaceSystem(lcm=DrakeLcm(driver.lcm_url)))
+    serializer = TolerantSerializer(lcmt_dvrk_status, is_status_of(arm))
+    subscriber = builder.AddNamedSystem("status_subscriber", LcmSubscriberSystem(status_channel(arm), serializer, lcm))
+    receiver = builder.AddNamedSystem("status_receiver", DvrkStatusReceiver(arm))
+    sender = builder.AddNamedSystem("command_sender", DvrkCommandSender(arm))
+    publisher = builder.AddNamedSystem(
+        "command_publisher",
+        LcmPublisherSystem(
+            command_channel(arm), TolerantSerializer(lcmt_dvrk_command), lcm, publish_period=driver.status_period
+        ),
+    )
+    for system in (receiver, sender):
+        builder.Connect(subscriber.get_output_port(), system.GetInputPort("lcmt_dvrk_status"))
+    builder.Connect(sender.GetOutputPort("lcmt_dvrk_command"), publisher.get_input_port())
+    return receiver, sender

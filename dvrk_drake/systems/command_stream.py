@@ -1,0 +1,62 @@
+"""Whether a command goes on from where its sender was: who sends, in what order, by which clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+
+
+@dataclass
+class CommandStream:
+    """The commands of whoever was heard last. All times in us, arrivals on the arm's clock.
+
+    A sender keeps its place as long as it is heard, with good commands or refused ones; another one that comes in
+    within `expiry` of it is the second of two at once.
+
+    Attributes:
+        expiry: after which a sender that is silent may be followed by another.
+        clock_tolerance: by how much the sender's clock and the arm's may differ from one accepted command to the next.
+        sender_id: of who was heard last; 0: nobody yet.
+        lost: commands missing between accepted ones.
+    """
+
+    expiry: int
+    clock_tolerance: int
+    sender_id: int = 0
+    lost: int = 0
+    _heard: int = 0
+    _last: lcmt_dvrk_command | None = None
+    _arrival: int = 0
+    _can_reset: bool = False
+
+    def refusal(self, command: lcmt_dvrk_command, utime: int) -> int:
+        """REFUSAL_OTHER_SENDER, _OUT_OF_ORDER or _CLOCK_JUMP of a command that is good by itself, or REFUSAL_NONE."""
+        if command.sender_id != self.sender_id:
+            if self.sender_id != 0 and utime - self._heard <= self.expiry:
+                return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
+            self.sender_id, self._last, self._can_reset = command.sender_id, None, False
+        self._heard = utime
+        if self._last is None:
+            return lcmt_dvrk_status.REFUSAL_NONE
+        if command.sequence <= self._last.sequence:
+            return lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER
+        advance = command.utime - self._last.utime
+        if advance <= 0 or abs(advance - (utime - self._arrival)) > self.clock_tolerance:
+            # What follows is compared with the clock as it is now.
+            self._last, self._arrival = command, utime
+            return lcmt_dvrk_status.REFUSAL_CLOCK_JUMP
+        return lcmt_dvrk_status.REFUSAL_NONE
+
+    def accept(self, command: lcmt_dvrk_command, utime: int) -> bool:
+        """Goes on to this command; True if it asks for a reset: reset_fault changed from false to true."""
+        if self._last is not None:
+            self.lost += command.sequence - self._last.sequence - 1
+        self._last, self._arrival = command, utime
+        resets = command.reset_fault and self._can_reset
+        self._can_reset = not command.reset_fault
+        return resets
+
+    def forget(self) -> None:
+        """Forgets who was heard, for when the arm's own clock cannot be trusted."""
+        self.sender_id, self._last, self._can_reset = 0, None, False

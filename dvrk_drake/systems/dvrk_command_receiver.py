@@ -1,0 +1,143 @@
+"""The arm's end of the command channel: the command guard as a system."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.lcm import DrakeLcmInterface
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.systems.command_check import decode
+from dvrk_drake.systems.command_guard import CommandGuard
+from dvrk_drake.systems.lcm_serializer import command_channel
+
+#: Messages kept from one update to the next; more is a flood, of which the newest are looked at.
+_INBOX = 256
+
+
+class DvrkCommandReceiver(LeafSystem):
+    """Receives commands for one arm, lets its guard judge them, and says what motors and position controller do.
+
+    Until a command acts it holds the measured pose, like Drake's receivers, and whenever the guard takes over.
+
+    .. pydrake_system::
+
+        name: DvrkCommandReceiver
+        input_ports:
+        - lcmt_dvrk_command (optional)
+        - state_estimated
+        - effort_measured
+        - position_control_effort
+        - gravity_effort (optional)
+        output_ports:
+        - control_mode
+        - desired_state
+        - effort
+        - guard
+
+    Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
+
+    - `lcmt_dvrk_command`: a command, e.g. from an LcmSubscriberSystem; the same one is taken once. That system keeps
+      only the newest message, which can hide a second sender: give `lcm` instead, by which every message is taken.
+    - `state_estimated` (2n): q, then v, measured. `effort_measured` (n): what the motors apply.
+    - `position_control_effort` (n): what the arm's own position controller asks for now.
+    - `gravity_effort` (n): the arm's own gravity compensation. Connected, it is added to commanded efforts, and
+      commands are understood without it.
+    - `control_mode` (1): lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT, what is in force.
+    - `desired_state` (2n): where that position controller shall go; the measured pose at rest while efforts act.
+    - `effort` (n): what the motors shall apply: zero when off, the guarded command in EFFORT, else
+      `position_control_effort`.
+    - `guard`: the CommandGuard, to be read only.
+
+    Its clock is the context's time after `start_utime`. The guard is abstract state; it is updated every `period`, and
+    Drake does that before discrete plants of the same time are stepped, so a command acts in the step that follows it.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        guard: CommandGuard,
+        *,
+        start_utime: int = 0,
+        period: float = 1e-3,
+        lcm: DrakeLcmInterface | None = None,
+    ) -> None:
+        """Of `arm` with a `guard` of it.
+
+        Args:
+            arm: names the channel.
+            guard: its state at first; each context has its own.
+            start_utime: the arm's clock at time zero of the context [us].
+            period: of the update [s].
+            lcm: where to subscribe to DVRK_COMMAND_<ARM>; its `HandleSubscriptions` is called by somebody else.
+        """
+        super().__init__()
+        n = arm.num_joints
+        self._num_joints, self._start_utime = n, start_utime
+        self._command = self.DeclareAbstractInputPort("lcmt_dvrk_command", AbstractValue.Make(lcmt_dvrk_command()))
+        self._state = self.DeclareVectorInputPort("state_estimated", 2 * n)
+        self._effort = self.DeclareVectorInputPort("effort_measured", n)
+        self._position_control = self.DeclareVectorInputPort("position_control_effort", n)
+        self._gravity = self.DeclareVectorInputPort("gravity_effort", n)
+        self._guard = self.DeclareAbstractState(AbstractValue.Make(guard))
+        self._taken = self.DeclareAbstractState(AbstractValue.Make((0, 0, 0)))
+        own = {self.abstract_state_ticket(self._guard)}
+        self.DeclareVectorOutputPort("control_mode", 1, self._calc_control_mode, own)
+        self.DeclareVectorOutputPort("desired_state", 2 * n, self._calc_desired_state, own)
+        efforts = {self.input_port_ticket(port.get_index()) for port in (self._position_control, self._gravity)}
+        self.DeclareVectorOutputPort("effort", n, self._calc_effort, own | efforts)
+        self.DeclareAbstractOutputPort("guard", lambda: AbstractValue.Make(guard), self._calc_guard, own)
+        self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
+        self._inbox: deque[bytes] = deque(maxlen=_INBOX)
+        if lcm is not None:
+            lcm.Subscribe(command_channel(arm), self._inbox.append)
+
+    def utime(self, context: Context) -> int:
+        """The arm's clock [us]."""
+        return self._start_utime + round(1e6 * context.get_time())
+
+    def GetGuard(self, context: Context) -> CommandGuard:
+        """The guard of this context, to be read only."""
+        return context.get_abstract_state(int(self._guard)).get_value()
+
+    def _update(self, context: Context, state: State) -> None:
+        guard = state.get_mutable_abstract_state(int(self._guard)).get_mutable_value()
+        utime = self.utime(context)
+        while self._inbox:
+            guard.receive(decode(lcmt_dvrk_command, self._inbox.popleft()), utime)
+        if self._command.HasValue(context):
+            command = self._command.Eval(context)
+            taken = (command.sender_id, command.sequence, command.utime)
+            if taken != context.get_abstract_state(int(self._taken)).get_value():
+                state.get_mutable_abstract_state(int(self._taken)).set_value(taken)
+                guard.receive(command, utime)
+        q_v = self._state.Eval(context)
+        effort = self._effort.Eval(context)
+        if self._gravity.HasValue(context):
+            effort = effort - self._gravity.Eval(context)
+        guard.step(utime, q_v[: self._num_joints], q_v[self._num_joints :], effort)
+
+    def _calc_control_mode(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self.GetGuard(context).output.control_mode)
+
+    def _calc_desired_state(self, context: Context, output: BasicVector) -> None:
+        told = self.GetGuard(context).output
+        output.SetFromVector(np.concatenate([told.position, told.velocity]))
+
+    def _calc_effort(self, context: Context, output: BasicVector) -> None:
+        told = self.GetGuard(context).output
+        if told.control_mode == lcmt_dvrk_command.OFF:
+            output.SetZero()
+        elif told.control_mode == lcmt_dvrk_command.EFFORT:
+            gravity = self._gravity.Eval(context) if self._gravity.HasValue(context) else 0.0
+            output.SetFromVector(told.effort + gravity)
+        else:
+            output.SetFromVector(self._position_control.Eval(context))
+
+    def _calc_guard(self, context: Context, output: AbstractValue) -> None:
+        output.set_value(self.GetGuard(context))

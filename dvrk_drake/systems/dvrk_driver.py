@@ -1,0 +1,46 @@
+"""How an arm is driven over LCM, as a schema for yaml_load_typed.
+
+No postponed annotations here: yaml_load_typed reads the types at run time.
+"""
+
+from dataclasses import dataclass, field
+
+from dvrk_drake.errors import StationError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command
+from dvrk_drake.systems.guard_settings import GuardSettings
+
+_MODES = {"position": lcmt_dvrk_command.POSITION, "effort": lcmt_dvrk_command.EFFORT}
+
+
+@dataclass
+class DvrkDriver:
+    """Configuration of the driver of one arm, as Drake's IiwaDriver is for its arm.
+
+    Attributes:
+        lcm_url: of the LCM network; empty: the environment's LCM_DEFAULT_URL, or LCM's default.
+        status_period: in which the arm says what it measures, and controllers answer [s].
+        control_modes: what the arm accepts beside hold and off: position, effort.
+        gravity_compensation: the arm adds its own gravity compensation to commanded efforts, as a dVRK does on request.
+        guard: what its command guard allows.
+    """
+
+    lcm_url: str = ""
+    status_period: float = 1e-3
+    control_modes: list[str] = field(default_factory=lambda: ["position", "effort"])
+    gravity_compensation: bool = False
+    guard: GuardSettings = field(default_factory=GuardSettings)
+
+    def __post_init__(self) -> None:
+        """Checks the values.
+
+        Raises:
+            StationError: an unknown control mode, or a period that is not positive or above 10 ms.
+        """
+        if unknown := [mode for mode in self.control_modes if mode not in _MODES]:
+            raise StationError(f'unknown control mode "{unknown[0]}"; known: {", ".join(_MODES)}')
+        if not 0 < self.status_period <= 0.01:
+            raise StationError(f"status_period must be above 0 and at most 0.01 s; got {self.status_period}")
+
+    def accepted_modes(self) -> tuple[int, ...]:
+        """`control_modes` as values of lcmt_dvrk_command.control_mode."""
+        return tuple(_MODES[mode] for mode in self.control_modes)

@@ -1,0 +1,90 @@
+"""The arm's end of the status channel."""
+
+from __future__ import annotations
+
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import Context, LeafSystem
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.systems.command_guard import CommandGuard
+
+
+class DvrkStatusSender(LeafSystem):
+    """Says in a message what one arm measures and what its guard decided, for an LcmPublisherSystem.
+
+    .. pydrake_system::
+
+        name: DvrkStatusSender
+        input_ports:
+        - state_estimated
+        - effort_measured
+        - effort_commanded
+        - guard
+        output_ports:
+        - lcmt_dvrk_status
+
+    - `state_estimated` (2n): q, then v; `effort_measured`, `effort_commanded` (n): what the motors apply and were told
+      [rad, rad/s, N m; m, m/s, N on a prismatic joint].
+    - `guard`: the CommandGuard, from DvrkCommandReceiver.
+    - `lcmt_dvrk_status`: the message. Its sequence is the number of periods since time zero.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        guard: CommandGuard,
+        *,
+        start_utime: int = 0,
+        period: float = 1e-3,
+        gravity_compensation: bool = False,
+    ) -> None:
+        """Of `arm`.
+
+        Args:
+            arm: named in the message.
+            guard: a guard of that arm, for the type of the port.
+            start_utime: the arm's clock at time zero of the context [us].
+            period: in which messages are sent [s].
+            gravity_compensation: whether the arm adds its own to commanded efforts.
+        """
+        super().__init__()
+        n = arm.num_joints
+        self._num_joints, self._arm_name = n, arm.name
+        self._start_utime, self._period = start_utime, period
+        self._gravity_compensation = gravity_compensation
+        self._state = self.DeclareVectorInputPort("state_estimated", 2 * n)
+        self._measured = self.DeclareVectorInputPort("effort_measured", n)
+        self._commanded = self.DeclareVectorInputPort("effort_commanded", n)
+        self._guard = self.DeclareAbstractInputPort("guard", AbstractValue.Make(guard))
+        self.DeclareAbstractOutputPort(
+            "lcmt_dvrk_status", lambda: AbstractValue.Make(lcmt_dvrk_status()), self._calc_status
+        )
+
+    def _calc_status(self, context: Context, output: AbstractValue) -> None:
+        n, time = self._num_joints, context.get_time()
+        guard: CommandGuard = self._guard.Eval(context)
+        q_v = self._state.Eval(context)
+        status = lcmt_dvrk_status()
+        status.utime, status.sequence = self._start_utime + round(1e6 * time), round(time / self._period)
+        status.arm_name, status.gravity_compensation = self._arm_name, self._gravity_compensation
+        status.num_joints = n
+        status.position, status.velocity = q_v[:n].tolist(), q_v[n:].tolist()
+        status.effort_measured = self._measured.Eval(context).tolist()
+        status.effort_commanded = self._commanded.Eval(context).tolist()
+        fill_in_guard(status, guard)
+        output.set_value(status)
+
+
+def fill_in_guard(status: lcmt_dvrk_status, guard: CommandGuard) -> None:
+    """Sets the fields of `status` that tell what a guard decided, for bridges as well."""
+    status.session_id = guard.session_id
+    status.guard_state, status.accepted_modes = guard.state, guard.accepted_modes
+    status.fault_code, status.fault_text = guard.fault_code, guard.fault_text
+    status.command_sender_id = guard.sender_id
+    status.command_sequence, status.command_utime = guard.last_command.sequence, guard.last_command.utime
+    counts = guard.counts
+    status.num_accepted, status.num_lost, status.num_refused = counts.accepted, counts.lost, counts.refused
+    status.num_expired, status.refusal_code = counts.expired, guard.refusal_code
+    status.position_commanded = guard.output.position.tolist()
+    status.joint_flags = guard.output.joint_flags.tolist()

@@ -1,0 +1,128 @@
+"""What stands between the messages and the motors of a simulated arm."""
+
+from __future__ import annotations
+
+from pydrake.lcm import DrakeLcmInterface
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.lcm import LcmPublisherSystem
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.command_guard import CommandGuard
+from dvrk_drake.systems.dvrk_command_receiver import DvrkCommandReceiver
+from dvrk_drake.systems.dvrk_command_sender import draw_id
+from dvrk_drake.systems.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.dvrk_status_sender import DvrkStatusSender
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.lcm_serializer import TolerantSerializer, status_channel
+
+
+class SimDvrkDriver(Diagram):
+    """An arm's own controller, simulated: command guard, position controller, status.
+
+    .. pydrake_system::
+
+        name: SimDvrkDriver
+        input_ports:
+        - lcmt_dvrk_command (optional)
+        - state_estimated
+        - effort_measured
+        output_ports:
+        - effort_commanded
+        - lcmt_dvrk_status
+
+    Ports as in DvrkCommandReceiver and DvrkStatusSender. The position controller, which holds the arm whenever no
+    command acts, is a GravityPidController that knows the arm's true gravity; a real arm's has friction instead.
+    """
+
+    def __init__(
+        self, arm: Arm, driver: DvrkDriver, *, start_utime: int = 0, lcm: DrakeLcmInterface | None = None
+    ) -> None:
+        """Of `arm`.
+
+        Args:
+            arm: as it is simulated, mounting included.
+            driver: its configuration.
+            start_utime: the arm's clock at time zero of the context [us].
+            lcm: where every command is received; None: `lcmt_dvrk_command` is the only way in.
+        """
+        super().__init__()
+        period = driver.status_period
+        guard = CommandGuard(arm, draw_id(), driver.guard, driver.accepted_modes())
+        builder = DiagramBuilder()
+        self._receiver = builder.AddNamedSystem(
+            "command_receiver", DvrkCommandReceiver(arm, guard, start_utime=start_utime, period=period, lcm=lcm)
+        )
+        position_controller = builder.AddNamedSystem(
+            "position_controller", GravityPidController(IdentifiedModel.from_arm(arm), period=period)
+        )
+        status_sender = builder.AddNamedSystem(
+            "status_sender",
+            DvrkStatusSender(
+                arm,
+                guard,
+                start_utime=start_utime,
+                period=period,
+                gravity_compensation=driver.gravity_compensation,
+            ),
+        )
+        receiver = self._receiver
+        builder.Connect(receiver.GetOutputPort("desired_state"), position_controller.GetInputPort("desired_state"))
+        builder.Connect(position_controller.GetOutputPort("effort"), receiver.GetInputPort("position_control_effort"))
+        if driver.gravity_compensation:
+            builder.Connect(
+                position_controller.GetOutputPort("gravity_effort"), receiver.GetInputPort("gravity_effort")
+            )
+        builder.Connect(receiver.GetOutputPort("guard"), status_sender.GetInputPort("guard"))
+        builder.Connect(receiver.GetOutputPort("effort"), status_sender.GetInputPort("effort_commanded"))
+        for name, systems in {
+            "lcmt_dvrk_command": (receiver,),
+            "state_estimated": (receiver, position_controller, status_sender),
+            "effort_measured": (receiver, status_sender),
+        }.items():
+            port = builder.ExportInput(systems[0].GetInputPort(name), name)
+            for system in systems[1:]:
+                builder.ConnectInput(port, system.GetInputPort(name))
+        builder.ExportOutput(receiver.GetOutputPort("effort"), "effort_commanded")
+        builder.ExportOutput(status_sender.GetOutputPort("lcmt_dvrk_status"), "lcmt_dvrk_status")
+        builder.BuildInto(self)
+        self.set_name(f"{arm.name.lower()}_driver")
+
+    def GetGuard(self, context: Context) -> CommandGuard:
+        """The guard in this driver's context, to be read only."""
+        return self._receiver.GetGuard(self.GetSubsystemContext(self._receiver, context))
+
+
+def apply_driver_config(
+    driver: DvrkDriver, station: ArmStation, lcm: DrakeLcmInterface, builder: DiagramBuilder, *, start_utime: int = 0
+) -> SimDvrkDriver:
+    """Puts a simulated station behind LCM: DVRK_COMMAND_<ARM> moves it, DVRK_STATUS_<ARM> tells of it.
+
+    Args:
+        driver: its configuration; its `lcm_url` is not read.
+        station: in `builder`, with its effort input free.
+        lcm: whose `HandleSubscriptions` is called by somebody else, e.g. an LcmInterfaceSystem or a loop.
+        builder: of the Diagram.
+        start_utime: the arm's clock at time zero of the context [us].
+
+    Returns:
+        The driver that was added.
+    """
+    arm, name = station.arm, station.arm.name.lower()
+    sim_driver = builder.AddSystem(SimDvrkDriver(arm, driver, start_utime=start_utime, lcm=lcm))
+    for port in ("state_estimated", "effort_measured"):
+        builder.Connect(station.GetOutputPort(f"{name}.{port}"), sim_driver.GetInputPort(port))
+    builder.Connect(sim_driver.GetOutputPort("effort_commanded"), station.GetInputPort(f"{name}.effort_commanded"))
+    publisher = builder.AddNamedSystem(
+        f"{name}_status_publisher",
+        LcmPublisherSystem(
+            status_channel(arm),
+            TolerantSerializer(lcmt_dvrk_status),
+            lcm,
+            publish_period=driver.status_period,
+        ),
+    )
+    builder.Connect(sim_driver.GetOutputPort("lcmt_dvrk_status"), publisher.get_input_port())
+    return sim_driver

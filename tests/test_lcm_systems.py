@@ -1,0 +1,310 @@
+"""Both ends of an arm's LCM channels, in one process: the same controller on the simulated driver as on a plant."""
+
+import numpy as np
+import pytest
+from pydrake.common.value import AbstractValue
+from pydrake.common.yaml import yaml_load_typed
+from pydrake.lcm import DrakeLcm
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.lcm import LcmSubscriberSystem
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import StationError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.dvrk_command_sender import DvrkCommandSender
+from dvrk_drake.systems.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.dvrk_status_receiver import DvrkStatusReceiver
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.lcm_serializer import TolerantSerializer, is_status_of
+from dvrk_drake.systems.sim_dvrk_driver import apply_driver_config
+
+ARM = load_arm("mtml")
+POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
+START = 10**15
+
+
+class SimulatedArm:
+    """A simulated arm behind LCM, and what it said."""
+
+    def __init__(self, lcm, name="mtml", driver=None):
+        self.arm = load_arm(name)
+        builder = DiagramBuilder()
+        self.station = builder.AddSystem(ArmStation(self.arm))
+        apply_driver_config(driver or DvrkDriver(), self.station, lcm, builder, start_utime=START)
+        self.statuses = []
+        lcm.Subscribe(f"DVRK_STATUS_{self.arm.name}", lambda data: self.statuses.append(Status.decode(data)))
+        self.simulator = Simulator(builder.Build())
+        self.context = self.station.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
+        self.station.set_positions(self.context, POSES[name])
+        self.simulator.Initialize()
+        self.tick = 0
+
+    def step(self):
+        self.tick += 1
+        self.simulator.AdvanceTo(1e-3 * self.tick)
+
+    def drift(self):
+        return np.abs(self.station.get_positions(self.context) - POSES[self.arm.name.lower()]).max()
+
+
+class Controller:
+    """Holds the first pose that it hears of, through the hardware station."""
+
+    def __init__(self, lcm, name="mtml", driver=None):
+        arm = load_arm(name)
+        builder = DiagramBuilder()
+        station = builder.AddSystem(ArmStation(arm, hardware=True, driver=driver, lcm=lcm))
+        controller = builder.AddSystem(GravityPidController(IdentifiedModel.from_arm(arm), mode="gravity"))
+        builder.Connect(station.GetOutputPort(f"{name}.state_estimated"), controller.GetInputPort("state_estimated"))
+        builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))
+        self.simulator = Simulator(builder.Build())
+        self.simulator.Initialize()
+        self.tick = 0
+
+    def step(self):
+        self.tick += 1
+        self.simulator.AdvanceTo(1e-3 * self.tick)
+
+
+def run(lcm, milliseconds, *processes):
+    for _ in range(milliseconds):
+        for process in processes:
+            process.step()
+            lcm.HandleSubscriptions(0)
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_a_controller_starts_acts_and_is_replaced_by_a_hold(name):
+    lcm = DrakeLcm("memq://")
+    arm, controller = SimulatedArm(lcm, name), Controller(lcm, name)
+    run(lcm, 300, arm, controller)
+    status = arm.statuses[-1]
+    assert (status.guard_state, status.fault_text) == (Status.STATE_EFFORT, "")
+    assert status.utime == START + 300_000
+    assert [s.sequence for s in arm.statuses] == list(range(301))
+    assert arm.drift() < 1e-4
+    effort_before = np.array(status.effort_commanded)
+    # The controller dies: the arm holds after 50 ms, without a jump of the effort or the pose.
+    run(lcm, 60, arm)
+    states = [s.guard_state for s in arm.statuses[-60:]]
+    assert states == sorted(states, reverse=True)
+    assert 49 <= states.count(Status.STATE_EFFORT) <= 51
+    assert states[-1] == Status.STATE_HOLD
+    accepted = arm.statuses[-1].num_accepted
+    run(lcm, 500, arm)
+    status = arm.statuses[-1]
+    assert (status.num_expired, status.command_sender_id, status.num_accepted) == (1, 0, accepted)
+    assert np.abs(np.array(status.effort_commanded) - effort_before).max() < 0.01 * arm.arm.effort_limits.max()
+    assert arm.drift() < 1e-3
+    # It comes back as another sender and is watched again first.
+    controller = Controller(lcm, name)
+    run(lcm, 200, arm, controller)
+    assert arm.statuses[-1].guard_state == Status.STATE_STARTING
+    run(lcm, 100, arm, controller)
+    assert arm.statuses[-1].guard_state == Status.STATE_EFFORT
+    assert (arm.statuses[-1].num_lost, arm.drift() < 1e-3) == (0, True)
+
+
+def test_the_status_echoes_the_last_accepted_command():
+    lcm = DrakeLcm("memq://")
+    sent = []
+    lcm.Subscribe("DVRK_COMMAND_MTML", lambda data: sent.append(Command.decode(data)))
+    arm, controller = SimulatedArm(lcm), Controller(lcm)
+    run(lcm, 20, arm, controller)
+    arm.step()  # it steps with what came last, and says so one period later
+    arm.step()
+    lcm.HandleSubscriptions(0)
+    status, command = arm.statuses[-1], sent[-1]
+    assert (status.command_sequence, status.command_utime) == (command.sequence, command.utime)
+    assert status.command_sender_id == command.sender_id != 0
+    assert command.session_id == status.session_id != 0
+
+
+def test_two_controllers_fault_the_arm():
+    lcm = DrakeLcm("memq://")
+    arm, first, second = SimulatedArm(lcm), Controller(lcm), Controller(lcm)
+    run(lcm, 300, arm, first)
+    run(lcm, 3, arm, first, second)
+    assert arm.statuses[-1].fault_code == Status.FAULT_DUPLICATE_SENDER
+    run(lcm, 500, arm, first)
+    assert arm.statuses[-1].guard_state == Status.STATE_FAULT
+    assert arm.drift() < 1e-3
+
+
+def test_own_gravity_compensation_makes_a_second_one_start_too_far():
+    lcm = DrakeLcm("memq://")
+    driver = DvrkDriver(gravity_compensation=True)
+    arm, controller = SimulatedArm(lcm, driver=driver), Controller(lcm)
+    run(lcm, 400, arm, controller)
+    status = arm.statuses[-1]
+    assert status.gravity_compensation
+    assert (status.guard_state, status.refusal_code) == (Status.STATE_HOLD, Status.REFUSAL_START_FAR)
+
+
+def test_own_gravity_compensation_carries_an_arm_that_is_commanded_no_effort():
+    lcm = DrakeLcm("memq://")
+    arm = SimulatedArm(lcm, driver=DvrkDriver(gravity_compensation=True))
+    sender = Sending(lcm, effort=np.zeros(7))
+    run(lcm, 1000, arm, sender)
+    assert arm.statuses[-1].guard_state == Status.STATE_EFFORT
+    assert arm.drift() < 1e-3
+    assert np.abs(arm.statuses[-1].effort_commanded).max() > 0.3
+
+
+def test_position_commands_move_the_arm():
+    lcm = DrakeLcm("memq://")
+    arm = SimulatedArm(lcm)
+    sender = Sending(lcm, desired_state=np.concatenate([POSES["mtml"], np.zeros(7)]))
+    run(lcm, 300, arm, sender)
+    assert arm.statuses[-1].guard_state == Status.STATE_POSITION
+    goal = np.array(POSES["mtml"]) + 0.1
+    sender.fix("desired_state", np.concatenate([goal, np.zeros(7)]))
+    run(lcm, 2500, arm, sender)
+    assert np.abs(arm.statuses[-1].position - goal).max() < 5e-3
+    assert np.abs(arm.statuses[-1].position_commanded - goal).max() < 1e-9
+
+
+def test_a_fault_is_reset_through_the_sender():
+    lcm = DrakeLcm("memq://")
+    arm = SimulatedArm(lcm)
+    first, second = Sending(lcm), Sending(lcm)
+    run(lcm, 3, arm, first, second)
+    assert arm.statuses[-1].guard_state == Status.STATE_FAULT
+    run(lcm, 100, arm, first)
+    first.fix("reset_fault", [1.0])
+    run(lcm, 3, arm, first)
+    assert arm.statuses[-1].guard_state == Status.STATE_HOLD
+
+
+def test_off_lets_the_arm_fall():
+    lcm = DrakeLcm("memq://")
+    arm = SimulatedArm(lcm)
+    sender = Sending(lcm, control_mode=[float(Command.OFF)])
+    run(lcm, 200, arm, sender)
+    assert arm.statuses[-1].guard_state == Status.STATE_OFF
+    assert not np.any(arm.statuses[-1].effort_measured)
+    assert arm.drift() > 0.01
+
+
+class Sending:
+    """A DvrkCommandSender that answers each status, with fixed inputs."""
+
+    def __init__(self, lcm, **inputs):
+        self.sender = DvrkCommandSender(ARM)
+        self.context = self.sender.CreateDefaultContext()
+        self.lcm, self.status, self.ticks = lcm, Status(), 0
+        lcm.Subscribe("DVRK_STATUS_MTML", self.hear)
+        for name, value in inputs.items():
+            self.fix(name, value)
+
+    def hear(self, data):
+        self.status = Status.decode(data)
+
+    def fix(self, name, value):
+        self.sender.GetInputPort(name).FixValue(self.context, value)
+
+    def command(self):
+        self.fix("lcmt_dvrk_status", self.status_value())
+        return self.sender.get_output_port().Eval(self.context)
+
+    def status_value(self):
+        return AbstractValue.Make(self.status)
+
+    def step(self):
+        self.ticks += 1
+        self.context.SetTime(1e-3 * self.ticks)
+        self.lcm.Publish("DVRK_COMMAND_MTML", self.command().encode())
+
+
+def test_the_sender_asks_for_a_hold_unless_it_is_given_finite_numbers():
+    lcm = DrakeLcm("memq://")
+    effort, q_v = np.arange(7.0), np.arange(14.0)
+    cases = [
+        ({}, Command.HOLD),
+        ({"effort": effort}, Command.EFFORT),
+        ({"desired_state": q_v}, Command.POSITION),
+        ({"effort": effort, "desired_state": q_v}, Command.EFFORT),
+        ({"effort": effort, "desired_state": q_v, "control_mode": [2.0]}, Command.POSITION),
+        ({"effort": effort, "control_mode": [2.0]}, Command.HOLD),
+        ({"effort": effort, "control_mode": [np.nan]}, Command.HOLD),
+        ({"effort": effort, "control_mode": [0.0]}, Command.OFF),
+        ({"effort": effort * np.nan}, Command.HOLD),
+        ({"effort": effort + 1e7}, Command.HOLD),
+        ({"effort": effort, "reset_fault": [1.0]}, Command.HOLD),
+    ]
+    for inputs, mode in cases:
+        command = Sending(lcm, **inputs).command()
+        assert command.control_mode == mode
+        np.testing.assert_array_equal(command.effort, effort if mode == Command.EFFORT else np.zeros(7))
+        expected = q_v if mode == Command.POSITION else np.zeros(14)
+        np.testing.assert_array_equal([*command.position, *command.velocity], expected)
+        assert command.reset_fault == ("reset_fault" in inputs)
+
+
+def full_status(arm_name="MTML", n=7, utime=1):
+    status = Status()
+    status.arm_name, status.num_joints, status.utime = arm_name, n, utime
+    for k, name in enumerate(("position", "velocity", "effort_measured", "position_commanded", "effort_commanded")):
+        setattr(status, name, list(np.arange(n) + 10.0 * k))
+    status.joint_flags = [0] * n
+    return status
+
+
+def test_the_status_receiver_knows_nothing_before_the_first_status_and_ignores_what_is_not_of_its_arm():
+    lcm = DrakeLcm("memq://")
+    builder = DiagramBuilder()
+    serializer = TolerantSerializer(Status, is_status_of(ARM))
+    subscriber = builder.AddSystem(LcmSubscriberSystem("DVRK_STATUS_MTML", serializer, lcm))
+    receiver = builder.AddSystem(DvrkStatusReceiver(ARM))
+    builder.Connect(subscriber.get_output_port(), receiver.get_input_port())
+    simulator = Simulator(builder.Build())
+    context = receiver.GetMyContextFromRoot(simulator.get_context())
+
+    def after(data):
+        lcm.Publish("DVRK_STATUS_MTML", data)
+        lcm.HandleSubscriptions(0)
+        simulator.AdvanceTo(simulator.get_context().get_time() + 1e-3)
+        return {name: receiver.GetOutputPort(name).Eval(context).tolist() for name in names}
+
+    names = ("position_measured", "velocity_estimated", "state_estimated", "effort_measured")
+    assert all(np.all(np.isnan(receiver.GetOutputPort(name).Eval(context))) for name in names)
+    good = after(full_status().encode())
+    assert (
+        good["state_estimated"] == [*range(7), *range(10, 17)] == good["position_measured"] + good["velocity_estimated"]
+    )
+    assert good["effort_measured"] == list(range(20, 27))
+    for bad in (b"", b"garbage", full_status("MTMR").encode(), full_status(n=6).encode(), full_status().encode()[:-30]):
+        assert after(bad) == good
+
+
+def test_each_context_has_a_guard_of_its_own():
+    lcm = DrakeLcm("memq://")
+    arm, controller = SimulatedArm(lcm), Controller(lcm)
+    run(lcm, 300, arm, controller)
+    simulator = arm.simulator
+    clone = simulator.get_context().Clone()
+    driver = simulator.get_system().GetSubsystemByName("mtml_driver")
+    guard = driver.GetGuard(driver.GetMyContextFromRoot(clone))
+    run(lcm, 100, arm)
+    assert guard.state == Status.STATE_EFFORT
+    assert driver.GetGuard(driver.GetMyContextFromRoot(simulator.get_context())).state == Status.STATE_HOLD
+    assert guard.counts.expired == 0
+
+
+def test_driver_is_loaded_from_yaml_and_checked():
+    driver = yaml_load_typed(
+        schema=DvrkDriver, data="{status_period: 0.002, guard: {expiry: 0.02}}", defaults=DvrkDriver()
+    )
+    assert (driver.status_period, driver.guard.expiry, driver.guard.start_time) == (0.002, 0.02, 0.25)
+    with pytest.raises(StationError, match='unknown control mode "speed"; known: position, effort'):
+        DvrkDriver(control_modes=["speed"])
+    with pytest.raises(StationError, match="status_period"):
+        DvrkDriver(status_period=0.0)
+    with pytest.raises(StationError, match="expiry must be at most 1 s"):
+        DvrkDriver(guard=type(driver.guard)(expiry=5.0))
+    with pytest.raises(StationError, match="margin must be above 0"):
+        type(driver.guard)(margin=float("nan"))

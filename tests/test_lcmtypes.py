@@ -1,0 +1,49 @@
+"""The committed Python of the LCM types is what lcm-gen makes of the .lcm files, and survives the wire."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dvrk_drake import lcmtypes
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+
+FOLDER = Path(lcmtypes.__file__).parent
+LCM_GEN = Path(sys.executable).with_name("lcm-gen")
+
+
+def test_committed_python_is_what_lcm_gen_makes(tmp_path):
+    if not LCM_GEN.exists():
+        pytest.skip(f"no {LCM_GEN}: the lcm wheel ships it")
+    sources = sorted(str(path) for path in FOLDER.glob("*.lcm"))
+    subprocess.run([LCM_GEN, "-p", "--ppath", tmp_path, *sources], check=True, timeout=60)
+    made = {path.name: path.read_text() for path in (tmp_path / "dvrk_drake" / "lcmtypes").glob("*.py")}
+    assert len(made) == 3
+    assert made == {path.name: path.read_text() for path in FOLDER.glob("*.py")}
+
+
+@pytest.mark.parametrize("type_", [lcmt_dvrk_command, lcmt_dvrk_status])
+def test_every_field_and_constant_has_a_comment_before_it(type_):
+    lines = [line.strip() for line in (FOLDER / f"{type_.__name__}.lcm").read_text().splitlines()]
+    fields = [i for i, line in enumerate(lines) if line.endswith(";") and not line.startswith("package")]
+    assert len(fields) >= len(type_.__slots__)
+    assert not [lines[i] for i in fields if not lines[i - 1].startswith("//")]
+
+
+def test_round_trip():
+    command = lcmt_dvrk_command()
+    command.utime, command.sequence, command.sender_id, command.session_id = 2**40, 7, -(2**62), 2**62
+    command.arm_name, command.control_mode, command.reset_fault = "MTML", command.EFFORT, True
+    command.num_joints = 2
+    command.position, command.velocity, command.effort = [1.0, 2.0], [3.0, 4.0], [5.0, float("inf")]
+    back = lcmt_dvrk_command.decode(command.encode())
+    for field in lcmt_dvrk_command.__slots__:
+        expected = getattr(command, field)
+        assert getattr(back, field) == (tuple(expected) if isinstance(expected, list) else expected)
+
+
+def test_codes_of_one_kind_are_distinct():
+    for prefix in ("STATE_", "FAULT_", "REFUSAL_", "FLAG_"):
+        codes = [value for name, value in vars(lcmt_dvrk_status).items() if name.startswith(prefix)]
+        assert len(codes) == len(set(codes)) > 3
