@@ -215,15 +215,15 @@ def _arm(options: argparse.Namespace) -> None:
     arm = _mounted(load_arm(options.arm), options.gravity)
     driver = DvrkDriver() if options.driver is None else load_driver(options.driver)
     pose = start_pose(arm, options.pose)
-    lcm = open_lcm(options.lcm_url or driver.lcm_url)
+    network = open_lcm(options.lcm_url or driver.lcm_url)
     meshcat = start_meshcat() if options.meshcat else None
-    simulated = SimulatedArm(arm, driver, lcm, pose, meshcat)
+    simulated = SimulatedArm(arm, driver, network, pose, meshcat)
     stopped = stop_on_signals()
     if options.realtime and (warning := make_realtime()):
         print(f"dvrk-drake: warning: {warning}", file=sys.stderr)
     settle_memory()
     where = f"; {meshcat.web_url()}" if meshcat else ""
-    print(f"simulated {arm.name} on LCM {lcm.get_lcm_url()}{where}; end with Ctrl-C", flush=True)
+    print(f"simulated {arm.name} on LCM {network.get_lcm_url()}{where}; end with Ctrl-C", flush=True)
     pace = simulated.run(stopped, lambda line: print(line, flush=True))
     print(f"ended; {pace.late} ticks began more than a period late", flush=True)
 

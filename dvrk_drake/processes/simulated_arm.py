@@ -7,11 +7,12 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import lcm
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.geometry import Meshcat
-from pydrake.lcm import DrakeLcmInterface
+from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
@@ -22,7 +23,11 @@ from dvrk_drake.processes.pace import Pace
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.command_guard import CommandGuard
 from dvrk_drake.systems.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm_serializer import command_channel
 from dvrk_drake.systems.sim_dvrk_driver import apply_driver_config
+
+#: More commands in one step are a flood: the rest waits, and is stale when it is looked at.
+_MESSAGES_A_STEP = 200
 
 _STATES = {
     value: name.removeprefix("STATE_").lower() for name, value in vars(lcmt_dvrk_status).items() if "STATE_" in name
@@ -36,9 +41,9 @@ def load_driver(path: str | Path) -> DvrkDriver:
         StationError: it cannot be read, or holds something that is not allowed.
     """
     try:
-        return yaml_load_typed(schema=DvrkDriver, filename=str(path), defaults=DvrkDriver())
-    except StationError as error:
-        raise StationError(f"{path}: {error}") from error
+        driver = yaml_load_typed(schema=DvrkDriver, filename=str(path), defaults=DvrkDriver())
+        driver.check()
+        return driver
     except Exception as error:
         # yaml_load_typed raises many types, from YAML's to KeyError; each text names the field.
         raise StationError(f"{path}: {error}") from error
@@ -68,16 +73,22 @@ class SimulatedArm:
         self,
         arm: Arm,
         driver: DvrkDriver,
-        lcm: DrakeLcmInterface,
+        network: DrakeLcm,
         q: ArrayLike,
         meshcat: Meshcat | None = None,
     ) -> None:
         """At rest at the pose q (n,); the arm's clock starts at the time of day."""
-        self.arm, self.driver, self._lcm = arm, driver, lcm
+        self.arm, self.driver = arm, driver
         self._ticks = 0
         builder = DiagramBuilder()
         station = builder.AddSystem(ArmStation(arm, meshcat=meshcat))
-        self._driver = apply_driver_config(driver, station, lcm, builder, start_utime=time.time_ns() // 1000)
+        self._driver = apply_driver_config(
+            driver, station, network, builder, start_utime=time.time_ns() // 1000, subscribe=False
+        )
+        # Drake's own subscription would keep one message between two steps; a second sender must not hide there.
+        self._commands = lcm.LCM(network.get_lcm_url())
+        subscription = self._commands.subscribe(command_channel(arm), lambda _, data: self._driver.Receive(data))
+        subscription.set_queue_capacity(_MESSAGES_A_STEP)
         self._simulator = Simulator(builder.Build())
         context = self._simulator.get_mutable_context()
         station.set_positions(station.GetMyMutableContextFromRoot(context), q)
@@ -90,7 +101,9 @@ class SimulatedArm:
 
     def step(self) -> None:
         """Takes what has arrived, moves on by one period of the driver, and tells of it."""
-        self._lcm.HandleSubscriptions(0)
+        for _ in range(_MESSAGES_A_STEP):
+            if self._commands.handle_timeout(0) == 0:
+                break
         self._ticks += 1
         self._simulator.AdvanceTo(self._ticks * self.driver.status_period)
 

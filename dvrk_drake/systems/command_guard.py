@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -90,6 +89,7 @@ class CommandGuard:
             modes: which of POSITION and EFFORT are accepted; both if empty.
         """
         self.settings = settings or GuardSettings()
+        self.settings.check()
         self.limits = GuardLimits(arm, self.settings)
         self.arm_name, self.num_joints, self.session_id = arm.name, arm.num_joints, session_id
         self.state = lcmt_dvrk_status.STATE_HOLD
@@ -109,8 +109,13 @@ class CommandGuard:
 
     def __deepcopy__(self, memo: object) -> CommandGuard:
         # A Drake context copies its state before every update, so this must be quick. No array is changed in place.
-        other = copy.copy(self)
-        other.counts, other._stream, other._force = replace(self.counts), copy.copy(self._stream), replace(self._force)
+        other = object.__new__(CommandGuard)
+        other.__dict__.update(self.__dict__)
+        for name in ("counts", "_stream", "_force"):
+            part = getattr(self, name)
+            twin = object.__new__(type(part))
+            twin.__dict__.update(part.__dict__)
+            setattr(other, name, twin)
         return other
 
     @property

@@ -6,14 +6,12 @@ from collections import deque
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.lcm import DrakeLcmInterface
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.command_check import decode
 from dvrk_drake.systems.command_guard import CommandGuard
-from dvrk_drake.systems.lcm_serializer import command_channel
 
 #: Messages kept from one update to the next; more is a flood, of which the newest are looked at.
 _INBOX = 256
@@ -41,8 +39,9 @@ class DvrkCommandReceiver(LeafSystem):
 
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
-    - `lcmt_dvrk_command`: a command, e.g. from an LcmSubscriberSystem; the same one is taken once. That system keeps
-      only the newest message, which can hide a second sender: give `lcm` instead, by which every message is taken.
+    - `lcmt_dvrk_command`: a command, e.g. from an LcmSubscriberSystem; the same one is taken once. Drake keeps only the
+      newest message of a channel, which can hide a second sender: a process that moves an arm gives every message to
+      `Receive` instead.
     - `state_estimated` (2n): q, then v, measured. `effort_measured` (n): what the motors apply.
     - `position_control_effort` (n): what the arm's own position controller asks for now.
     - `gravity_effort` (n): the arm's own gravity compensation. Connected, it is added to commanded efforts, and
@@ -64,16 +63,14 @@ class DvrkCommandReceiver(LeafSystem):
         *,
         start_utime: int = 0,
         period: float = 1e-3,
-        lcm: DrakeLcmInterface | None = None,
     ) -> None:
         """Of `arm` with a `guard` of it.
 
         Args:
-            arm: names the channel.
+            arm: for the number of its joints.
             guard: its state at first; each context has its own.
             start_utime: the arm's clock at time zero of the context [us].
             period: of the update [s].
-            lcm: where to subscribe to DVRK_COMMAND_<ARM>; its `HandleSubscriptions` is called by somebody else.
         """
         super().__init__()
         n = arm.num_joints
@@ -94,8 +91,10 @@ class DvrkCommandReceiver(LeafSystem):
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
         self._inbox: deque[bytes] = deque(maxlen=_INBOX)
-        if lcm is not None:
-            lcm.Subscribe(command_channel(arm), self._inbox.append)
+
+    def Receive(self, data: bytes) -> None:
+        """Puts a message, as it came over the wire, into the inbox that the next update takes."""
+        self._inbox.append(data)
 
     def utime(self, context: Context) -> int:
         """The arm's clock [us]."""

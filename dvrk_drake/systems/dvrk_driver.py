@@ -31,11 +31,15 @@ class DvrkDriver:
     guard: GuardSettings = field(default_factory=GuardSettings)
 
     def __post_init__(self) -> None:
-        """Checks the values.
+        self.check()
+
+    def check(self) -> None:
+        """Checks the values; whoever sets them one by one, as yaml_load_typed does, calls it again.
 
         Raises:
-            StationError: an unknown control mode, or a period that is not positive or above 10 ms.
+            StationError: an unknown control mode, or a period that is not positive or above 10 ms, or the guard's settings.
         """
+        self.guard.check()
         if unknown := [mode for mode in self.control_modes if mode not in _MODES]:
             raise StationError(f'unknown control mode "{unknown[0]}"; known: {", ".join(_MODES)}')
         if not 0 < self.status_period <= 0.01:

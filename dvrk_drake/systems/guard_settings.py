@@ -34,6 +34,9 @@ class GuardSettings:
     traverse_time: float = 1.0
 
     def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
         """Refuses settings that switch the guard off.
 
         Raises:

@@ -16,7 +16,7 @@ from dvrk_drake.systems.dvrk_command_sender import draw_id
 from dvrk_drake.systems.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.dvrk_status_sender import DvrkStatusSender
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.lcm_serializer import TolerantSerializer, status_channel
+from dvrk_drake.systems.lcm_serializer import TolerantSerializer, command_channel, status_channel
 
 
 class SimDvrkDriver(Diagram):
@@ -37,23 +37,20 @@ class SimDvrkDriver(Diagram):
     command acts, is a GravityPidController that knows the arm's true gravity; a real arm's has friction instead.
     """
 
-    def __init__(
-        self, arm: Arm, driver: DvrkDriver, *, start_utime: int = 0, lcm: DrakeLcmInterface | None = None
-    ) -> None:
+    def __init__(self, arm: Arm, driver: DvrkDriver, *, start_utime: int = 0) -> None:
         """Of `arm`.
 
         Args:
             arm: as it is simulated, mounting included.
             driver: its configuration.
             start_utime: the arm's clock at time zero of the context [us].
-            lcm: where every command is received; None: `lcmt_dvrk_command` is the only way in.
         """
         super().__init__()
         period = driver.status_period
         guard = CommandGuard(arm, draw_id(), driver.guard, driver.accepted_modes())
         builder = DiagramBuilder()
         self._receiver = builder.AddNamedSystem(
-            "command_receiver", DvrkCommandReceiver(arm, guard, start_utime=start_utime, period=period, lcm=lcm)
+            "command_receiver", DvrkCommandReceiver(arm, guard, start_utime=start_utime, period=period)
         )
         position_controller = builder.AddNamedSystem(
             "position_controller", GravityPidController(IdentifiedModel.from_arm(arm), period=period)
@@ -90,13 +87,23 @@ class SimDvrkDriver(Diagram):
         builder.BuildInto(self)
         self.set_name(f"{arm.name.lower()}_driver")
 
+    def Receive(self, data: bytes) -> None:
+        """Takes a message of the command channel, as it came over the wire, at the next update."""
+        self._receiver.Receive(data)
+
     def GetGuard(self, context: Context) -> CommandGuard:
         """The guard in this driver's context, to be read only."""
         return self._receiver.GetGuard(self.GetSubsystemContext(self._receiver, context))
 
 
 def apply_driver_config(
-    driver: DvrkDriver, station: ArmStation, lcm: DrakeLcmInterface, builder: DiagramBuilder, *, start_utime: int = 0
+    driver: DvrkDriver,
+    station: ArmStation,
+    lcm: DrakeLcmInterface,
+    builder: DiagramBuilder,
+    *,
+    start_utime: int = 0,
+    subscribe: bool = True,
 ) -> SimDvrkDriver:
     """Puts a simulated station behind LCM: DVRK_COMMAND_<ARM> moves it, DVRK_STATUS_<ARM> tells of it.
 
@@ -106,12 +113,16 @@ def apply_driver_config(
         lcm: whose `HandleSubscriptions` is called by somebody else, e.g. an LcmInterfaceSystem or a loop.
         builder: of the Diagram.
         start_utime: the arm's clock at time zero of the context [us].
+        subscribe: take commands from `lcm`, which over UDP keeps the newest one between two calls of
+            `HandleSubscriptions`. False: somebody else gives every message to `SimDvrkDriver.Receive`.
 
     Returns:
         The driver that was added.
     """
     arm, name = station.arm, station.arm.name.lower()
-    sim_driver = builder.AddSystem(SimDvrkDriver(arm, driver, start_utime=start_utime, lcm=lcm))
+    sim_driver = builder.AddSystem(SimDvrkDriver(arm, driver, start_utime=start_utime))
+    if subscribe:
+        lcm.Subscribe(command_channel(arm), sim_driver.Receive)
     for port in ("state_estimated", "effort_measured"):
         builder.Connect(station.GetOutputPort(f"{name}.{port}"), sim_driver.GetInputPort(port))
     builder.Connect(sim_driver.GetOutputPort("effort_commanded"), station.GetInputPort(f"{name}.effort_commanded"))

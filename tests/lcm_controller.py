@@ -1,0 +1,49 @@
+"""A small controller process for tests: holds the pose at which it first hears of the arm, by efforts.
+
+    python lcm_controller.py ARM [--echo]
+
+With --echo it only answers with HOLD commands. It needs no Drake while it runs, so it is a peer to measure against.
+"""
+
+import sys
+import time
+
+import lcm
+import numpy as np
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.systems.dvrk_command_sender import draw_id
+
+
+class Controller:
+    def __init__(self, arm_name: str, echo: bool = False) -> None:
+        self.arm, self.echo = load_arm(arm_name), echo
+        self.kp, self.kd = np.array(self.arm.gains.kp), np.array(self.arm.gains.kd)
+        self.sender_id, self.sequence = draw_id(), 0
+        self.held = None
+        self.lcm = lcm.LCM()
+        self.lcm.subscribe(f"DVRK_STATUS_{self.arm.name}", self.answer)
+
+    def answer(self, channel: str, data: bytes) -> None:
+        status = lcmt_dvrk_status.decode(data)
+        q, v = np.array(status.position), np.array(status.velocity)
+        if self.held is None:
+            self.held = q, np.array(status.effort_measured)
+        n = self.arm.num_joints
+        command = lcmt_dvrk_command()
+        self.sequence += 1
+        command.utime, command.sequence, command.sender_id = time.monotonic_ns() // 1000, self.sequence, self.sender_id
+        command.session_id, command.status_utime = status.session_id, status.utime
+        command.arm_name, command.num_joints = self.arm.name, n
+        command.control_mode = lcmt_dvrk_command.HOLD if self.echo else lcmt_dvrk_command.EFFORT
+        command.position, command.velocity = [0.0] * n, [0.0] * n
+        q_held, effort = self.held
+        command.effort = (effort + self.kp * (q_held - q) - self.kd * v).tolist()
+        self.lcm.publish(f"DVRK_COMMAND_{self.arm.name}", command.encode())
+
+
+if __name__ == "__main__":
+    controller = Controller(sys.argv[1], "--echo" in sys.argv)
+    while True:
+        controller.lcm.handle()

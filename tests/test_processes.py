@@ -1,0 +1,102 @@
+"""Pace, network and start of the processes, without a network of their own."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dvrk_drake.errors import DvrkDrakeError, StationError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.processes import pace
+from dvrk_drake.processes.lcm_network import open_lcm
+from dvrk_drake.processes.simulated_arm import load_driver, start_pose
+
+
+class Clock:
+    def __init__(self):
+        self.now, self.slept = 100.0, 0.0
+
+    def sleep(self, seconds):
+        self.slept += seconds
+        self.now += seconds
+
+
+def test_pace_keeps_its_period_and_catches_up():
+    clock = Clock()
+    beat = pace.Pace(1e-3, lambda: clock.now, clock.sleep)
+    begun = []
+    for k in range(1000):
+        beat.wait()
+        begun.append(clock.now - 100.0)
+        clock.now += 0.0105 if k == 500 else 0.0003  # one tick takes ten periods
+    assert np.abs(np.array(begun[:501]) - 1e-3 * np.arange(501)).max() < 1e-9
+    assert np.abs(np.array(begun[-400:]) - 1e-3 * np.arange(600, 1000)).max() < 1e-9
+    assert 9 <= beat.late <= 15
+
+
+def test_pace_far_behind_goes_on_from_now():
+    clock = Clock()
+    beat = pace.Pace(1e-3, lambda: clock.now, clock.sleep)
+    beat.wait()
+    clock.now += 10.0
+    begun = []
+    for _ in range(5):
+        beat.wait()
+        begun.append(clock.now - 110.0)
+    np.testing.assert_allclose(begun, 1e-3 * np.arange(5), atol=1e-9)
+    assert beat.late == 1
+
+
+def test_no_permission_for_realtime_is_a_warning(monkeypatch):
+    def refuse(*arguments):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    assert pace.make_realtime().startswith("no real-time scheduling (Operation not permitted): ")
+
+
+@pytest.mark.parametrize("url", ["bogus://", "udpm://nonsense"])
+def test_a_network_that_does_not_work_is_an_error(url):
+    with pytest.raises(DvrkDrakeError, match=f'LCM network "{url}" cannot be used'):
+        open_lcm(url)
+
+
+def test_a_network_without_a_route_is_an_error():
+    code = "from dvrk_drake.processes.lcm_network import open_lcm; open_lcm()"
+    try:
+        done = subprocess.run(
+            ["unshare", "-rn", sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+        )
+    except OSError:
+        pytest.skip("no unshare here")
+    if "unshare failed" in done.stderr:
+        pytest.skip("a network of its own is not permitted here")
+    assert done.returncode == 1
+    assert 'DvrkDrakeError: LCM network "udpm://239.255.76.67:7667' in done.stderr
+
+
+def test_start_pose():
+    for name in ("mtml", "mtmr", "psm"):
+        arm = load_arm(name)
+        assert not arm.limit_violations(start_pose(arm), tolerance=-0.01)
+    arm = load_arm("mtml")
+    np.testing.assert_array_equal(start_pose(arm, [0.1] * 7), [0.1] * 7)
+    with pytest.raises(StationError, match="a pose of MTML is 7 numbers"):
+        start_pose(arm, [0.1] * 6)
+    with pytest.raises(StationError, match=r"parallelogram = 1.2 is outside"):
+        start_pose(arm, [0.0, 0.7, 0.5, 0.0, 0.0, 0.0, 0.0])
+
+
+def test_driver_file(tmp_path):
+    path = tmp_path / "driver.yaml"
+    path.write_text("control_modes: [effort]\nguard: {expiry: 0.03}\n")
+    driver = load_driver(path)
+    assert (driver.control_modes, driver.guard.expiry, driver.status_period) == (["effort"], 0.03, 1e-3)
+    for text in ("control_modes: [speed]", "gard: {}", "guard: {expiry: -1}", "guard: {expiry: soon}", "["):
+        path.write_text(text)
+        with pytest.raises(StationError, match=r"driver\.yaml: "):
+            load_driver(path)
+    with pytest.raises(StationError, match=r"nowhere\.yaml"):
+        load_driver(tmp_path / "nowhere.yaml")
