@@ -8,7 +8,16 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from dvrk_drake.cli_support import ProgressBar, check_output, import_interruptibly, made_folder, quiet_drake, seed
+from dvrk_drake.cli_support import (
+    ProgressBar,
+    check_output,
+    import_interruptibly,
+    made_folder,
+    print_notes,
+    quiet_drake,
+    seconds,
+    seed,
+)
 from dvrk_drake.errors import DvrkDrakeError
 
 # Verbs import what they need when they run: drake and numba take seconds, `--help` should not.
@@ -73,6 +82,7 @@ def _identify(options: argparse.Namespace) -> None:
 
     arm = _mounted(load_arm(options.arm), options.gravity)
     recording = read_recording(options.recording, arm, options.coordinates)
+    print_notes(options.recording, recording.notes)
     check_output(options.output, options.recording)
     measured = None
     if options.slow_parts:
@@ -108,6 +118,7 @@ def _validate(options: argparse.Namespace) -> None:
     model = IdentifiedModel.load(options.model)
     arm = model.load_arm()
     recording = read_recording(options.recording, arm, options.coordinates)
+    print_notes(options.recording, recording.notes)
     if options.json is not None:
         check_output(options.json, options.recording, options.model)
     console = make_console()
@@ -142,6 +153,7 @@ def _predict(options: argparse.Namespace) -> None:
     check_output(options.output, options.recording, options.model)
     model = IdentifiedModel.load(options.model)
     recording = read_recording(options.recording, model.load_arm(), options.coordinates)
+    print_notes(options.recording, recording.notes)
     tau = predict(model, recording)
     write_csv(options.output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
 
@@ -228,6 +240,23 @@ def _arm(options: argparse.Namespace) -> None:
     print(f"ended; {pace.late} ticks began more than a period late", flush=True)
 
 
+def _record(options: argparse.Namespace) -> None:
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.processes.lcm_network import open_lcm
+    from dvrk_drake.processes.live_line import LiveLine
+    from dvrk_drake.processes.recorder import Recorder
+    from dvrk_drake.processes.simulated_arm import stop_on_signals
+
+    recorder = Recorder(load_arm(options.arm), options.output, open_lcm(options.lcm_url).get_lcm_url())
+    line = LiveLine(sys.stderr)
+    try:
+        recorder.run(options.duration, stop_on_signals(), line.show)
+    finally:
+        line.clear()
+    print(f"{options.output}: {recorder.stream.num_taken} rows", flush=True)
+    print_notes(options.output, recorder.stream.notes())
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="dvrk-drake", description="Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."
@@ -269,16 +298,16 @@ def _parser() -> argparse.ArgumentParser:
     _add_recording(verb)
     verb.add_argument("--output", required=True, metavar="FILE.csv", help="columns tau1.., one row a row")
     verb.set_defaults(run=_predict)
-    verb = verbs.add_parser("convert", help="turn a public recording (team .mat, WPI 21-column CSV) into our CSV")
+    verb = verbs.add_parser("convert", help="turn a recording (LCM log, team .mat, WPI 21-column CSV) into our CSV")
     verb.add_argument("input", metavar="INPUT")
     verb.add_argument("output", metavar="OUTPUT.csv")
-    verb.add_argument("--format", choices=("team-mat", "wpi-csv"), help="default: detected")
+    verb.add_argument("--format", choices=("team-mat", "wpi-csv", "lcm-log"), help="default: detected")
     verb.add_argument("--variable", metavar="NAME", help="the .mat's variable, where several fit")
     verb.add_argument(
         "--rate", type=float, default=200.0, metavar="HZ", help="samples a second of the CSV; default: 200"
     )
     verb.add_argument(
-        "--arm", help="write joint coordinates of this arm, e.g. psm, instead of actuator coordinates (WPI)"
+        "--arm", help="e.g. psm; WPI: write its joint coordinates instead of the actuators'; LCM log: which arm"
     )
     verb.add_argument("--skip-invalid", action="store_true", help="leave out rows that are not numbers, and count them")
     verb.set_defaults(run=_convert)
@@ -297,6 +326,17 @@ def _parser() -> argparse.ArgumentParser:
     _add_gravity(verb)
     verb.set_defaults(run=_arm)
 
+    verb = verbs.add_parser(
+        "record", help="record an arm over LCM; whatever ends it, the file is whole up to its last row"
+    )
+    verb.add_argument("output", metavar="OUTPUT", help="a new file: .csv, or .log for an LCM log")
+    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
+    verb.add_argument(
+        "--duration", type=seconds, default=float("inf"), metavar="S", help="from the first status; default: to Ctrl-C"
+    )
+    verb.add_argument("--lcm-url", default="", metavar="URL", help="default: LCM_DEFAULT_URL, or LCM's own")
+    verb.set_defaults(run=_record)
+
     verb = verbs.add_parser("demo", help="simulate an arm, identify it, compensate it, hold it; writes a folder")
     verb.add_argument("--output", default="demo_output", metavar="DIR", help="default: demo_output")
     verb.add_argument("--arm", choices=("mtml", "mtmr", "psm"), default="mtml", help="default: mtml")
@@ -311,7 +351,9 @@ _model_help = (
 
 
 def _add_recording(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument("recording", metavar="RECORDING.csv", help="header with q1..qn, tau1..taun; t, qd1.. optional")
+    verb.add_argument(
+        "recording", metavar="RECORDING", help="CSV with header q1..qn, tau1..taun; t, qd1.. optional; or an LCM log"
+    )
     verb.add_argument(
         "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
     )

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import importlib
 import logging
+import math
 import os
 import signal
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -69,6 +71,23 @@ def seed(text: str) -> int:
     if not text.isdigit():
         raise argparse.ArgumentTypeError(f'"{text}" is not a whole number from 0')
     return int(text)
+
+
+def seconds(text: str) -> float:
+    """A time above 0, for argparse."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f'"{text}" is not a number of seconds above 0')
+    return value
+
+
+def print_notes(path: str, notes: Sequence[str]) -> None:
+    """Says on stderr what a user must know of a recording, a line each."""
+    for note in notes:
+        print(f"dvrk-drake: note: {path}: {note}", file=sys.stderr)
 
 
 class ProgressBar:

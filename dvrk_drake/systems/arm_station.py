@@ -239,7 +239,7 @@ class ArmStation(Diagram):
         """Takes the collision shapes out if no two of them may touch: they would cost a sixth of a step for nothing."""
         if self._scene_graph.model_inspector().GetCollisionCandidates():
             return
-        plant = self._plant
+        plant = self.plant
         for body in map(plant.get_body, plant.GetBodyIndices(self._instance)):
             for shape in plant.GetCollisionGeometriesForBody(body):
                 self._scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
