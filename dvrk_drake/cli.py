@@ -74,7 +74,7 @@ def _model(options: argparse.Namespace) -> None:
 
 def _identify(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_identification
-    from dvrk_drake.analysis.slow_parts import slow_parts
+    from dvrk_drake.analysis.poses import find_poses
     from dvrk_drake.analysis.static_identification import identify_static
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_model
     from dvrk_drake.models.arm import load_arm
@@ -84,15 +84,14 @@ def _identify(options: argparse.Namespace) -> None:
     recording = read_recording(options.recording, arm, options.coordinates)
     print_notes(options.recording, recording.notes)
     check_output(options.output, options.recording)
-    measured = None
-    if options.slow_parts:
-        recording.check_fits(arm)
-        recording, measured = slow_parts(recording, arm)
+    console = make_console()
+    recording, measured, note = find_poses(recording, arm, options.slow_parts)
+    if note:
+        console.print(note)
     with ProgressBar("identifying") as (progress, task):
         result = identify_static(
             recording, arm, options.method, lambda share: progress.update(task, completed=100 * share), measured
         )
-    console = make_console()
     print_doubts(console, result.doubts)
     print_model(console, result.model)
     if len(result.recording) < len(recording):
@@ -108,7 +107,7 @@ def _identify(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_validation
-    from dvrk_drake.analysis.slow_parts import slow_parts
+    from dvrk_drake.analysis.poses import find_poses
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
     from dvrk_drake.analysis.validation import validate
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -122,10 +121,9 @@ def _validate(options: argparse.Namespace) -> None:
     if options.json is not None:
         check_output(options.json, options.recording, options.model)
     console = make_console()
-    measured = None
-    if options.slow_parts:
-        recording.check_fits(arm)
-        recording, measured = slow_parts(recording, arm)
+    recording, measured, note = find_poses(recording, arm, options.slow_parts)
+    if note:
+        console.print(note)
     if motion := recording.motion(arm):
         console.print(
             f"the arm moves in this recording ({motion}): the model holds poses, and "
@@ -281,7 +279,7 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("--output", required=True, metavar="MODEL.yaml", help="the model file to write")
     verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="default: robust")
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
-    verb.add_argument("--slow-parts", action="store_true", help="of a motion, take where a joint is slow as poses")
+    verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
     _add_gravity(verb)
     verb.set_defaults(run=_identify)
 
@@ -289,7 +287,7 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("model", metavar="MODEL.yaml")
     _add_recording(verb)
     verb.add_argument("--json", metavar="FILE", help="write the errors as JSON")
-    verb.add_argument("--slow-parts", action="store_true", help="of a motion, compare where a joint is slow")
+    verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.set_defaults(run=_validate)
 
@@ -348,6 +346,7 @@ def _parser() -> argparse.ArgumentParser:
 _model_help = (
     "Prints the base parameters; with --latex, --python or --c the gravity torque and its regressor as source."
 )
+_slow_parts_help = "of a motion without rests, take where a joint is slow as poses"
 
 
 def _add_recording(verb: argparse.ArgumentParser) -> None:
