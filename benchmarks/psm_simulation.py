@@ -2,16 +2,16 @@
 
     python benchmarks/psm_simulation.py [--json FILE] [--repetitions N] [--seconds S]
 
-All rows are the same arm under GravityPidController at 1 kHz, which moves all joints along one smooth motion through the
-joint box; nothing is published and it runs as fast as it can. Repetitions are interleaved, so that a busy machine slows
+All rows are the same arm under GravityPidController at 1 kHz, which moves all joints along one smooth motion; nothing
+is published and it runs as fast as it can. Repetitions are interleaved, so that a busy machine slows
 all rows alike. The real-time factor is simulated time over CPU time of this process (one thread: on a core of its own
 that is wall time), median over the repetitions.
 
 Rows:
     ball         ArmStation with both loops pinned; SAP at 1 ms.
     mimic        The same station as a tree whose joints are coupled.
-    open         The seven joints alone, without any constraint: end link hinged on the yaw link at the remote centre, no
-                 linkage, no counterweight, fingers as one. Its gravity is not the controller's; the integrator takes it.
+    open         The seven joints alone, without any constraint: end link hinged on the yaw link at the remote centre,
+                 no linkage and counterweight, fingers as one; the controller's gravity is not its.
     cenic_mimic  A continuous plant with couplings under Drake's error-controlled CENIC, accuracy 1e-4; the controller's
     cenic_ball   samples bound its steps, so that none is longer than 1 ms. The second has its loops pinned.
     free_mimic   CENIC with couplings and no controller: the arm falls, and CENIC chooses its steps. For its steps only.
@@ -101,9 +101,11 @@ class StationRow:
         self.simulator = Simulator(self.diagram)
 
     def set_start(self, root: Context, q: np.ndarray) -> None:
+        """Puts the arm at q, at rest."""
         self.station.set_positions(self.station.GetMyMutableContextFromRoot(root), q)
 
     def get_positions(self, root: Context) -> np.ndarray:
+        """Pose of the seven joints."""
         return self.station.get_positions(self.station.GetMyContextFromRoot(root))
 
 
@@ -135,9 +137,11 @@ class CenicRow:
         self.simulator.get_mutable_integrator().set_target_accuracy(1e-4)
 
     def set_start(self, root: Context, q: np.ndarray) -> None:
+        """Puts the arm at q, at rest."""
         set_arm_positions(self.plant, self.plant.GetMyMutableContextFromRoot(root), ARM, q)
 
     def get_positions(self, root: Context) -> np.ndarray:
+        """Pose of the seven joints."""
         context = self.plant.GetMyContextFromRoot(root)
         return np.array([self.plant.GetJointByName(name).GetOnePosition(context) for name in ARM.joint_names])
 

@@ -8,15 +8,20 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
+from dvrk_drake.cli_lcm import add_arm
+from dvrk_drake.cli_record import add_record
+from dvrk_drake.cli_simulate import add_simulate
 from dvrk_drake.cli_support import (
     ProgressBar,
+    add_gravity,
     check_output,
     import_interruptibly,
     made_folder,
+    mounted,
     print_notes,
     quiet_drake,
-    seconds,
     seed,
+    until_stopped,
 )
 from dvrk_drake.errors import DvrkDrakeError
 
@@ -54,7 +59,7 @@ def _model(options: argparse.Namespace) -> None:
         if options.format is None:
             raise DvrkDrakeError("--output needs to know what to write: --latex, --python or --c")
         check_output(options.output)
-    arm = _mounted(load_arm(options.arm), options.gravity)
+    arm = mounted(load_arm(options.arm), options.gravity)
     gravity = derive_gravity(arm, options.frames, options.serial)
     writers = {
         "latex": lambda gravity: export.to_latex(gravity, SymbolicPlant(arm, options.frames).frame_poses()),
@@ -80,7 +85,7 @@ def _identify(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.recording import read_recording
 
-    arm = _mounted(load_arm(options.arm), options.gravity)
+    arm = mounted(load_arm(options.arm), options.gravity)
     recording = read_recording(options.recording, arm, options.coordinates)
     print_notes(options.recording, recording.notes)
     check_output(options.output, options.recording)
@@ -177,8 +182,6 @@ def _convert(options: argparse.Namespace) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    import time
-
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.systems.arm_view import ArmView, start_meshcat
     from dvrk_drake.systems.camera import framing
@@ -188,13 +191,34 @@ def _view(options: argparse.Namespace) -> None:
     meshcat = start_meshcat(*framing(arm), port=options.port)
     view = ArmView(arm, meshcat)
     view.add_sliders()
-    meshcat.AddButton("Stop", "Escape")
     print(
         f"{arm.name} at {meshcat.web_url()}; sliders under Open Controls; end with Stop, Escape or Ctrl-C", flush=True
     )
-    while meshcat.GetButtonClicks("Stop") == 0:
-        view.follow_sliders()
-        time.sleep(0.03)
+    until_stopped(meshcat, view.follow_sliders)
+
+
+def _teleop(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.tables import make_console, print_teleoperation
+    from dvrk_drake.analysis.teleoperation_demo import play_teleoperation, run_live_teleoperation, start_scene
+    from dvrk_drake.models.atomic_file import atomic_write
+
+    quiet_drake()
+    if options.html is None:
+        meshcat = start_scene(options.port)
+        print(
+            f"MTML leads PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale under Open Controls; the "
+            "arms appear after some seconds; end with Stop, Escape or Ctrl-C",
+            flush=True,
+        )
+        run_live_teleoperation(meshcat)
+        return
+    check_output(options.html)
+    meshcat = start_scene(options.port)
+    with ProgressBar("playing") as (progress, task):
+        result = play_teleoperation(meshcat, progress=lambda share: progress.update(task, completed=100 * share))
+    with atomic_write(options.html) as stream:
+        stream.write(meshcat.StaticHtml())
+    print_teleoperation(make_console(), result, options.html)
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -213,48 +237,6 @@ def _demo(options: argparse.Namespace) -> None:
     print_demo(make_console(), result, options.output)
 
 
-def _arm(options: argparse.Namespace) -> None:
-    from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.processes.lcm_network import open_lcm
-    from dvrk_drake.processes.pace import make_realtime, settle_memory
-    from dvrk_drake.processes.simulated_arm import SimulatedArm, load_driver, start_pose, stop_on_signals
-    from dvrk_drake.systems.arm_view import start_meshcat
-    from dvrk_drake.systems.dvrk_driver import DvrkDriver
-
-    quiet_drake()
-    arm = _mounted(load_arm(options.arm), options.gravity)
-    driver = DvrkDriver() if options.driver is None else load_driver(options.driver)
-    pose = start_pose(arm, options.pose)
-    network = open_lcm(options.lcm_url or driver.lcm_url)
-    meshcat = start_meshcat() if options.meshcat else None
-    simulated = SimulatedArm(arm, driver, network, pose, meshcat)
-    stopped = stop_on_signals()
-    if options.realtime and (warning := make_realtime()):
-        print(f"dvrk-drake: warning: {warning}", file=sys.stderr)
-    settle_memory()
-    where = f"; {meshcat.web_url()}" if meshcat else ""
-    print(f"simulated {arm.name} on LCM {network.get_lcm_url()}{where}; end with Ctrl-C", flush=True)
-    pace = simulated.run(stopped, lambda line: print(line, flush=True))
-    print(f"ended; {pace.late} ticks began more than a period late", flush=True)
-
-
-def _record(options: argparse.Namespace) -> None:
-    from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.processes.lcm_network import open_lcm
-    from dvrk_drake.processes.live_line import LiveLine
-    from dvrk_drake.processes.recorder import Recorder
-    from dvrk_drake.processes.simulated_arm import stop_on_signals
-
-    recorder = Recorder(load_arm(options.arm), options.output, open_lcm(options.lcm_url).get_lcm_url())
-    line = LiveLine(sys.stderr)
-    try:
-        recorder.run(options.duration, stop_on_signals(), line.show)
-    finally:
-        line.clear()
-    print(f"{options.output}: {recorder.stream.num_taken} rows", flush=True)
-    print_notes(options.output, recorder.stream.notes())
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="dvrk-drake", description="Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."
@@ -270,7 +252,7 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("--frames", default="dh", help="link frames of the parameters: dh (dVRK) or paper (Table I)")
     verb.add_argument("--serial", action="store_true", help="leave out the links of the linkage, as the paper does")
     verb.add_argument("--output", metavar="FILE", help="write to a file instead of standard output")
-    _add_gravity(verb)
+    add_gravity(verb)
     verb.set_defaults(run=_model)
 
     verb = verbs.add_parser("identify", help="identify a model from a recording of poses and holding torques")
@@ -280,7 +262,7 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="default: robust")
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
-    _add_gravity(verb)
+    add_gravity(verb)
     verb.set_defaults(run=_identify)
 
     verb = verbs.add_parser("validate", help="compare a model with a recording that it was not made from")
@@ -314,26 +296,17 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("--port", type=int, help="of the page; default: a free one")
     verb.set_defaults(run=_view)
 
-    verb = verbs.add_parser("arm", help="play an arm behind LCM: a simulated one with a hardware driver's safeguards")
-    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
-    verb.add_argument("--driver", metavar="FILE.yaml", help="configuration of its driver, fields as in DvrkDriver")
-    verb.add_argument("--lcm-url", metavar="URL", help="default: the driver's, or LCM_DEFAULT_URL, or LCM's own")
-    verb.add_argument("--pose", nargs="+", type=float, metavar="Q", help="where it starts [rad, m]; default: near zero")
-    verb.add_argument("--meshcat", action="store_true", help="draw it in a browser")
-    verb.add_argument("--realtime", action="store_true", help="real-time scheduling, or a warning where not permitted")
-    _add_gravity(verb)
-    verb.set_defaults(run=_arm)
-
+    add_arm(verbs)
+    add_record(verbs)
+    add_simulate(verbs)
     verb = verbs.add_parser(
-        "record", help="record an arm over LCM; whatever ends it, the file is whole up to its last row"
+        "teleop", help="simulate a master arm that leads a PSM, with your hand on sliders or a played one"
     )
-    verb.add_argument("output", metavar="OUTPUT", help="a new file: .csv, or .log for an LCM log")
-    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
     verb.add_argument(
-        "--duration", type=seconds, default=float("inf"), metavar="S", help="from the first status; default: to Ctrl-C"
+        "--html", metavar="FILE", help="play a hand, write the recording and say how well the PSM followed"
     )
-    verb.add_argument("--lcm-url", default="", metavar="URL", help="default: LCM_DEFAULT_URL, or LCM's own")
-    verb.set_defaults(run=_record)
+    verb.add_argument("--port", type=int, help="of the page; default: a free one")
+    verb.set_defaults(run=_teleop)
 
     verb = verbs.add_parser("demo", help="simulate an arm, identify it, compensate it, hold it; writes a folder")
     verb.add_argument("--output", default="demo_output", metavar="DIR", help="default: demo_output")
@@ -356,22 +329,6 @@ def _add_recording(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
     )
-
-
-def _add_gravity(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "--gravity",
-        nargs=3,
-        type=float,
-        metavar=("X", "Y", "Z"),
-        help="gravity in the arm's base frame [m/s^2], for other mountings; default: the arm's file, 0 0 -9.81",
-    )
-
-
-def _mounted(arm, gravity):
-    if gravity is None:
-        return arm
-    return arm.with_gravity(gravity)
 
 
 if __name__ == "__main__":

@@ -10,13 +10,20 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from dvrk_drake.errors import DvrkDrakeError
+
+if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat
+
+    from dvrk_drake.models.arm import Arm
 
 
 def import_interruptibly() -> None:
@@ -66,6 +73,14 @@ def made_folder(path: str) -> Path:
     return Path(path)
 
 
+def until_stopped(meshcat: Meshcat, meanwhile: Callable[[], object] = lambda: None) -> None:
+    """Serves a Meshcat page until its Stop button or Escape is pressed; `meanwhile` is called all the time."""
+    meshcat.AddButton("Stop", "Escape")
+    while meshcat.GetButtonClicks("Stop") == 0:
+        meanwhile()
+        time.sleep(0.03)
+
+
 def seed(text: str) -> int:
     """A whole number from 0, for argparse."""
     if not text.isdigit():
@@ -88,6 +103,24 @@ def print_notes(path: str, notes: Sequence[str]) -> None:
     """Says on stderr what a user must know of a recording, a line each."""
     for note in notes:
         print(f"dvrk-drake: note: {path}: {note}", file=sys.stderr)
+
+
+def add_gravity(verb: argparse.ArgumentParser) -> None:
+    """Adds the option --gravity."""
+    verb.add_argument(
+        "--gravity",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="gravity in the arm's base frame [m/s^2], for other mountings; default: the arm's file, 0 0 -9.81",
+    )
+
+
+def mounted(arm: Arm, gravity: list[float] | None) -> Arm:
+    """The arm as --gravity says that it is mounted."""
+    if gravity is None:
+        return arm
+    return arm.with_gravity(gravity)
 
 
 class ProgressBar:

@@ -27,3 +27,7 @@ class ControllerError(DvrkDrakeError):
 
 class StationError(DvrkDrakeError):
     """A station that cannot be built or used as asked."""
+
+
+class ScenarioError(DvrkDrakeError):
+    """A scenario that cannot be read or simulated."""

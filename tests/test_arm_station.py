@@ -16,9 +16,10 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import tree_selector
-from dvrk_drake.systems.arm_station import ArmStation, station_ports
+from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.station_ports import station_ports
 
 ARM = load_arm("mtml")
 MODEL = IdentifiedModel.from_arm(ARM)
@@ -312,7 +313,7 @@ def test_meshcat_is_given_the_arm():
     meshcat = Meshcat()
     diagram = ArmStation(ARM, meshcat=meshcat)
     diagram.ForcedPublish(diagram.CreateDefaultContext())
-    assert meshcat.HasPath("/drake/visualizer")
+    assert meshcat.HasPath("/drake/mtml/links")
 
 
 def test_two_stations_in_one_diagram_and_again():

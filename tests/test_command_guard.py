@@ -394,7 +394,7 @@ def test_a_soft_wall_turns_outward_effort_inward_before_each_limit(row, side):
     command = np.where(a != 0, side * np.sign(a) * LIMIT, 0.0)
 
     def settled(depth, rate=0.0):
-        """Effort after the rate limit has run out, at `depth` margins into the wall."""
+        """Effort and flags at `depth` margins into the wall."""
         q = Q.copy()
         # The sum of joints 2 and 3 stays in the middle of its range, unless it is the limit in question.
         q[1:3] = {
@@ -405,10 +405,7 @@ def test_a_soft_wall_turns_outward_effort_inward_before_each_limit(row, side):
             (7, -1): (0.0, -0.6),
         }.get((row, side), (0.2, 0.0))
         q[joints[0]] += (bound - side * (1 - depth) * limits.margin[row] - a @ q) / a[joints[0]]
-        effort = np.zeros(N)
-        for _ in range(50):
-            effort, flags = limits.limit_effort(command, effort, q, rate * side * a, 1e-3)
-        return effort, flags
+        return limits.restrain_effort(command, q, rate * side * a)
 
     effort, flags = settled(-0.01)
     np.testing.assert_allclose(effort, command)
@@ -416,9 +413,14 @@ def test_a_soft_wall_turns_outward_effort_inward_before_each_limit(row, side):
     effort, flags = settled(0.25)
     assert np.all(effort[joints] * command[joints] < LIMIT[joints] ** 2)
     assert np.all(flags[joints] == (Status.FLAG_COUPLED_LIMIT if row >= N else Status.FLAG_POSITION_LIMIT))
-    for depth, rate in ((0.5, 0.0), (1.0, 0.0), (0.01, 2.0)):
-        effort, _ = settled(depth, rate)
-        assert np.all(effort[joints] * np.sign(command[joints]) <= 1e-12)  # nothing outward is left
+    effort, _ = settled(0.5)
+    assert np.all(effort[joints] * np.sign(command[joints]) <= 1e-12)  # nothing outward is left
+    effort, _ = settled(1.0)
+    np.testing.assert_allclose(effort, -command)
+    # One margin before the wall, but there within Kd/Kp at this speed.
+    seconds = max(np.divide(ARM.gains.kd, ARM.gains.kp)[joints])
+    effort, _ = settled(-1.0, 2 * limits.margin[row] / (seconds * (a @ a)))
+    np.testing.assert_allclose(effort, -command)
     # It never pulls: on the way out it lets go.
     effort, _ = settled(0.9, -2.0)
     np.testing.assert_allclose(effort, command)
@@ -501,7 +503,7 @@ def test_fuzz_never_an_unlimited_output(seed):
     bench = Bench()
     limits = bench.guard.limits
     states, codes = set(), set()
-    last_effort, last_mode = None, Command.HOLD
+    last_effort, last_flags, last_mode = None, None, Command.HOLD
     for k in range(10_000):
         if k % 700 == 0 and bench.guard.state != Status.STATE_EFFORT:
             # Now and then a good start, so that the fuzz also meets a guard that acts.
@@ -544,8 +546,9 @@ def test_fuzz_never_an_unlimited_output(seed):
         if output.control_mode != Command.EFFORT:
             assert not np.any(output.effort)
         elif last_mode == Command.EFFORT:
-            assert np.all(np.abs(output.effort - last_effort) <= LIMIT / 20 * (1 + 1e-9))
-        last_effort, last_mode = output.effort, output.control_mode
+            free = ((output.joint_flags | last_flags) & ~(Status.FLAG_EFFORT_CLAMPED | Status.FLAG_RATE_LIMITED)) == 0
+            assert np.all(np.abs(output.effort - last_effort)[free] <= LIMIT[free] / 20 * (1 + 1e-9))
+        last_effort, last_flags, last_mode = output.effort, output.joint_flags, output.control_mode
     assert {Status.STATE_OFF, Status.STATE_HOLD, Status.STATE_EFFORT, Status.STATE_FAULT} <= states
     assert len(codes) > 10
 

@@ -31,10 +31,10 @@ START = 10**15
 class SimulatedArm:
     """A simulated arm behind LCM, and what it said."""
 
-    def __init__(self, lcm, name="mtml", driver=None):
+    def __init__(self, lcm, name="mtml", driver=None, modify_plant=None):
         self.arm = load_arm(name)
         builder = DiagramBuilder()
-        self.station = builder.AddSystem(ArmStation(self.arm))
+        self.station = builder.AddSystem(ArmStation(self.arm, modify_plant=modify_plant))
         apply_driver_config(driver or DvrkDriver(), self.station, lcm, builder, start_utime=START)
         self.statuses = []
         lcm.Subscribe(f"DVRK_STATUS_{self.arm.name}", lambda data: self.statuses.append(Status.decode(data)))
@@ -181,6 +181,48 @@ def test_a_fault_is_reset_through_the_sender():
     assert arm.statuses[-1].guard_state == Status.STATE_HOLD
 
 
+def without_stops(plant):
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        if joint.num_positions() == 1:
+            joint.set_position_limits([-np.inf], [np.inf])
+
+
+def pushed(name, push, seconds):
+    """Furthest way beyond any limit [guard's margins], under efforts that ramp to `push` in 0.2 s; last status."""
+    lcm = DrakeLcm("memq://")
+    arm = SimulatedArm(lcm, name, modify_plant=without_stops)
+    A, lower, upper = arm.arm.limit_matrix()
+    held = IdentifiedModel.from_arm(arm.arm).holding_torque(POSES[name])
+    sender = Sending(lcm, arm.arm, effort=held)
+    run(lcm, 300, arm, sender)
+    worst = -np.inf
+    for k in range(round(1e3 * seconds)):
+        sender.fix("effort", held + (push - held) * min(1.0, k / 200))
+        run(lcm, 1, arm, sender)
+        c = A @ np.array(arm.statuses[-1].position)
+        worst = max(worst, *(np.maximum(c - upper, lower - c) / np.minimum(0.05, 0.05 * (upper - lower))))
+    return worst, arm.statuses[-1]
+
+
+@pytest.mark.parametrize(("name", "row"), [("mtml", k) for k in range(8)] + [("psm", k) for k in range(7)])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_all_the_effort_that_motors_have_pushes_no_joint_beyond_its_limit(name, row, side):
+    # Neither friction nor damping nor a stop of the plant helps: the soft wall does it alone.
+    arm = load_arm(name)
+    push = side * np.sign(arm.limit_matrix()[0][row]) * arm.effort_limits
+    worst, status = pushed(name, push, 0.6)
+    assert worst < 0.5  # beyond half of the wall's width is a fault
+    assert (status.guard_state, status.fault_text) == (Status.STATE_EFFORT, "")
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_a_limp_arm_falls_into_the_soft_wall(name):
+    worst, status = pushed(name, np.zeros(7), 2.0)
+    assert worst < 0.5
+    assert status.guard_state == Status.STATE_EFFORT
+
+
 def test_off_lets_the_arm_fall():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm)
@@ -194,11 +236,11 @@ def test_off_lets_the_arm_fall():
 class Sending:
     """A DvrkCommandSender that answers each status, with fixed inputs."""
 
-    def __init__(self, lcm, **inputs):
-        self.sender = DvrkCommandSender(ARM)
+    def __init__(self, lcm, arm=ARM, **inputs):
+        self.arm, self.sender = arm, DvrkCommandSender(arm)
         self.context = self.sender.CreateDefaultContext()
         self.lcm, self.status, self.ticks = lcm, Status(), 0
-        lcm.Subscribe("DVRK_STATUS_MTML", self.hear)
+        lcm.Subscribe(f"DVRK_STATUS_{arm.name}", self.hear)
         for name, value in inputs.items():
             self.fix(name, value)
 
@@ -218,7 +260,7 @@ class Sending:
     def step(self):
         self.ticks += 1
         self.context.SetTime(1e-3 * self.ticks)
-        self.lcm.Publish("DVRK_COMMAND_MTML", self.command().encode())
+        self.lcm.Publish(f"DVRK_COMMAND_{self.arm.name}", self.command().encode())
 
 
 def test_the_sender_asks_for_a_hold_unless_it_is_given_finite_numbers():

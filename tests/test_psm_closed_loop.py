@@ -97,7 +97,7 @@ def test_pins_give_the_same_motion_torque_and_inertia_as_the_couplings():
 def test_same_torques_move_both_alike(q):
     """Holding torque and more, different at every joint, for half a second without control: about 1 rad/s."""
     phase = np.arange(N)
-    push = 0.05 * np.array([1.0, 1.0, 6.0, 0.003, 0.006, 0.015, 0.004])
+    push = 0.05 * np.array([2.0, 2.0, 6.0, 0.003, 0.006, 0.015, 0.004])
     runs = {}
     for closure in ("mimic", "ball"):
         station = ArmStation(ARM, closure=closure)
@@ -175,3 +175,25 @@ def test_held_poses_all_over_the_box_keep_the_remote_centre(closure):
         worst = gaps(station.plant, station.GetSubsystemContext(station.plant, context))
         assert np.all(worst < 1e-7)
         assert np.abs(station.get_positions(context) - q).max() < 5e-6
+
+
+@pytest.mark.parametrize("closure", ["mimic", "ball"])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_full_effort_against_every_stop_moves_neither_linkage_nor_remote_centre(closure, sign):
+    """A stop acts on the leading joint; what follows it, the counterweight above all, must stop as well."""
+    station = ArmStation(ARM, closure=closure)
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    inset = 0.02 * (ARM.position_upper - ARM.position_lower)
+    stop = ARM.position_upper if sign > 0 else ARM.position_lower
+    station.set_positions(context, stop - sign * inset)
+    station.GetInputPort("psm.effort_commanded").FixValue(context, sign * ARM.effort_limits)
+    plant, select = station.plant, tree_selector(station.plant, ARM)
+    plant_context = station.GetSubsystemContext(plant, context)
+    for t in np.arange(0.002, 0.5, 0.002):
+        simulator.AdvanceTo(t)
+        q = station.get_positions(context)
+        assert np.all(gaps(plant, plant_context) < 2e-7)  # measured 6e-8
+        follows = np.abs(plant.GetPositions(plant_context)[select] - ARM.linkage.position(q))
+        assert follows.max() < 2e-5  # measured 7e-6 rad on the light finger as it stops, 4e-7 elsewhere
+    assert np.abs(q - stop).max() < 1e-5

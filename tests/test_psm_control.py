@@ -95,7 +95,7 @@ def test_a_step_of_each_joint_settles_within_a_second(gravity_factor):
 
 
 def test_a_step_settles_on_an_arm_with_three_times_the_inertia():
-    """Identified inertias of real arms are several times those of the SDF; here the gravity model knows, to 20 %."""
+    """The inertia of a real arm is up to twice that of the SDF; here three times, and the gravity model knows to 20 %."""
     bench = Bench(gravity_factor=0.8 * 3, inertia_factor=3)
     # Its weight is beyond the effort limits in a third of the box: poses where the motors have something left.
     poses = ARM.sample_poses(200, np.random.default_rng(5), margin=0.1)
@@ -118,7 +118,7 @@ def test_a_saturating_step_does_not_wind_up():
         assert np.all(np.any(saturated, axis=0)[:3])
         # Forward, brake: no chatter.
         assert np.all(np.count_nonzero(np.diff(saturated.astype(int), axis=0) > 0, axis=0) <= 2)
-        assert not np.any(saturated[t > 0.7])
+        assert not np.any(saturated[t > 1.0])  # 2.3 rad take 0.7 s at the largest torque
         assert np.all(np.abs(q[t > 1.5] - goal) < SETTLED)
         overshoot[integral] = np.max((q - goal) / (goal - start), axis=0)
     assert np.all(overshoot[True] < overshoot[False] + 0.02), "what overshoots is the late brake, not the integrator"

@@ -18,9 +18,6 @@ MODELS: dict[str, Callable[[Path], dict[str, Callable[[], Body]]]] = {
     "large_needle_driver": needle_driver_shapes.bodies,
 }
 
-# The MTM's files keep the name of the script that first wrote them: made again they are the same, byte for byte.
-GENERATOR = {"mtm": "tools/make_mtm_meshes.py"}
-
 
 def main() -> None:
     """Write one file per link."""
@@ -35,7 +32,7 @@ def main() -> None:
         for link, body in MODELS[model](SDF_FOLDER / f"{model}.sdf").items():
             if not options.link or link in options.link:
                 path = folder / f"{link}.gltf"
-                write_gltf(body(), path, GENERATOR.get(model, "tools/make_meshes.py"))
+                write_gltf(body(), path)
                 print(f"{model}/{path.name:28} {path.stat().st_size / 1000:6.0f} kB")
 
 

@@ -3,7 +3,7 @@
 import shutil
 import subprocess
 import tempfile
-from argparse import ArgumentParser
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from pydrake.geometry import Meshcat, Role
@@ -29,11 +29,11 @@ CHROMIUM_FLAGS = (
 HIDE_PANEL = "<style>.dg, #status-message, #stats-plot { display: none !important; }</style>"
 
 
-def picture(meshcat: Meshcat, file: Path, width: int, height: int, chromium: str) -> None:
-    """Let Chromium draw the scene, from a page that needs no server."""
+def picture(html: str, file: Path, width: int, height: int, chromium: str) -> None:
+    """Let Chromium draw a page that Meshcat has written, one that needs no server."""
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / "scene.html"
-        page.write_text(meshcat.StaticHtml().replace("</head>", HIDE_PANEL + "</head>", 1))
+        page.write_text(html.replace("</head>", HIDE_PANEL + "</head>", 1))
         command = [
             chromium,
             *CHROMIUM_FLAGS,
@@ -52,6 +52,7 @@ def main() -> None:
     """Read the options and write the picture."""
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path, help="PNG to write")
+    parser.add_argument("--page", type=Path, help="a page that Meshcat has written, instead of an arm")
     parser.add_argument("--arm", default="mtml", help="which arm")
     parser.add_argument(
         "--pose", nargs="+", type=float, default=[0.0] * 7, metavar="q", help="independent joints, rad or m"
@@ -63,12 +64,18 @@ def main() -> None:
     parser.add_argument("--size", nargs=2, type=int, default=[1200, 900], metavar="pixels", help="width, height")
     parser.add_argument("--chromium", default=shutil.which("chromium") or "chromium", help="the browser")
     options = parser.parse_args()
+    html = options.page.read_text() if options.page else scene(options).StaticHtml()
+    picture(html, options.file, *options.size, options.chromium)
+
+
+def scene(options: Namespace) -> Meshcat:
+    """The arm at its pose."""
     role = Role.kProximity if options.collision else Role.kIllustration
     arm = load_arm(options.arm)
     camera, target = framing(arm)
     meshcat = start_meshcat(options.camera or camera, options.target or target, options.zoom)
     ArmView(arm, meshcat, role).show(options.pose)
-    picture(meshcat, options.file, *options.size, options.chromium)
+    return meshcat
 
 
 if __name__ == "__main__":

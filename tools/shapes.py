@@ -163,11 +163,8 @@ def joined(solids: Sequence[cad.Shape]) -> tuple[np.ndarray, np.ndarray, np.ndar
     return np.vstack([p for p, _, _ in parts]), np.vstack([n for _, n, _ in parts]), np.vstack(triangles)
 
 
-def write_gltf(body: Body, path: Path, generator: str) -> None:
-    """Write a body as one .gltf file in metres, Y up as the format asks (Drake turns it to Z up).
-
-    `generator` is what the file names as its maker.
-    """
+def write_gltf(body: Body, path: Path) -> None:
+    """Write a body as one .gltf file in metres, Y up as the format asks (Drake turns it to Z up)."""
     data, views, accessors, meshes, materials = bytearray(), [], [], [], []
     for name in dict.fromkeys(material for material, _ in body):
         points, normals, triangles = joined([solid for material, solid in body if material == name])
@@ -213,7 +210,7 @@ def write_gltf(body: Body, path: Path, generator: str) -> None:
         )
     uri = "data:application/octet-stream;base64," + b64encode(data).decode()
     document = {
-        "asset": {"version": "2.0", "generator": generator},
+        "asset": {"version": "2.0", "generator": "tools/make_meshes.py"},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))}],
         "nodes": [{"name": mesh["name"], "mesh": index} for index, mesh in enumerate(meshes)],

@@ -15,6 +15,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 
@@ -84,16 +85,8 @@ def collect_static_poses(
     name = arm.name.lower()
     trajectory, settled = visiting_trajectory(arm, poses)
     builder = DiagramBuilder()
-    builder.AddSystem(station)
-    controller = builder.AddSystem(GravityPidController(model))
-    desired = builder.AddSystem(TrajectorySource(trajectory, output_derivative_order=1))
-    builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
-    builder.Connect(station.GetOutputPort(f"{name}.state_estimated"), controller.GetInputPort("state_estimated"))
-    builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))
-    if effects is not None:
-        builder.AddSystem(effects)
-        builder.Connect(station.GetOutputPort(f"{name}.state_estimated"), effects.get_input_port())
-        builder.Connect(effects.get_output_port(), station.GetInputPort(f"{name}.effort_disturbance"))
+    desired = TrajectorySource(trajectory, output_derivative_order=1)
+    add_closed_loop(builder, station, GravityPidController(model), desired, effects)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     prepare(station, context)

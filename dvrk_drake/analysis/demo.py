@@ -28,6 +28,7 @@ from dvrk_drake.models.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.arm_view import start_meshcat
 from dvrk_drake.systems.camera import framing
+from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 POSES, FRESH_POSES = 40, 15
@@ -175,14 +176,14 @@ def run_demo(
     )
     plot_positions(
         output / "release.png",
-        names,
+        arm,
         t,
         {"identified model": released, "model as drawn (SDF)": with_nominal},
         f"Held until {HELD_UNTIL} s, released under gravity compensation until {RELEASED_UNTIL} s, then driven home",
     )
     plot_positions(
         output / "step.png",
-        names,
+        arm,
         t_step,
         {"identified model": step},
         plan.step_title,
@@ -200,18 +201,10 @@ def run_demo(
 def _closed_loop(
     true_arm: TrueArm, model: IdentifiedModel, q_start: Sequence[float], meshcat: Meshcat | None
 ) -> tuple[Simulator, ArmStation, GravityPidController, ConstantVectorSource]:
-    name = true_arm.arm.name.lower()
+    station, controller = true_arm.station(meshcat), GravityPidController(model)
+    desired = ConstantVectorSource(_at_rest(q_start))
     builder = DiagramBuilder()
-    station = builder.AddSystem(true_arm.station(meshcat))
-    controller = builder.AddSystem(GravityPidController(model))
-    effects = builder.AddSystem(true_arm.effect_torque())
-    desired = builder.AddSystem(ConstantVectorSource(_at_rest(q_start)))
-    state = station.GetOutputPort(f"{name}.state_estimated")
-    builder.Connect(state, controller.GetInputPort("state_estimated"))
-    builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
-    builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))
-    builder.Connect(state, effects.get_input_port())
-    builder.Connect(effects.get_output_port(), station.GetInputPort(f"{name}.effort_disturbance"))
+    add_closed_loop(builder, station, controller, desired, true_arm.effect_torque())
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     true_arm.prepare(station, context)

@@ -16,6 +16,7 @@ from dvrk_drake.analysis.doubts import usable_measurements
 from dvrk_drake.analysis.static_identification import StaticIdentification
 from dvrk_drake.analysis.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.recording import Recording
 
@@ -125,9 +126,10 @@ def plot_validation(folder: Path, model: IdentifiedModel, validation: Validation
 
 
 def plot_positions(
-    path: Path, names: tuple[str, ...], t: NDArray[np.float64], curves: dict[str, NDArray[np.float64]], title: str
+    path: Path, arm: Arm, t: NDArray[np.float64], curves: dict[str, NDArray[np.float64]], title: str
 ) -> None:
-    """One panel a joint of positions over time: `curves` label -> (samples, n) [rad]; dashed from the second on."""
+    """One panel a joint of positions over time: `curves` label -> (samples, n) [rad, m]; dashed from the second on."""
+    names = arm.joint_names
     figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained")
     colours = [MODEL_COLOUR, MEASURED_COLOUR, "#edae49"]
     for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
@@ -137,7 +139,7 @@ def plot_positions(
         if high - low < 2e-3:  # A joint that stands still should look still.
             ax.set_ylim((low + high) / 2 - 1e-3, (low + high) / 2 + 1e-3)
         ax.set_title(f"J{j + 1} {name}", fontsize=10)
-        ax.set_ylabel("position [rad]", fontsize=8)
+        ax.set_ylabel(f"position [{'m' if arm.prismatic[j] else 'rad'}]", fontsize=8)
         ax.set_xlabel("time [s]", fontsize=8)
         ax.tick_params(labelsize=7)
         ax.grid(alpha=0.3)

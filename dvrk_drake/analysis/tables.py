@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -11,10 +12,12 @@ from rich.text import Text
 
 from dvrk_drake.analysis.demo import DemoResult
 from dvrk_drake.analysis.doubts import Doubt
+from dvrk_drake.analysis.simulation import Simulation
+from dvrk_drake.analysis.teleoperation_demo import TeleoperationResult
 from dvrk_drake.analysis.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm import Arm, load_arm
 
 TABLE_WIDTH = 112
 
@@ -91,6 +94,32 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
                 style="yellow",
                 soft_wrap=True,
             )
+
+
+def print_simulation(console: Console, simulation: Simulation, arm: Arm) -> None:
+    """Where each joint was and how far from where it was wanted, over all recorded samples."""
+    recording, desired = simulation.recording, simulation.desired
+    effort = np.abs(recording.measured_effort())
+    table = _table(
+        f"{arm.name}, simulated for {simulation.time[-1]:g} s [rad, N m; m, N if prismatic]",
+        "",
+        "start",
+        "end",
+        "largest error",
+        "error at the end",
+        "largest effort",
+        "effort limit",
+    )
+    for j, name in enumerate(arm.joint_names):
+        errors = ("-", "-")
+        if desired is not None:
+            error = np.abs(recording.q[:, j] - desired[:, j])
+            errors = (f"{error.max():.5f}", f"{error[-1]:.5f}")
+        q = recording.q[:, j]
+        table.add_row(
+            name, f"{q[0]:z.4f}", f"{q[-1]:z.4f}", *errors, f"{effort[:, j].max():.4f}", f"{arm.effort_limits[j]:.4f}"
+        )
+    console.print(table)
 
 
 def print_demo(console: Console, result: DemoResult, folder: str) -> None:
@@ -177,6 +206,25 @@ def print_validation(console: Console, validation: Validation) -> None:
             style="red" if worse else "",
         )
     console.print(table)
+
+
+def print_teleoperation(console: Console, result: TeleoperationResult, file: str) -> None:
+    """How well the tip followed."""
+    table = _table("Tip against handle", "", "RMS", "largest")
+    table.add_row(
+        escape("position [mm]"), f"{1e3 * result.rms_position_error:.3f}", f"{1e3 * result.max_position_error:.3f}"
+    )
+    table.add_row(
+        escape("rotation [mrad]"), f"{1e3 * result.rms_rotation_error:.2f}", f"{1e3 * result.max_rotation_error:.2f}"
+    )
+    console.print(table)
+    console.print(
+        "The error of the tip against the scaled way of the handle since the clutch closed, over "
+        f"{result.handle_path:.2f} m of it. With an open clutch the tip moved {1e3 * result.max_motion_held:.1g} mm. "
+        f"Open {file} in a browser.",
+        markup=False,
+        soft_wrap=True,
+    )
 
 
 def _table(title: str, *columns: str) -> Table:

@@ -86,6 +86,8 @@ class lcmt_dvrk_status(object):
     """ near or beyond a limit of this joint, and kept from it """
     FLAG_COUPLED_LIMIT = 8
     """ the same for a limit of a sum of joints that this one is in """
+    FLAG_SPEED_LIMIT = 16
+    """ faster than allowed while efforts act, and braked """
 
     def __init__(self):
         self.utime = 0

@@ -58,6 +58,12 @@ def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic"
     return plant
 
 
+def set_joint_damping(plant: MultibodyPlant, arm: Arm, damping: ArrayLike) -> None:
+    """Gives the independent joints viscous friction (n,) [N m s/rad; N s/m]; before the plant is finalized."""
+    for name, value in zip(arm.joint_names, np.asarray(damping, float), strict=True):
+        plant.GetJointByName(name).set_default_damping_vector([value])
+
+
 def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex | None = None) -> NDArray[np.int_]:
     """Index into the plant's q (and v: all joints have one degree of freedom) of each of `arm.tree_joint_names`."""
     joints = [plant.GetJointByName(name, instance) for name in arm.tree_joint_names]

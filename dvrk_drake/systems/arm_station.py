@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.geometry import Meshcat, MeshcatVisualizer, Role
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role
 from pydrake.lcm import DrakeLcmInterface
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
@@ -19,32 +18,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import Closure, add_arm, set_arm_positions, tree_selector
 from dvrk_drake.systems.arm_connection import connect_arm
 from dvrk_drake.systems.dvrk_driver import DvrkDriver
-
-
-@dataclass(frozen=True)
-class StationPorts:
-    """Name -> size of the ports that a station of one arm has, in simulation and on hardware alike."""
-
-    inputs: dict[str, int]
-    outputs: dict[str, int]
-
-
-def station_ports(arm: Arm) -> StationPorts:
-    """The ports of `arm`'s station, named like the fields of the iiwa's driver in Drake.
-
-    Prefixed with the arm's lower-case name; n numbers in the arm's order of joints [rad, rad/s, N m; m, m/s,
-    N].
-    """
-    n, name = arm.num_joints, arm.name.lower()
-    return StationPorts(
-        inputs={f"{name}.effort_commanded": n},
-        outputs={
-            f"{name}.position_measured": n,
-            f"{name}.velocity_estimated": n,
-            f"{name}.state_estimated": 2 * n,
-            f"{name}.effort_measured": n,
-        },
-    )
+from dvrk_drake.systems.station_ports import station_ports
 
 
 class ArmStation(Diagram):
@@ -105,7 +79,8 @@ class ArmStation(Diagram):
             arm: names the ports, and is the arm that controllers of this station know.
             hardware: the arm itself instead of its simulation: of the other arguments only `driver` and `lcm` count.
             time_step: of the plant [s].
-            meshcat: draws the arm there.
+            meshcat: draws the arm there, below the path of its lower-case name: `SetTransform("mtml", X_WB)` places
+            it.
             closure: how the linkage's loops are held, see `add_arm`.
             plant_arm: the arm that is simulated, `arm` by default: another mounting or SDF with the same
             joints.
@@ -165,12 +140,14 @@ class ArmStation(Diagram):
         self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=time_step)
         self._instance = add_arm(self.plant, true_arm, closure)
         if modify_plant is not None:
-            modify_plant(self._plant)
+            modify_plant(self.plant)
         self.plant.Finalize()
         self._drop_idle_shapes()
         self._set_default_pose()
         if meshcat is not None:
-            MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat)
+            # The visualizer deletes its prefix when it starts: one level down, so that a SetTransform stays.
+            parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
+            MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
         self._export_inputs(builder)
         self._export_outputs(builder)
 

@@ -284,6 +284,7 @@ class CommandGuard:
             return GuardOutput(lcmt_dvrk_command.POSITION, self._target.copy(), velocity, zero, flags)
         if self.state == lcmt_dvrk_status.STATE_EFFORT:
             wanted = np.asarray(command.effort)
-            self._last_effort, flags = self.limits.limit_effort(wanted, self._last_effort, q, self._v, dt)
-            return GuardOutput(lcmt_dvrk_command.EFFORT, q, zero, self._last_effort, flags)
+            self._last_effort, flags = self.limits.follow_effort(wanted, self._last_effort, dt)
+            effort, restrained = self.limits.restrain_effort(self._last_effort, q, self._v)
+            return GuardOutput(lcmt_dvrk_command.EFFORT, q, zero, effort, flags | restrained)
         return GuardOutput(lcmt_dvrk_command.HOLD, self._target.copy(), zero, zero, flags)

@@ -37,7 +37,7 @@ class DvrkDriver:
         """Checks the values; whoever sets them one by one, as yaml_load_typed does, calls it again.
 
         Raises:
-            StationError: an unknown control mode, or a period that is not positive or above 10 ms, or the guard's settings.
+            StationError: an unknown control mode, a period that is not positive or above 10 ms, or a guard's setting.
         """
         self.guard.check()
         if unknown := [mode for mode in self.control_modes if mode not in _MODES]:

@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 Flags = NDArray[np.int8]
 
-#: A limit that is approached at this many margins a second is met by all of the wall [1/s].
-_WALL_RATE = 20.0
-
 _ROUNDING = 1e-12
 
 
@@ -28,12 +25,14 @@ class GuardLimits:
     **Effort commands** meet a soft wall in the margin before each position limit lower <= A q <= upper, the joint box
     and the coupled limits alike: a spring and damper along the limit's own coordinate c = A_k q,
 
-        lambda = F_k clip(2 depth + rate / (20/s margin), 0, 1),  tau -= A_k' lambda,
+        lambda = 2 F_k clip(depth, 0, 1),  tau -= A_k' lambda,
 
-    depth from 0 at the margin's beginning to 1 at the limit, rate = dc/dt outward, F_k the effort that outweighs every
-    motor that can push along c. So at half of the margin no outward command is left, and at the limit all of it is
-    directed inward; the arm is never pulled, only pushed back. Without efforts (a falling arm) the wall pushes all the
-    same. The result is clamped and limited in rate.
+    F_k the effort that outweighs every motor that can push along c, and depth that of c + T_k dc/dt in the wall: 0
+    where the margin begins, 1 at the limit. So at half of the margin no outward command is left, and at the limit all
+    that the motors have is directed inward; what approaches fast is met earlier, by T_k, the ratio Kd/Kp of the joint's
+    position controller. The arm is never pulled, only pushed back. Without efforts (a falling arm) the wall pushes all
+    the same. Joints that are faster than they may be are braked: above 1.25 times the speed nothing drives them on.
+    Commands are clamped and limited in rate before; what the wall adds is not delayed.
 
     **Position commands** move a target that is limited in rate and never leaves the limits; a target that starts
     outside moves no further out.
@@ -52,6 +51,8 @@ class GuardLimits:
         self.speed = width[:n] / settings.traverse_time
         self._effort_rate = self.effort_limits / settings.effort_rise_time
         self._wall_effort = np.array([max(self.effort_limits[row != 0] / np.abs(row[row != 0])) for row in self.A])
+        look_ahead = np.divide(arm.gains.kd, arm.gains.kp)
+        self._look_ahead = np.array([max(look_ahead[row != 0]) for row in self.A])
         self._wall_flags = np.full(len(self.A), lcmt_dvrk_status.FLAG_COUPLED_LIMIT, np.int8)
         self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT
 
@@ -64,25 +65,33 @@ class GuardLimits:
             return ""
         return f"{self.names[k]} = {c[k]:.4g} is beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}"
 
-    def limit_effort(self, command: Vector, last: Vector, q: Vector, v: Vector, dt: float) -> tuple[Vector, Flags]:
-        """Effort (n,) to apply for `command`, `dt` seconds after `last` was applied, and the flags of the joints.
+    def follow_effort(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:
+        """Effort (n,) `dt` seconds after `last`, which follows `command` clamped and at a limited rate; joint flags.
 
-        All are (n,) [N m, N; rad, m; rad/s, m/s] and finite; `last` is inside the effort limits.
+        All are (n,) [N m, N] and finite; `last` is inside the effort limits.
+        """
+        clamped = np.clip(command, -self.effort_limits, self.effort_limits)
+        step = self._effort_rate * dt
+        effort = np.clip(clamped, last - step, last + step)
+        flags = np.where(clamped != command, lcmt_dvrk_status.FLAG_EFFORT_CLAMPED, 0).astype(np.int8)
+        flags[effort != clamped] |= lcmt_dvrk_status.FLAG_RATE_LIMITED
+        return effort, flags
+
+    def restrain_effort(self, effort: Vector, q: Vector, v: Vector) -> tuple[Vector, Flags]:
+        """`effort` with what the walls and the speed limit add at q, v, all (n,); joint flags.
+
+        Not limited in rate: it must not come late, and it is continuous in the state.
         """
         limit = self.effort_limits
-        flags = np.where(np.abs(command) > limit, lcmt_dvrk_status.FLAG_EFFORT_CLAMPED, 0).astype(np.int8)
-        c, rate = self.A @ q, (self.A @ v) / (_WALL_RATE * self.margin)
+        flags = np.zeros(len(effort), np.int8)
+        braking = 4 * limit * np.sign(v) * np.clip(np.abs(v) / self.speed - 1, 0, 0.5)
+        flags[braking != 0] |= lcmt_dvrk_status.FLAG_SPEED_LIMIT
+        c = self.A @ q + self._look_ahead * (self.A @ v)
         to_upper, to_lower = (self.upper - c) / self.margin, (c - self.lower) / self.margin
-        push_in = np.where(to_upper < 1, np.clip(2 * (1 - to_upper) + rate, 0, 1), 0.0)
-        push_out = np.where(to_lower < 1, np.clip(2 * (1 - to_lower) - rate, 0, 1), 0.0)
-        walls = self._wall_effort * (push_out - push_in)
-        effort = np.clip(np.clip(command, -limit, limit) + walls @ self.A, -limit, limit)
+        walls = 2 * self._wall_effort * (np.clip(1 - to_lower, 0, 1) - np.clip(1 - to_upper, 0, 1))
         for k in np.flatnonzero(walls):
             flags[self.A[k] != 0] |= self._wall_flags[k]
-        step = self._effort_rate * dt
-        limited = np.clip(effort, last - step, last + step)
-        flags[limited != effort] |= lcmt_dvrk_status.FLAG_RATE_LIMITED
-        return np.clip(limited, -limit, limit), flags
+        return np.clip(effort - braking + walls @ self.A, -limit, limit), flags
 
     def limit_position(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:
         """Target (n,) for `command`, `dt` seconds after the target `last`, and the flags of the joints."""

@@ -21,7 +21,8 @@ class GuardSettings:
             commands may start; at most `margin_fraction` of the range, which counts on short or prismatic joints.
         margin_fraction: see margin.
         effort_rise_time: in which the commanded effort may grow from zero to its limit [s].
-        traverse_time: in which the commanded position may cross a joint's range [s].
+        traverse_time: in which a joint may cross its range [s]: the speed that it may have. Commanded positions go no
+            faster, and while efforts act it is braked above.
     """
 
     expiry: float = 0.05
@@ -31,7 +32,7 @@ class GuardSettings:
     margin: float = 0.05
     margin_fraction: float = 0.05
     effort_rise_time: float = 0.02
-    traverse_time: float = 1.0
+    traverse_time: float = 0.5
 
     def __post_init__(self) -> None:
         self.check()

@@ -1,0 +1,234 @@
+"""What to simulate, as a file: the schema of a scenario, read strictly, and what of it makes no sense.
+
+No postponed annotations here: yaml_load_typed reads the types at run time.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.joint_effects import EFFECT_KINDS
+from dvrk_drake.errors import ScenarioError
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.models.plant import Closure
+from dvrk_drake.systems.gravity_pid_controller import Mode
+
+#: Longest simulation [s] and finest recording that are taken for meant.
+LONGEST, LEAST_SAMPLE_PERIOD = 3600.0, 1e-3
+
+
+@dataclass
+class ControllerScenario:
+    """`mode` is "hold" or "gravity"; `model` the file of an identified model, or empty for what the SDF states.
+
+    `gains` replaces the arm's own (kp, kd, ki: one number a joint).
+    """
+
+    mode: str = "hold"
+    model: str = ""
+    gains: Gains | None = None
+
+
+@dataclass
+class Target:
+    """At `time` [s] the arm is wanted at rest at `pose` [rad, m], one number a joint."""
+
+    time: float = 0.0
+    pose: list[float] = field(default_factory=list)
+
+
+@dataclass
+class TrueEffect:
+    """A joint effect of the simulated arm, see dvrk_drake.dynamics.joint_effects; coefficient in N m, or N."""
+
+    joint: str = ""
+    kind: str = ""
+    coefficient: float = 0.0
+
+
+@dataclass
+class Scenario:
+    """Schema of a scenario file. One scenario gives one result, bit for bit.
+
+    Attributes:
+        arm: name, or path of an arm's YAML file; paths are relative to the folder that the command runs in.
+        closure: how the linkage's loops are held: "ball" or "mimic".
+        gravity: (3,) in the base frame [m/s^2]; the arm's own if left out.
+        time_step: of the plant and period of the controller [s].
+        duration: of the simulation [s].
+        sample_period: of the recording [s].
+        controller: what drives the arm.
+        start: pose at the start, at rest; zero, or the nearest pose inside the limits, if left out.
+        targets: where the arm shall be when; before, between and after them it is at rest at each. Mode "hold" only.
+        effects: at the joints of the simulated arm; the controller does not know them.
+        effort_noise: standard deviation of recorded efforts, as a share of the effort limits.
+        seed: of the noise.
+    """
+
+    arm: str = ""
+    closure: str = "ball"
+    gravity: list[float] | None = None
+    time_step: float = 1e-3
+    duration: float = 5.0
+    sample_period: float = 0.01
+    controller: ControllerScenario = field(default_factory=ControllerScenario)
+    start: list[float] | None = None
+    targets: list[Target] = field(default_factory=list)
+    effects: list[TrueEffect] = field(default_factory=list)
+    effort_noise: float = 0.0
+    seed: int = 0
+
+    @cached_property
+    def mounted_arm(self) -> Arm:
+        """The arm, with gravity from where the scenario says."""
+        arm = load_arm(self.arm)
+        return arm if self.gravity is None else arm.with_gravity(self.gravity)
+
+    @cached_property
+    def model(self) -> IdentifiedModel:
+        """What the controller believes."""
+        if self.controller.model:
+            return IdentifiedModel.load(self.controller.model)
+        return IdentifiedModel.from_arm(self.mounted_arm)
+
+    def knots(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Times (m,) and poses (m, n) that the arm shall rest at: the start, then the targets."""
+        arm = self.mounted_arm
+        home = np.clip(0.0, arm.position_lower, arm.position_upper)
+        poses = [home if self.start is None else self.start, *(target.pose for target in self.targets)]
+        return np.array([0.0, *(target.time for target in self.targets)]), np.array(poses, float)
+
+    def check(self) -> None:
+        """Refuses what cannot be simulated.
+
+        Raises:
+            ScenarioError: names the field, its value, and what is allowed.
+            ArmError, ModelError: the arm or the controller's model cannot be loaded.
+        """
+        if not self.arm:
+            raise ScenarioError("arm is missing; give an arm's name, or the path of its YAML file")
+        arm = self.mounted_arm
+        _check_choice("closure", self.closure, get_args(Closure))
+        _check_choice("controller.mode", self.controller.mode, get_args(Mode))
+        _check_number("time_step", self.time_step, 1e-5, 0.01)
+        _check_number("sample_period", self.sample_period, LEAST_SAMPLE_PERIOD, LONGEST)
+        _check_number("duration", self.duration, self.sample_period, LONGEST)
+        _check_number("effort_noise", self.effort_noise, 0.0, 1.0)
+        _check_number("seed", self.seed, 0, 2**63)
+        if self.start is not None:
+            _check_pose("start", self.start, arm)
+        before = 0.0
+        for i, target in enumerate(self.targets):
+            _check_pose(f"targets[{i}].pose", target.pose, arm)
+            if not before < target.time <= self.duration:
+                raise ScenarioError(
+                    f"targets[{i}].time = {target.time:g} s must be after {before:g} s and at most the duration, "
+                    f"{self.duration:g} s"
+                )
+            before = target.time
+        if self.targets and self.controller.mode != "hold":
+            raise ScenarioError(f'targets need controller.mode "hold"; it is "{self.controller.mode}"')
+        for i, effect in enumerate(self.effects):
+            _check_choice(f"effects[{i}].joint", effect.joint, arm.joint_names)
+            _check_choice(f"effects[{i}].kind", effect.kind, tuple(EFFECT_KINDS))
+            _check_number(f"effects[{i}].coefficient", effect.coefficient, -1e3, 1e3)
+        if self.model.load_arm().joint_names != arm.joint_names:
+            raise ScenarioError(f"controller.model {self.controller.model} is of {self.model.arm}, not of {self.arm}")
+
+
+def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
+    """Reads a scenario file, or makes the scenario of an arm that holds its home pose; changes it, and checks it.
+
+    Args:
+        arm_or_file: path of a YAML file, or the name of an arm.
+        settings: "key=value" in YAML; a dot goes into a group: "controller.mode=gravity", "targets=[...]".
+
+    Raises:
+        ScenarioError: the file cannot be read, has an unknown key, or asks for what makes no sense.
+    """
+    path = Path(arm_or_file)
+    if path.suffix in (".yaml", ".yml"):
+        if not path.is_file():
+            raise ScenarioError(f"{path}: no such scenario file")
+        content = _parse(path.read_text(encoding="utf-8"), str(path))
+        if not isinstance(content, dict):
+            raise ScenarioError(f"{path}: must be keys and values; {_known_keys()}")
+    else:
+        content = {"arm": arm_or_file}
+    for setting in settings:
+        _change(content, setting)
+    for key, value in content.items():
+        try:
+            yaml_load_typed(schema=Scenario, data=yaml_dump({key: value}))
+        except Exception as error:
+            # yaml_load_typed raises many types, from RuntimeError to TypeError, and does not always name the key.
+            raise ScenarioError(f"{arm_or_file}: {key}: {error}; {_known_keys()}") from error
+    scenario = yaml_load_typed(schema=Scenario, data=yaml_dump(content))
+    try:
+        scenario.check()
+    except ScenarioError as error:
+        raise ScenarioError(f"{arm_or_file}: {error}") from error
+    return scenario
+
+
+def _change(content: dict[str, Any], setting: str) -> None:
+    key, equals, value = setting.partition("=")
+    if not equals or not key:
+        raise ScenarioError(f'--set {setting}: must be key=value, e.g. "duration=2" or "controller.mode=gravity"')
+    *groups, last = key.strip().split(".")
+    group: Any = content
+    for name in groups:
+        group = group.setdefault(name, {})
+        if not isinstance(group, dict):
+            raise ScenarioError(f"--set {setting}: {name} has no keys of its own; {_known_keys()}")
+    group[last] = _parse(value, f"--set {setting}")
+
+
+def _parse(text: str, where: str) -> Any:
+    try:
+        return yaml_load(data=text)
+    except Exception as error:
+        raise ScenarioError(f"{where}: not YAML: {error}") from error
+
+
+def _known_keys() -> str:
+    def names(schema: type) -> str:
+        return ", ".join(f.name for f in dataclasses.fields(schema))
+
+    groups = {"controller": ControllerScenario, "controller.gains": Gains, "targets": Target, "effects": TrueEffect}
+    return f"allowed: {names(Scenario)}; " + "; ".join(f"in {key}: {names(schema)}" for key, schema in groups.items())
+
+
+def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
+    if value not in allowed:
+        raise ScenarioError(f'{name} is "{value}"; allowed: {", ".join(allowed)}')
+
+
+def _check_number(name: str, value: float, least: float, most: float) -> None:
+    if not least <= value <= most:  # also true of NaN
+        raise ScenarioError(f"{name} is {value:g}; allowed: {least:g}..{most:g}")
+
+
+def _check_pose(name: str, pose: list[float], arm: Arm) -> None:
+    n, q = arm.num_joints, np.array(pose, float)
+    if len(q) != n:
+        raise ScenarioError(
+            f"{name} has {len(q)} number{'s' * (len(q) != 1)}; {arm.name} has {n} joints: {', '.join(arm.joint_names)}"
+        )
+    if not np.all(np.isfinite(q)):
+        raise ScenarioError(f"{name} must be finite numbers; got {q.tolist()}")
+    if violations := arm.limit_violations(q, 1e-9):
+        message = f"{name}: {'; '.join(violations)} [rad, m] of {arm.name}"
+        far = arm.prismatic & (np.abs(q) > 2 * arm.position_upper)
+        if np.any(far) and np.all(np.abs(q[far]) / 1000 <= arm.position_upper[far]):
+            message += f"; is {arm.joint_names[int(np.argmax(far))]} in mm? It must be in m"
+        raise ScenarioError(message)

@@ -1,0 +1,46 @@
+"""The verbs of the command line that talk LCM."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from dvrk_drake.cli_support import add_gravity, mounted, quiet_drake
+
+
+def add_arm(verbs: argparse._SubParsersAction) -> None:
+    """Adds the verb `arm` and its options."""
+    verb = verbs.add_parser("arm", help="play an arm behind LCM: a simulated one with a hardware driver's safeguards")
+    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
+    verb.add_argument("--driver", metavar="FILE.yaml", help="configuration of its driver, fields as in DvrkDriver")
+    verb.add_argument("--lcm-url", metavar="URL", help="default: the driver's, or LCM_DEFAULT_URL, or LCM's own")
+    verb.add_argument("--pose", nargs="+", type=float, metavar="Q", help="where it starts [rad, m]; default: near zero")
+    verb.add_argument("--meshcat", action="store_true", help="draw it in a browser")
+    verb.add_argument("--realtime", action="store_true", help="real-time scheduling, or a warning where not permitted")
+    add_gravity(verb)
+    verb.set_defaults(run=_arm)
+
+
+def _arm(options: argparse.Namespace) -> None:
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.processes.lcm_network import open_lcm
+    from dvrk_drake.processes.pace import make_realtime, settle_memory
+    from dvrk_drake.processes.simulated_arm import SimulatedArm, load_driver, start_pose, stop_on_signals
+    from dvrk_drake.systems.arm_view import start_meshcat
+    from dvrk_drake.systems.dvrk_driver import DvrkDriver
+
+    quiet_drake()
+    arm = mounted(load_arm(options.arm), options.gravity)
+    driver = DvrkDriver() if options.driver is None else load_driver(options.driver)
+    pose = start_pose(arm, options.pose)
+    network = open_lcm(options.lcm_url or driver.lcm_url)
+    meshcat = start_meshcat() if options.meshcat else None
+    simulated = SimulatedArm(arm, driver, network, pose, meshcat)
+    stopped = stop_on_signals()
+    if options.realtime and (warning := make_realtime()):
+        print(f"dvrk-drake: warning: {warning}", file=sys.stderr)
+    settle_memory()
+    where = f"; {meshcat.web_url()}" if meshcat else ""
+    print(f"simulated {arm.name} on LCM {network.get_lcm_url()}{where}; end with Ctrl-C", flush=True)
+    pace = simulated.run(stopped, lambda line: print(line, flush=True))
+    print(f"ended; {pace.late} ticks began more than a period late", flush=True)

@@ -1,0 +1,70 @@
+"""The verb `simulate` of the command line."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from dvrk_drake.cli_support import ProgressBar, check_output, made_folder, quiet_drake, until_stopped
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from dvrk_drake.analysis.scenario import Scenario
+    from dvrk_drake.analysis.simulation import Simulation
+
+
+def add_simulate(verbs: argparse._SubParsersAction) -> None:
+    """Adds the verb and its options."""
+    verb = verbs.add_parser("simulate", help="simulate an arm under control, as a scenario file says, and record it")
+    verb.add_argument("scenario", metavar="ARM_OR_SCENARIO", help="mtml, mtmr, psm: holds its home; or scenario.yaml")
+    verb.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="changes the scenario, e.g. controller.mode=gravity; again for more",
+    )
+    verb.add_argument("--output", metavar="RECORDING.csv", help="write t, q, qd and tau")
+    verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
+    verb.add_argument("--meshcat", action="store_true", help="show it in a browser, in real time")
+    verb.set_defaults(run=_simulate)
+
+
+def _simulate(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.scenario import load_scenario
+    from dvrk_drake.analysis.simulation import simulate
+    from dvrk_drake.analysis.tables import make_console, print_simulation
+    from dvrk_drake.models.recording import write_recording
+    from dvrk_drake.systems.arm_view import start_meshcat
+
+    quiet_drake()
+    scenario = load_scenario(options.scenario, options.set)
+    if options.output is not None:
+        check_output(options.output, options.scenario, scenario.controller.model)
+    plots = None if options.plots is None else made_folder(options.plots)
+    meshcat = start_meshcat() if options.meshcat else None
+    if meshcat is not None:
+        print(f"{scenario.mounted_arm.name} at {meshcat.web_url()}", flush=True)
+    with ProgressBar("simulating") as (progress, task):
+        simulation = simulate(scenario, meshcat, lambda share: progress.update(task, completed=100 * share))
+    print_simulation(make_console(), simulation, scenario.mounted_arm)
+    if options.output is not None:
+        write_recording(simulation.recording, options.output)
+        print(f"recording: {options.output}, {len(simulation.recording)} rows")
+    if plots is not None:
+        _plot(plots / "positions.png", simulation, scenario)
+        print(f"plots: {plots}")
+    if meshcat is not None:
+        print("the page can play the motion again; end with Stop, Escape or Ctrl-C", flush=True)
+        until_stopped(meshcat)
+
+
+def _plot(path: Path, simulation: Simulation, scenario: Scenario) -> None:
+    from dvrk_drake.analysis.plots import plot_positions
+
+    curves = {"simulated": simulation.recording.q}
+    if simulation.desired is not None:
+        curves["desired"] = simulation.desired
+    arm = scenario.mounted_arm
+    plot_positions(path, arm, simulation.time, curves, f"{arm.name}, simulated, mode {scenario.controller.mode}")

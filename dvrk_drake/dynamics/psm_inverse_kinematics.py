@@ -1,0 +1,89 @@
+"""Inverse kinematics of the PSM in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform
+
+from dvrk_drake.dynamics.arm_frame import ArmFrame
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import make_arm_plant
+
+
+class PsmInverseKinematics:
+    """Joint positions of a PSM whose tip (the wrist yaw frame) is at a given pose.
+
+    With the instrument inserted beyond the remote centre of motion (RCM) and |wrist_pitch| < 90 degrees there is one
+    solution, up to turns of the roll. The shaft's line passes through the RCM; the link between the two wrist axes, of
+    length L, lies in one plane with it and is perpendicular to the yaw axis. So the direction d from the pitch axis to
+    the yaw axis is that of the tip's position without its part along the yaw axis; p_wrist = p_tip - L d lies on the
+    shaft and gives yaw, pitch and insertion; what rotation remains is roll, wrist pitch and wrist yaw about z, x, y.
+
+    Lengths and the fixed tip frame are read from the arm's SDF.
+    """
+
+    def __init__(self, arm: Arm, frame_name: str = "dh_6", min_depth: float = 1e-3) -> None:
+        """For `arm`, and the frame of its wrist yaw link that is placed.
+
+        Args:
+            arm: a PSM.
+            frame_name: the tip.
+            min_depth: how far beyond the RCM the wrist centre must be to have a solution [m], above 0: at the RCM yaw
+            and pitch are not determined, near it they whirl.
+
+        Raises:
+            ArmError: the arm has not the kinematics of a PSM.
+        """
+        not_a_psm = ArmError(f"{arm.name} has not the kinematics of a PSM with a wrist (roll, pitch, yaw)")
+        if arm.num_joints < 6:
+            raise not_a_psm
+        plant = make_arm_plant(arm)
+        context = plant.CreateDefaultContext()
+        _, pitch_link, yaw_link = (plant.GetJointByName(name).child_body() for name in arm.joint_names[3:6])
+        p_BWrist = pitch_link.EvalPoseInWorld(context).translation()
+        p_BYaw = yaw_link.EvalPoseInWorld(context).translation()
+        #: Wrist centre below the RCM [m] at insertion 0; length between the wrist axes [m].
+        self.depth_at_zero, self.wrist_length = -p_BWrist[2], p_BWrist[2] - p_BYaw[2]
+        self._min_depth = min_depth
+        frame = ArmFrame(arm, frame_name)
+        self._X_LF = plant.GetFrameByName(frame_name).GetFixedPoseInBodyFrame()
+        # The formulas take the axes for granted: try them.
+        q = np.clip(
+            [0.3, -0.2, 0.1, 0.5, -0.4, 0.6, *np.zeros(arm.num_joints - 6)], arm.position_lower, arm.position_upper
+        )
+        solution = self.solve(frame.pose(q), q)
+        if solution is None or not np.allclose(solution, q[:6], rtol=0, atol=1e-9):
+            raise not_a_psm
+
+    def solve(self, X_BF: RigidTransform, q_near: ArrayLike) -> NDArray[np.float64] | None:
+        """Joint positions (6,) [rad, m], not limited to the arm's range; the roll is that turn which is nearest to
+        q_near's.
+
+        None where the wrist centre would be nearer to the RCM than min_depth, the wrist pitch 90 degrees or more, or
+        the shaft point more than 45 degrees upward (|yaw| > 135 degrees): that is what a tip above the RCM comes to.
+        """
+        X_BL = X_BF @ self._X_LF.inverse()
+        R_BL, p_BL = X_BL.rotation().matrix(), X_BL.translation()
+        yaw_axis = R_BL[:, 1]
+        d = p_BL - (p_BL @ yaw_axis) * yaw_axis
+        distance = np.linalg.norm(d)
+        if distance <= self.wrist_length:
+            return None
+        p_wrist = (1 - self.wrist_length / distance) * d + (p_BL @ yaw_axis) * yaw_axis
+        depth = np.linalg.norm(p_wrist)
+        if depth < self._min_depth:
+            return None
+        u = p_wrist / depth
+        yaw, pitch = np.arctan2(u[0], -u[2]), np.arctan2(-u[1], np.hypot(u[0], u[2]))
+        if abs(yaw) > 0.75 * np.pi:
+            return None
+        s1, c1, s2, c2 = np.sin(yaw), np.cos(yaw), np.sin(pitch), np.cos(pitch)
+        R_BS = np.array([[c1, s1 * s2, -s1 * c2], [0, c2, s2], [s1, -c1 * s2, c1 * c2]])
+        R = R_BS.T @ R_BL  # = Rz(-roll) Rx(-wrist_pitch) Ry(-wrist_yaw)
+        roll = np.arctan2(R[0, 1], R[1, 1])
+        roll += 2 * np.pi * np.round((np.asarray(q_near, float)[3] - roll) / (2 * np.pi))
+        wrist_pitch = np.arctan2(-R[2, 1], np.hypot(R[2, 0], R[2, 2]))
+        wrist_yaw = np.arctan2(R[2, 0], R[2, 2])
+        return np.array([yaw, pitch, depth - self.depth_at_zero, roll, wrist_pitch, wrist_yaw])

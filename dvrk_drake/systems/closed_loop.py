@@ -1,0 +1,40 @@
+"""The wires between an arm's station, its controller, what is desired of it and the effects at its joints."""
+
+from __future__ import annotations
+
+from pydrake.systems.framework import DiagramBuilder, System
+
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
+
+
+def add_closed_loop(
+    builder: DiagramBuilder,
+    station: ArmStation,
+    controller: GravityPidController,
+    desired: System | None = None,
+    effects: JointEffectTorque | None = None,
+) -> None:
+    """Adds all that is given to `builder` and connects it.
+
+    Args:
+        builder: of the diagram that they become part of.
+        station: the arm.
+        controller: of an arm with the same joints.
+        desired: a source with one output port: q_d, then v_d (2n,). Without it the controller holds where it starts.
+        effects: torques at the joints beside the plant's own.
+    """
+    name = station.arm.name.lower()
+    builder.AddSystem(station)
+    builder.AddSystem(controller)
+    state = station.GetOutputPort(f"{name}.state_estimated")
+    builder.Connect(state, controller.GetInputPort("state_estimated"))
+    builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))
+    if desired is not None:
+        builder.AddSystem(desired)
+        builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
+    if effects is not None:
+        builder.AddSystem(effects)
+        builder.Connect(state, effects.get_input_port())
+        builder.Connect(effects.get_output_port(), station.GetInputPort(f"{name}.effort_disturbance"))

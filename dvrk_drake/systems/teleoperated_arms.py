@@ -1,0 +1,128 @@
+"""A master arm in gravity compensation that a simulated hand moves, and the patient side manipulator that it leads."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from numpy.typing import ArrayLike
+from pydrake.geometry import Meshcat
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import set_joint_damping
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.hand import Hand
+from dvrk_drake.systems.teleoperation import FOLLOWER_FRAME, MASTER_FRAME, Teleoperation
+
+#: Viscous friction of the simulated master's joints, as a share of their effort limits [s].
+MASTER_DAMPING = 0.03
+
+
+class TeleoperatedArms(Diagram):
+    """Two simulated arms, coupled by `Teleoperation`.
+
+    .. pydrake_system::
+
+        name: TeleoperatedArms
+        input_ports:
+        - X_MG_desired (optional)
+        - engaged
+        - jaw_angle (optional)
+        output_ports:
+        - mtml.state_estimated
+        - psm.state_estimated
+        - desired_state
+        - following
+        - fault
+
+    `mtml` and `psm` stand for the arms' lower-case names.
+
+    - `X_MG_desired` (RigidTransform): where the hand wants the master's handle, in the master's base. Unconnected:
+      nobody touches the master.
+    - `engaged`, `jaw_angle`, `desired_state`, `following`, `fault`: those of `Teleoperation`.
+    - `state_estimated`: those of the two stations.
+    """
+
+    def __init__(
+        self,
+        master: Arm,
+        follower: Arm,
+        *,
+        scale: float = 0.3,
+        R_FM: RotationMatrix | None = None,
+        meshcat: Meshcat | None = None,
+    ) -> None:
+        """Builds it; both arms have exact models of themselves, the master some joint friction.
+
+        Args:
+            master: an MTM.
+            follower: a PSM.
+            scale, R_FM: see `Teleoperation`.
+            meshcat: draws both arms there, below paths of their lower-case names; place them with `SetTransform`.
+        """
+        super().__init__()
+        builder = DiagramBuilder()
+        damping = partial(set_joint_damping, arm=master, damping=MASTER_DAMPING * master.effort_limits)
+        self.master = builder.AddSystem(ArmStation(master, meshcat=meshcat, modify_plant=damping))
+        self.follower = builder.AddSystem(ArmStation(follower, meshcat=meshcat))
+        self.teleoperation = builder.AddNamedSystem(
+            "teleoperation", Teleoperation(master, follower, scale=scale, R_FM=R_FM)
+        )
+        carry = builder.AddNamedSystem(
+            "master_controller", GravityPidController(IdentifiedModel.from_arm(master), mode="gravity")
+        )
+        regulate = builder.AddNamedSystem(
+            "follower_controller", GravityPidController(IdentifiedModel.from_arm(follower))
+        )
+        hand = builder.AddNamedSystem("hand", Hand(master, MASTER_FRAME))
+
+        M, F = master.name.lower(), follower.name.lower()
+        state_M, state_F = (
+            self.master.GetOutputPort(f"{M}.state_estimated"),
+            self.follower.GetOutputPort(f"{F}.state_estimated"),
+        )
+        connect = builder.Connect
+        connect(state_M, carry.GetInputPort("state_estimated"))
+        connect(state_M, hand.GetInputPort("state_estimated"))
+        connect(carry.GetOutputPort("effort"), self.master.GetInputPort(f"{M}.effort_commanded"))
+        connect(hand.GetOutputPort("effort_disturbance"), self.master.GetInputPort(f"{M}.effort_disturbance"))
+        connect(self.master.GetOutputPort(f"{M}.position_measured"), self.teleoperation.GetInputPort("master_position"))
+        connect(
+            self.follower.GetOutputPort(f"{F}.position_measured"), self.teleoperation.GetInputPort("follower_position")
+        )
+        connect(self.teleoperation.GetOutputPort("desired_state"), regulate.GetInputPort("desired_state"))
+        connect(state_F, regulate.GetInputPort("state_estimated"))
+        connect(regulate.GetOutputPort("effort"), self.follower.GetInputPort(f"{F}.effort_commanded"))
+
+        builder.ExportInput(hand.GetInputPort("X_BG_desired"), "X_MG_desired")
+        for name in ("engaged", "jaw_angle"):
+            builder.ExportInput(self.teleoperation.GetInputPort(name), name)
+        builder.ExportOutput(state_M, f"{M}.state_estimated")
+        builder.ExportOutput(state_F, f"{F}.state_estimated")
+        for name in ("desired_state", "following", "fault"):
+            builder.ExportOutput(self.teleoperation.GetOutputPort(name), name)
+        builder.BuildInto(self)
+
+    def set_positions(self, context: Context, q_master: ArrayLike, q_follower: ArrayLike) -> None:
+        """Puts both arms at poses, at rest. `context` is this system's own.
+
+        Raises:
+            StationError: poses that are none.
+        """
+        for station, q in ((self.master, q_master), (self.follower, q_follower)):
+            station.set_positions(self.GetMutableSubsystemContext(station, context), q)
+
+    def X_MG(self, context: Context) -> RigidTransform:
+        """Pose of the master's handle in its base."""
+        return self._pose(self.master, MASTER_FRAME, context)
+
+    def X_FT(self, context: Context) -> RigidTransform:
+        """Pose of the follower's tip in its base."""
+        return self._pose(self.follower, FOLLOWER_FRAME, context)
+
+    def _pose(self, station: ArmStation, frame_name: str, context: Context) -> RigidTransform:
+        plant_context = station.GetSubsystemContext(station.plant, self.GetSubsystemContext(station, context))
+        return station.plant.GetFrameByName(frame_name).CalcPoseInWorld(plant_context)

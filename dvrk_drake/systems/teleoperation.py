@@ -1,0 +1,206 @@
+"""A master arm's handle leads a patient side manipulator's tip: scaled position, rotation one to one, clutch."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from dvrk_drake.dynamics.arm_frame import ArmFrame
+from dvrk_drake.dynamics.psm_inverse_kinematics import PsmInverseKinematics
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.systems.gravity_pid_step import ABSURD
+
+#: Frames that lead and follow: the dVRK's measured_cp of the two arms, at the wrist centre and at the wrist yaw axis.
+MASTER_FRAME, FOLLOWER_FRAME = "dh_7", "dh_6"
+#: The follower's wrist centre stays this far beyond its remote centre of motion [m]: nearer, yaw and pitch would whirl.
+MIN_DEPTH = 0.02
+#: A follower that is behind its command by more than its fastest joint motion in this time [s] is not following.
+MAX_LAG = 0.1
+
+
+class Teleoperation(LeafSystem):
+    """Commands a follower (PSM) from the handle of a master (MTM) that somebody moves.
+
+    .. pydrake_system::
+
+        name: Teleoperation
+        input_ports:
+        - master_position
+        - follower_position
+        - engaged
+        - jaw_angle (optional)
+        output_ports:
+        - desired_state
+        - following
+        - fault
+
+    Ports [rad, rad/s; m, m/s on a prismatic joint], joints in the arms' order:
+
+    - `master_position` (n of the master), `follower_position` (n of the follower): measured joint positions.
+    - `engaged` (1): the clutch; above 0.5 the follower follows. Pressing the dVRK's clutch pedal disengages.
+    - `jaw_angle` (1): wanted opening of the jaw, e.g. the master's gripper angle. Unconnected: the jaw is held.
+    - `desired_state` (2n of the follower): commanded joint positions, then their rates; for `GravityPidController`.
+    - `following` (1): 1 while the master leads, else 0.
+    - `fault` (1): 1 while an input is unusable or the follower is not where it was commanded, else 0.
+
+    **Law.** With X_MG the master's handle in its base and X_FT the follower's tip in its base, both noted when the
+    clutch engages (index 0), and R_FM the rotation between the bases as the operator sees them:
+
+        p_FT = p_FT0 + scale R_FM (p_MG - p_MG0),    R_FT = R_FM R_MG R_MG0' R_FM' R_FT0
+
+    Engaging therefore never moves the follower, whatever the two orientations are: their difference is kept. (The
+    dVRK turns the master's wrist to match instead; a master in gravity compensation has nobody to turn it.)
+
+    **Limits.** Joint positions from `PsmInverseKinematics` are clamped to the arm's limits; then each joint moves
+    towards them no faster than its velocity limit. A pose without a solution, as at and above the remote centre of
+    motion, moves nothing but the jaw. The relation of the poses is kept beyond a limit, so the tip takes it up again
+    where the master comes back.
+
+    **Hold.** `desired_state` stands still, with zero rates, while the clutch is open, while `master_position` or
+    `jaw_angle` is not finite or beyond 1e6, while the follower is farther from the command than its velocity limits
+    cover in `MAX_LAG` (the jaw excepted: it may press on something), and while the instrument is in its cannula, less
+    than `MIN_DEPTH` beyond the remote centre. When that ends the clutch engages anew. With an open clutch a follower
+    that was moved by something else is taken where it is. Before a finite follower_position was seen, `desired_state`
+    is NaN, which the controller refuses.
+
+    A receiver of messages that are late has to open the clutch: ports have no age. Inputs are sampled, and outputs
+    change, every `period` seconds and at initialization, which forgets all.
+    """
+
+    def __init__(
+        self,
+        master: Arm,
+        follower: Arm,
+        *,
+        scale: float = 0.3,
+        R_FM: RotationMatrix | None = None,
+        period: float = 1e-3,
+    ) -> None:
+        """Of a `master` with the frame "dh_7" and a `follower` with the kinematics of a PSM.
+
+        Args:
+            master: the arm that leads.
+            follower: the arm that follows.
+            scale: tip's displacement over handle's, above 0 and at most 1; see `SetScale`.
+            R_FM: rotation from the master's base to the follower's; by default none: bases that stand alike.
+            period: of the update [s].
+
+        Raises:
+            ArmError: an arm of another kind.
+            ControllerError: scale or period out of range, or a follower without velocity limits.
+        """
+        super().__init__()
+        if not (np.isfinite(period) and period > 0):
+            raise ControllerError(f"period must be a positive number of seconds; got {period}")
+        self._period = float(period)
+        self._master, self._follower = ArmFrame(master, MASTER_FRAME), ArmFrame(follower, FOLLOWER_FRAME)
+        self._inverse = PsmInverseKinematics(follower, FOLLOWER_FRAME, MIN_DEPTH)
+        self._R_FM = R_FM or RotationMatrix()
+        self._lower, self._upper = follower.position_lower, follower.position_upper
+        self._speed = _velocity_limits(follower)
+        self._max_lag = np.where(np.arange(follower.num_joints) < 6, MAX_LAG * self._speed, np.inf)
+
+        n = follower.num_joints
+        self.DeclareVectorInputPort(name="master_position", size=master.num_joints)
+        self.DeclareVectorInputPort(name="follower_position", size=n)
+        self.DeclareVectorInputPort(name="engaged", size=1)
+        self.DeclareVectorInputPort(name="jaw_angle", size=1)
+        desired = self.DeclareDiscreteState(model_vector=BasicVector(np.full(2 * n, np.nan)))
+        following = self.DeclareDiscreteState(num_state_variables=1)
+        fault = self.DeclareDiscreteState(num_state_variables=1)
+        self.DeclareDiscreteState(model_vector=BasicVector([self._checked(scale)]))
+        self.DeclareDiscreteState(num_state_variables=24)  # X_MG0 and X_FT0, 3 x 4 each
+        for name, state in (("desired_state", desired), ("following", following), ("fault", fault)):
+            self.DeclareStateOutputPort(name=name, state_index=state)
+        self.DeclareInitializationDiscreteUpdateEvent(update=self._restart)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_sec=self._period, offset_sec=0.0, update=self._update)
+        self.DeclareForcedDiscreteUpdateEvent(update=self._update)
+
+    def SetScale(self, context: Context, scale: float) -> None:
+        """Changes the scale from here on; the tip does not jump.
+
+        Raises:
+            ControllerError: not above 0 and at most 1.
+        """
+        context.get_mutable_discrete_state(_SCALE).SetAtIndex(0, self._checked(scale))
+        context.get_mutable_discrete_state(_FOLLOWING).SetAtIndex(0, 0.0)
+
+    @staticmethod
+    def _checked(scale: float) -> float:
+        if not 0 < scale <= 1:
+            raise ControllerError(f"scale must be above 0 and at most 1; got {scale}")
+        return float(scale)
+
+    def _restart(self, context: Context, state: DiscreteValues) -> None:
+        state.get_mutable_value(_DESIRED)[:] = np.nan
+        state.get_mutable_value(_FOLLOWING)[0] = 0.0
+        self._update(context, state)
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        desired = state.get_mutable_value(_DESIRED)
+        q_d, v_d = np.split(desired, 2)  # views
+        q_master, q_follower, engaged = (self._read(context, port) for port in range(3))
+        jaw = self._read(context, _JAW) if self.get_input_port(_JAW).HasValue(context) else q_d[6:]
+        is_engaged = engaged[0] > 0.5
+
+        lags = not np.all(np.abs(q_follower - q_d) <= self._max_lag)  # also true of NaN
+        if lags and _usable(q_follower) and (not is_engaged or np.isnan(q_d[0])):
+            q_d[:] = q_follower
+            lags = False
+        fault = lags or not (_usable(q_master) and _usable(jaw) and _usable(engaged))
+        inserted = q_d[2] + self._inverse.depth_at_zero >= MIN_DEPTH - 1e-6
+        follows = is_engaged and not fault and inserted
+        v_d[:] = 0.0
+        if follows:
+            X_FT = self._target(q_master, q_d, state)
+            v_d[:] = self._rates(X_FT, jaw, q_d)
+            q_d += self._period * v_d
+        state.get_mutable_value(_FOLLOWING)[0] = float(follows)
+        state.get_mutable_value(_FAULT)[0] = float(fault)
+
+    def _target(self, q_master: NDArray[np.float64], q_d: NDArray[np.float64], state: DiscreteValues) -> RigidTransform:
+        """Wanted X_FT; where the follower did not follow until now, the poses are noted and it is the present one."""
+        X_MG = self._master.pose(q_master)
+        memory = state.get_mutable_value(_POSES).reshape(2, 3, 4)  # a view
+        if state.get_value(_FOLLOWING)[0] == 0.0:
+            memory[0], memory[1] = X_MG.GetAsMatrix34(), self._follower.pose(q_d).GetAsMatrix34()
+        R_MG0, p_MG0, R_FT0, p_FT0 = memory[0, :, :3], memory[0, :, 3], memory[1, :, :3], memory[1, :, 3]
+        R_FM, scale = self._R_FM.matrix(), state.get_value(_SCALE)[0]
+        R_FT = R_FM @ X_MG.rotation().matrix() @ R_MG0.T @ R_FM.T @ R_FT0
+        return RigidTransform(
+            RotationMatrix.ProjectToRotationMatrix(R_FT), p_FT0 + scale * R_FM @ (X_MG.translation() - p_MG0)
+        )
+
+    def _rates(self, X_FT: RigidTransform, jaw: NDArray[np.float64], q_d: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Rates (n,) for one period that lead to the pose and jaw angle, inside all limits."""
+        solution = self._inverse.solve(X_FT, q_d)
+        wanted = np.concatenate([q_d[:6] if solution is None else solution, jaw])
+        way = np.clip(wanted, self._lower, self._upper) - q_d
+        return np.clip(way / self._period, -self._speed, self._speed)
+
+    def _read(self, context: Context, port: int) -> NDArray[np.float64]:
+        vector = self.EvalVectorInput(context, port)
+        if vector is None:
+            raise ControllerError(f"input port {self.get_input_port(port).get_name()} is not connected")
+        return vector.get_value()
+
+
+_JAW = 3  # index of the input port
+_DESIRED, _FOLLOWING, _FAULT, _SCALE, _POSES = range(5)  # indices of the discrete state groups
+
+
+def _usable(values: NDArray[np.float64]) -> bool:
+    return bool(np.all(np.abs(values) < ABSURD))  # not so of NaN
+
+
+def _velocity_limits(arm: Arm) -> NDArray[np.float64]:
+    """(n,) from the SDF's `<velocity>`."""
+    plant = make_arm_plant(arm)
+    limits = np.array([plant.GetJointByName(name).velocity_upper_limits()[0] for name in arm.joint_names])
+    if not np.all(np.isfinite(limits)):
+        raise ControllerError(f"{arm.name}: a joint of its SDF has no <velocity> limit, so it cannot follow a master")
+    return limits

@@ -1,0 +1,31 @@
+"""A hand pulls the handle of a master arm that carries its own weight; the patient side arm follows, at a third."""
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.systems.arm_view import start_meshcat
+from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
+
+meshcat = start_meshcat(camera=(1.7, 0.45, 0.5), target=(0.0, -0.12, 0.08))
+meshcat.SetTransform("mtml", RigidTransform([0.0, 0.45, 0.05]))
+meshcat.SetTransform("psm", RigidTransform([0.0, -0.22, 0.0]))
+arms = TeleoperatedArms(load_arm("mtml"), load_arm("psm"), scale=1 / 3, meshcat=meshcat)
+simulator = Simulator(arms)
+context = simulator.get_mutable_context()
+arms.set_positions(context, [0, 0.25, -0.1, 0, 1.2, 0, 0], [0, 0, 0.13, 0, 0, 0, 0.5])
+X_MG0, X_FT0 = arms.X_MG(context), arms.X_FT(context)
+
+arms.GetInputPort("engaged").FixValue(context, [1.0])
+arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(X_MG0))
+simulator.AdvanceTo(0.1)
+for t in np.arange(0.1, 3.0, 0.01):  # the hand moves the handle up by 6 cm
+    target = RigidTransform([0, 0, 0.06 * min(1, (t - 0.1) / 2)]) @ X_MG0
+    arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(target))
+    simulator.AdvanceTo(t)
+
+print(meshcat.web_url())
+print("handle moved [mm]", np.round(1e3 * (arms.X_MG(context).translation() - X_MG0.translation()), 2))
+print("tip moved    [mm]", np.round(1e3 * (arms.X_FT(context).translation() - X_FT0.translation()), 2))
