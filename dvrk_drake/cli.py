@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from dvrk_drake.cli_lcm import add_arm
+from dvrk_drake.cli_lcm import add_arm, add_run
 from dvrk_drake.cli_record import add_record
 from dvrk_drake.cli_simulate import add_simulate
 from dvrk_drake.cli_support import (
@@ -297,6 +297,7 @@ def _parser() -> argparse.ArgumentParser:
     verb.set_defaults(run=_view)
 
     add_arm(verbs)
+    add_run(verbs)
     add_record(verbs)
     add_simulate(verbs)
     verb = verbs.add_parser(

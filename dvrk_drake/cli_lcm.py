@@ -38,9 +38,55 @@ def _arm(options: argparse.Namespace) -> None:
     simulated = SimulatedArm(arm, driver, network, pose, meshcat)
     stopped = stop_on_signals()
     if options.realtime and (warning := make_realtime()):
-        print(f"dvrk-drake: warning: {warning}", file=sys.stderr)
+        _warn(warning)
     settle_memory()
     where = f"; {meshcat.web_url()}" if meshcat else ""
     print(f"simulated {arm.name} on LCM {network.get_lcm_url()}{where}; end with Ctrl-C", flush=True)
     pace = simulated.run(stopped, lambda line: print(line, flush=True))
     print(f"ended; {pace.late} ticks began more than a period late", flush=True)
+
+
+def add_run(verbs: argparse._SubParsersAction) -> None:
+    """Adds the verb `run` and its options."""
+    verb = verbs.add_parser("run", help="compensate or hold an arm over LCM")
+    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
+    verb.add_argument("--model", metavar="MODEL.yaml", help="from identify; default: what the arm's SDF states")
+    verb.add_argument("--mode", choices=("gravity", "hold"), default="gravity", help="default: gravity")
+    verb.add_argument("--lcm-url", default="", metavar="URL", help="default: LCM_DEFAULT_URL, or LCM's own")
+    verb.add_argument("--realtime", action="store_true", help="real-time scheduling, or a warning where not permitted")
+    verb.set_defaults(run=_run)
+
+
+def _run(options: argparse.Namespace) -> None:
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.errors import ModelError
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.processes.arm_controller import ArmController
+    from dvrk_drake.processes.control import ArmLink, control, first_status
+    from dvrk_drake.processes.lcm_network import open_lcm
+    from dvrk_drake.processes.pace import make_realtime, settle_memory
+    from dvrk_drake.processes.simulated_arm import stop_on_signals
+
+    quiet_drake()
+    arm = load_arm(options.arm)
+    model = IdentifiedModel.from_arm(arm) if options.model is None else IdentifiedModel.load(options.model)
+    if model.load_arm().name != arm.name:
+        raise ModelError(f"{options.model}: is of {model.load_arm().name}, not of {arm.name}")
+    url = open_lcm(options.lcm_url).get_lcm_url()
+    status, period = first_status(ArmLink(arm, url))
+    if status.gravity_compensation:
+        _warn(f"{arm.name} adds gravity compensation of its own: switch it off, or it is compensated twice")
+    controller = ArmController(arm, model, options.mode, period)
+    stopped = stop_on_signals()
+    if options.realtime and (warning := make_realtime()):
+        _warn(warning)
+    settle_memory()
+    print(f"{options.mode} of {arm.name} at {1 / period:.0f} Hz; Ctrl-C leaves it to its own hold", flush=True)
+    line_end = "\r" if sys.stdout.isatty() else "\n"
+    # A link of its own: what was said while the controller was compiled is past.
+    control(ArmLink(arm, url), controller, stopped, lambda line: print(f"{line:100}", end=line_end, flush=True))
+    print(f"{arm.name} holds by itself", flush=True)
+
+
+def _warn(text: str) -> None:
+    print(f"dvrk-drake: warning: {text}", file=sys.stderr, flush=True)

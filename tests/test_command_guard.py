@@ -362,6 +362,20 @@ def test_a_lost_measurement_turns_the_motors_off_until_a_reset(which, value):
     np.testing.assert_array_equal(output.position, Q - 0.03)
 
 
+def test_a_reset_just_before_the_measurement_is_found_again_holds_the_pose_that_is_found():
+    bench = Bench().started()
+    bench.q = Q * np.nan
+    bench.tick()
+    healthy = {"position": list(Q)}
+    bench.send(Command.HOLD, **healthy)
+    bench.tick()
+    bench.send(Command.HOLD, reset_fault=True, **healthy)
+    bench.q = Q - 0.03  # it fell meanwhile
+    output = bench.tick()
+    assert output.control_mode == Command.HOLD
+    np.testing.assert_array_equal(output.position, Q - 0.03)
+
+
 def test_a_fault_while_off_stays_off():
     bench = Bench()
     bench.run(Command.OFF, 1)

@@ -135,6 +135,22 @@ def drift(name, status):
     return np.abs(np.array(status.position) - POSES[name]).max()
 
 
+def reset(name, observer):
+    """Clears a fault: HOLD, HOLD, HOLD with the request."""
+    network, sender_id = lcm.LCM(), draw_id()
+    time.sleep(0.1)  # whoever commanded before is silent by then
+    for k, asks in enumerate((False, False, True)):
+        status, command = observer.last, Command()
+        command.utime, command.sequence, command.sender_id = time.monotonic_ns() // 1000, k, sender_id
+        command.session_id, command.status_utime = status.session_id, status.utime
+        command.arm_name, command.num_joints, command.control_mode = status.arm_name, status.num_joints, Command.HOLD
+        command.position = command.velocity = command.effort = [0.0] * status.num_joints
+        command.reset_fault = asks
+        network.publish(f"DVRK_COMMAND_{name.upper()}", command.encode())
+        time.sleep(0.01)
+    observer.until(lambda status: status.guard_state == Status.STATE_HOLD, 5, "reset")
+
+
 @inside
 def test_command_and_status_go_round(arm):
     name, _, observer = arm
@@ -186,6 +202,52 @@ def test_a_killed_controller_is_followed_by_a_hold(arm):
 
 
 @inside
+@pytest.mark.parametrize("mode", ["gravity", "hold"])
+def test_run_starts_ramps_in_and_leaves_the_arm_to_its_hold(arm, mode):
+    name, _, observer = arm
+    expired = observer.last.num_expired
+    process = start(sys.executable, "-m", "dvrk_drake.cli", "run", "--arm", name, "--mode", mode, "--realtime")
+    try:
+        begun = observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 90, "run")
+        time.sleep(2.0)
+        acting = [status for _, status in observer.heard[begun:]]
+    finally:
+        said = end(process, signal.SIGINT)
+    assert process.returncode == 0, said
+    assert {status.guard_state for status in acting} == {Status.STATE_EFFORT}
+    efforts = np.array([status.effort_commanded for status in acting])
+    assert np.all(np.abs(np.diff(efforts, axis=0)) < 0.01 * load_arm(name).effort_limits)
+    assert observer.last.guard_state == Status.STATE_HOLD
+    assert observer.last.num_expired == expired  # it was told to hold, it did not have to notice
+    assert drift(name, observer.last) < 1e-3
+    assert "holds by itself" in said
+    assert "effort; " in said and " Hz, round trip " in said
+    print(f"{name} {mode}: {said.splitlines()[-3].strip()}")
+
+
+@inside
+def test_run_stops_when_the_arm_faults_and_refuses_one_that_has_a_fault(arm):
+    name, _, observer = arm
+    process = start(sys.executable, "-m", "dvrk_drake.cli", "run", "--arm", name)
+    other = None
+    try:
+        observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 90, "run")
+        other = start_controller(name, "--echo")
+        observer.until(lambda status: status.guard_state == Status.STATE_FAULT, 60, "fault")
+        assert process.wait(20) == 2
+    finally:
+        process.kill()
+        if other is not None:
+            end(other)
+    assert "has a fault: senders" in process.stdout.read()
+    again = start(sys.executable, "-m", "dvrk_drake.cli", "run", "--arm", name)
+    assert again.wait(60) == 2
+    assert "It must be reset first" in again.stdout.read()
+    reset(name, observer)
+    assert drift(name, observer.last) < 1e-3
+
+
+@inside
 def test_garbage_neither_stops_nor_moves_the_arm(arm):
     name, process, observer = arm
     generator = np.random.default_rng(7)
@@ -225,15 +287,5 @@ def test_two_controllers_are_noticed_and_a_reset_must_be_meant(arm):
         end(second)
     time.sleep(0.2)
     assert observer.last.guard_state == Status.STATE_FAULT
-    network, sender_id = lcm.LCM(), draw_id()
-    for k, reset in enumerate((False, False, True)):
-        status, command = observer.last, Command()
-        command.utime, command.sequence, command.sender_id = time.monotonic_ns() // 1000, k, sender_id
-        command.session_id, command.status_utime = status.session_id, status.utime
-        command.arm_name, command.num_joints, command.control_mode = status.arm_name, status.num_joints, Command.HOLD
-        command.position = command.velocity = command.effort = [0.0] * status.num_joints
-        command.reset_fault = reset
-        network.publish(f"DVRK_COMMAND_{name.upper()}", command.encode())
-        time.sleep(0.01)
-    observer.until(lambda status: status.guard_state == Status.STATE_HOLD, 5, "reset")
+    reset(name, observer)
     assert drift(name, observer.last) < 1e-3

@@ -7,6 +7,8 @@ import sys
 import numpy as np
 import pytest
 
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, StationError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes import pace
@@ -100,3 +102,26 @@ def test_driver_file(tmp_path):
             load_driver(path)
     with pytest.raises(StationError, match=r"nowhere\.yaml"):
         load_driver(tmp_path / "nowhere.yaml")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["arm", "--arm", "mtml", "--pose", "1", "2"], "a pose of MTML is 7 numbers"),
+        (["arm", "--arm", "mtml", "--lcm-url", "bogus://"], 'LCM network "bogus://" cannot be used'),
+        (["arm", "--arm", "mtml", "--driver", "nowhere.yaml"], "nowhere.yaml"),
+        (["run", "--arm", "mtml", "--lcm-url", "bogus://"], 'LCM network "bogus://" cannot be used'),
+        (["run", "--arm", "nobody"], 'unknown arm "nobody"'),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(arguments, message, capfd):
+    assert main(arguments) == 2
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("dvrk-drake")]
+    assert message in line
+
+
+def test_a_model_of_another_arm_is_refused(tmp_path, capfd):
+    path = tmp_path / "model.yaml"
+    IdentifiedModel.from_arm(load_arm("mtmr")).save(path)
+    assert main(["run", "--arm", "mtml", "--model", str(path)]) == 2
+    assert "model.yaml: is of MTMR, not of MTML" in capfd.readouterr().err

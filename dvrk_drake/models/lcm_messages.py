@@ -12,8 +12,7 @@ Message = TypeVar("Message", lcmt_dvrk_command, lcmt_dvrk_status)
 
 STATUS_PREFIX = "DVRK_STATUS_"
 
-#: lcmt_dvrk_status.guard_state in words.
-STATE_NAMES = {
+_STATE_NAMES = {
     value: name.removeprefix("STATE_").lower()
     for name, value in vars(lcmt_dvrk_status).items()
     if name.startswith("STATE_")
@@ -44,3 +43,8 @@ def decode(message_type: type[Message], data: bytes) -> Message | None:
         return message_type.decode(data)
     except Exception:
         return None
+
+
+def describe_state(guard_state: int, fault_text: str = "") -> str:
+    """A guard's state in words."""
+    return _STATE_NAMES.get(guard_state, f"state {guard_state}") + (f": {fault_text}" if fault_text else "")

@@ -11,14 +11,15 @@ import lcm
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import STATE_NAMES, STATUS_PREFIX, status_channel
+from dvrk_drake.models.lcm_messages import STATUS_PREFIX, describe_state, status_channel
 from dvrk_drake.models.recording_stream import RecordingFile, check_stream_output, open_recording_file
 from dvrk_drake.models.status_stream import StatusStream
+from dvrk_drake.processes.lcm_network import handle_message
 
 #: How long the first status may take [s], and after how long without one the live line says so.
 FIRST_STATUS, SILENCE = 10.0, 0.5
-#: Longest wait for a message before it is looked whether to stop [ms].
-_POLL = 100
+#: Longest wait for a message before it is looked whether to stop [s].
+_POLL = 0.1
 
 
 class Recorder:
@@ -65,12 +66,12 @@ class Recorder:
             while not stopped() and self.stream.last is None:
                 if time.monotonic() > end:
                     raise RecordingError(self._why_silent())
-                self._lcm.handle_timeout(_POLL)
+                handle_message(self._lcm, _POLL)
             if self._file is None:
                 raise RecordingError(f"{self._path}: not made: ended before the first status of {self._arm.name}")
             end = time.monotonic() + duration
             while not stopped() and time.monotonic() < end:
-                self._lcm.handle_timeout(_POLL)
+                handle_message(self._lcm, _POLL)
                 show(self.describe)
         finally:
             if self._file is not None:
@@ -90,9 +91,9 @@ class Recorder:
             f"{self._arm.name}: {self.stream.num_taken} rows",
             f"{len(self._arrivals)} Hz",
             f"{self.stream.num_lost} lost",
-            STATE_NAMES.get(status.guard_state, f"state {status.guard_state}"),
+            describe_state(status.guard_state, status.fault_text),
         ]
-        return ", ".join([*parts, status.fault_text] if status.fault_text else parts)
+        return ", ".join(parts)
 
     def _receive(self, channel: str, data: bytes) -> None:
         if channel != self._channel:

@@ -18,7 +18,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import STATE_NAMES, command_channel
+from dvrk_drake.models.lcm_messages import command_channel, describe_state
 from dvrk_drake.processes.pace import Pace
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.command_guard import CommandGuard
@@ -120,12 +120,8 @@ class SimulatedArm:
 
     def _describe(self) -> str:
         guard = self.guard
-        parts = [STATE_NAMES[guard.state]]
-        if guard.fault_text:
-            parts.append(guard.fault_text)
-        if guard.sender_id:
-            parts.append(f"sender {guard.sender_id}")
-        return ": ".join(parts)
+        sender = f", sender {guard.sender_id}" if guard.sender_id else ""
+        return describe_state(guard.state, guard.fault_text) + sender
 
 
 def stop_on_signals() -> Callable[[], bool]:

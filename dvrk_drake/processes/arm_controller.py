@@ -1,0 +1,72 @@
+"""The controller that answers an arm's status messages, one command each, without a clock of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import DiagramBuilder
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.systems.dvrk_command_sender import DvrkCommandSender
+from dvrk_drake.systems.dvrk_status_receiver import DvrkStatusReceiver
+from dvrk_drake.systems.effort_ramp import EffortRamp
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
+
+
+class ArmController:
+    """Gravity compensation or a pose hold of one arm, from status to command.
+
+    A Diagram of DvrkStatusReceiver, GravityPidController, EffortRamp and DvrkCommandSender, stepped by forced updates:
+    one status in, one command out, nothing in between waits for a period. Whenever efforts do not act yet, or not any
+    more, it commands the measured efforts; when they begin to act it ramps to its own, and latches the pose to hold.
+    """
+
+    def __init__(self, arm: Arm, model: IdentifiedModel, mode: Mode, period: float) -> None:
+        """Of `arm`, carried by `model`.
+
+        Args:
+            arm: named in the messages.
+            model: of that arm, mounted as it is.
+            mode: "gravity" or "hold".
+            period: in which statuses come [s].
+        """
+        builder = DiagramBuilder()
+        self._mode = mode
+        receiver = builder.AddSystem(DvrkStatusReceiver(arm))
+        self._controller = builder.AddSystem(GravityPidController(model, period=period, mode="gravity"))
+        self._ramp = builder.AddSystem(EffortRamp(arm.num_joints, period=period))
+        self._sender = builder.AddSystem(DvrkCommandSender(arm))
+        builder.Connect(receiver.GetOutputPort("state_estimated"), self._controller.GetInputPort("state_estimated"))
+        builder.Connect(receiver.GetOutputPort("effort_measured"), self._ramp.GetInputPort("effort_measured"))
+        builder.Connect(self._controller.GetOutputPort("effort"), self._ramp.GetInputPort("effort_wanted"))
+        builder.Connect(self._ramp.GetOutputPort("effort"), self._sender.GetInputPort("effort"))
+        status = builder.ExportInput(receiver.GetInputPort("lcmt_dvrk_status"), "lcmt_dvrk_status")
+        builder.ConnectInput(status, self._sender.GetInputPort("lcmt_dvrk_status"))
+        self._diagram = builder.Build()
+        self._context = self._diagram.CreateDefaultContext()
+        self._acting = False
+
+    @property
+    def sender_id(self) -> int:
+        """By which the arm tells this controller from others."""
+        return self._sender.sender_id
+
+    def answer(self, status: lcmt_dvrk_status, time: float) -> lcmt_dvrk_command:
+        """The command that answers `status` at `time` [s] of the controller's own clock."""
+        context = self._context
+        context.SetTime(time)
+        self._diagram.GetInputPort("lcmt_dvrk_status").FixValue(context, AbstractValue.Make(status))
+        acts = status.guard_state == lcmt_dvrk_status.STATE_EFFORT and status.command_sender_id == self.sender_id
+        ramp_context = self._ramp.GetMyMutableContextFromRoot(context)
+        self._ramp.GetInputPort("enabled").FixValue(ramp_context, np.array([float(acts)]))
+        if acts != self._acting:
+            # From "gravity" to "hold" the pose is latched anew and the integrator is empty.
+            controller_context = self._controller.GetMyMutableContextFromRoot(context)
+            self._controller.SetMode(controller_context, self._mode if acts else "gravity")
+            self._acting = acts
+        state = self._diagram.AllocateDiscreteVariables()
+        self._diagram.CalcForcedDiscreteVariableUpdate(context, state)
+        context.SetDiscreteState(state)
+        return self._sender.get_output_port().Eval(self._sender.GetMyContextFromRoot(context))

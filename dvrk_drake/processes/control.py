@@ -1,0 +1,134 @@
+"""A process that controls one arm over LCM: `dvrk-drake run`."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+
+import lcm
+import numpy as np
+
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.lcm_messages import command_channel, decode, describe_state, is_status_of, status_channel
+from dvrk_drake.processes.arm_controller import ArmController
+from dvrk_drake.processes.lcm_network import handle_message
+
+#: Without a status for this long there is no arm [s]; at first it may have to be started.
+_SILENCE, _FIRST_WAIT = 1.0, 10.0
+
+#: How long the arm may take to confirm that it holds by itself [s].
+_RELEASE = 1.0
+
+#: How often `tell` hears the live status [s].
+_TELL = 0.2
+
+
+class ArmLink:
+    """Both channels of one arm, for a loop that is driven by its messages: only the newest status counts."""
+
+    def __init__(self, arm: Arm, url: str) -> None:
+        """Of `arm` on the LCM network `url`."""
+        self.arm, self.lost = arm, 0
+        self._lcm = lcm.LCM(url)
+        self._is_of_arm = is_status_of(arm)
+        self._last: lcmt_dvrk_status | None = None
+        self._is_new = False
+        self._lcm.subscribe(status_channel(arm), self._hear)
+
+    def next_status(self, seconds: float) -> lcmt_dvrk_status:
+        """The newest status that comes within `seconds`.
+
+        Raises:
+            ControllerError: none came.
+        """
+        end = time.monotonic() + seconds
+        self._is_new = False
+        while not self._is_new and (left := end - time.monotonic()) > 0:
+            handle_message(self._lcm, left)
+        while handle_message(self._lcm, 0.0):
+            pass
+        if not self._is_new or self._last is None:
+            raise ControllerError(f"no status of {self.arm.name} for {seconds:g} s on {status_channel(self.arm)}")
+        return self._last
+
+    def send(self, command: lcmt_dvrk_command) -> None:
+        """Publishes a command."""
+        self._lcm.publish(command_channel(self.arm), command.encode())
+
+    def _hear(self, channel: str, data: bytes) -> None:
+        status = decode(lcmt_dvrk_status, data)
+        if status is None or not self._is_of_arm(status):
+            return
+        if self._last is not None and status.session_id == self._last.session_id:
+            self.lost += max(0, status.sequence - self._last.sequence - 1)
+        self._last, self._is_new = status, True
+
+
+def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
+    """The first status of an arm that may be controlled, and the period in which statuses come [s].
+
+    Raises:
+        ControllerError: no arm, a fault, a pose outside the limits, or an arm that takes no efforts.
+    """
+    status, name = link.next_status(_FIRST_WAIT), link.arm.name
+    if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
+        raise ControllerError(f"{name} has a fault: {status.fault_text}. It must be reset first")
+    if violations := link.arm.limit_violations(status.position):
+        raise ControllerError(f"{name} stands outside its limits: {'; '.join(violations)}. Move it inside first")
+    if not status.accepted_modes >> lcmt_dvrk_command.EFFORT & 1:
+        raise ControllerError(f"{name} does not accept efforts now; it is {describe_state(status.guard_state)}")
+    for _ in range(20):
+        later = link.next_status(_SILENCE)
+    return status, 1e-6 * (later.utime - status.utime) / (later.sequence - status.sequence)
+
+
+def control(link: ArmLink, controller: ArmController, stopped: Callable[[], bool], tell: Callable[[str], None]) -> None:
+    """Answers every status until `stopped`, then leaves the arm to its own hold.
+
+    Args:
+        link: to the arm.
+        controller: makes the commands.
+        stopped: asked once a status.
+        tell: hears the live status a few times a second.
+
+    Raises:
+        ControllerError: the arm fell silent, faulted or was restarted.
+    """
+    start = time.monotonic()
+    session = link.next_status(_SILENCE).session_id
+    trips: deque[float] = deque(maxlen=1000)
+    answered, told_at, told_count = 0, start, 0
+    while not stopped():
+        status = link.next_status(_SILENCE)
+        if status.session_id != session:
+            raise ControllerError(f"{link.arm.name} was restarted: look at it, then start again")
+        if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
+            raise ControllerError(f"{link.arm.name} has a fault: {status.fault_text}")
+        now = time.monotonic() - start
+        link.send(controller.answer(status, now))
+        answered += 1
+        if status.command_sender_id == controller.sender_id:
+            trips.append(now - 1e-6 * status.command_utime)
+        if now + start - told_at >= _TELL:
+            rate = (answered - told_count) / (now + start - told_at)
+            trip = 1e3 * float(np.median(trips)) if trips else float("nan")
+            state = describe_state(status.guard_state)
+            tell(f"{state}; {rate:.0f} Hz, round trip {trip:.2f} ms, {link.lost} statuses lost")
+            told_at, told_count = now + start, answered
+    _release(link, controller, start)
+
+
+def _release(link: ArmLink, controller: ArmController, start: float) -> None:
+    """Asks the arm to hold until it says that it does."""
+    end = time.monotonic() + _RELEASE
+    while time.monotonic() < end:
+        status = link.next_status(_SILENCE)
+        if status.guard_state in (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_OFF):
+            return
+        command = controller.answer(status, time.monotonic() - start)
+        command.control_mode = lcmt_dvrk_command.HOLD
+        link.send(command)
+    raise ControllerError(f"{link.arm.name} did not confirm that it holds; without commands it does after its expiry")
