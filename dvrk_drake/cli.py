@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from dvrk_drake.cli_lcm import add_arm, add_run
+from dvrk_drake.cli_record import add_record
 from dvrk_drake.cli_simulate import add_simulate
 from dvrk_drake.cli_support import (
     ProgressBar,
@@ -17,6 +18,7 @@ from dvrk_drake.cli_support import (
     import_interruptibly,
     made_folder,
     mounted,
+    print_notes,
     quiet_drake,
     seed,
     until_stopped,
@@ -77,7 +79,7 @@ def _model(options: argparse.Namespace) -> None:
 
 def _identify(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_identification
-    from dvrk_drake.analysis.slow_parts import slow_parts
+    from dvrk_drake.analysis.poses import find_poses
     from dvrk_drake.analysis.static_identification import identify_static
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_model
     from dvrk_drake.models.arm import load_arm
@@ -85,16 +87,16 @@ def _identify(options: argparse.Namespace) -> None:
 
     arm = mounted(load_arm(options.arm), options.gravity)
     recording = read_recording(options.recording, arm, options.coordinates)
+    print_notes(options.recording, recording.notes)
     check_output(options.output, options.recording)
-    measured = None
-    if options.slow_parts:
-        recording.check_fits(arm)
-        recording, measured = slow_parts(recording, arm)
+    console = make_console()
+    recording, measured, note = find_poses(recording, arm, options.slow_parts)
+    if note:
+        console.print(note)
     with ProgressBar("identifying") as (progress, task):
         result = identify_static(
             recording, arm, options.method, lambda share: progress.update(task, completed=100 * share), measured
         )
-    console = make_console()
     print_doubts(console, result.doubts)
     print_model(console, result.model)
     if len(result.recording) < len(recording):
@@ -110,7 +112,7 @@ def _identify(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_validation
-    from dvrk_drake.analysis.slow_parts import slow_parts
+    from dvrk_drake.analysis.poses import find_poses
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
     from dvrk_drake.analysis.validation import validate
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -120,13 +122,13 @@ def _validate(options: argparse.Namespace) -> None:
     model = IdentifiedModel.load(options.model)
     arm = model.load_arm()
     recording = read_recording(options.recording, arm, options.coordinates)
+    print_notes(options.recording, recording.notes)
     if options.json is not None:
         check_output(options.json, options.recording, options.model)
     console = make_console()
-    measured = None
-    if options.slow_parts:
-        recording.check_fits(arm)
-        recording, measured = slow_parts(recording, arm)
+    recording, measured, note = find_poses(recording, arm, options.slow_parts)
+    if note:
+        console.print(note)
     if motion := recording.motion(arm):
         console.print(
             f"the arm moves in this recording ({motion}): the model holds poses, and "
@@ -154,6 +156,7 @@ def _predict(options: argparse.Namespace) -> None:
     check_output(options.output, options.recording, options.model)
     model = IdentifiedModel.load(options.model)
     recording = read_recording(options.recording, model.load_arm(), options.coordinates)
+    print_notes(options.recording, recording.notes)
     tau = predict(model, recording)
     write_csv(options.output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
 
@@ -258,7 +261,7 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("--output", required=True, metavar="MODEL.yaml", help="the model file to write")
     verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="default: robust")
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
-    verb.add_argument("--slow-parts", action="store_true", help="of a motion, take where a joint is slow as poses")
+    verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
     add_gravity(verb)
     verb.set_defaults(run=_identify)
 
@@ -266,7 +269,7 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument("model", metavar="MODEL.yaml")
     _add_recording(verb)
     verb.add_argument("--json", metavar="FILE", help="write the errors as JSON")
-    verb.add_argument("--slow-parts", action="store_true", help="of a motion, compare where a joint is slow")
+    verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.set_defaults(run=_validate)
 
@@ -275,16 +278,16 @@ def _parser() -> argparse.ArgumentParser:
     _add_recording(verb)
     verb.add_argument("--output", required=True, metavar="FILE.csv", help="columns tau1.., one row a row")
     verb.set_defaults(run=_predict)
-    verb = verbs.add_parser("convert", help="turn a public recording (team .mat, WPI 21-column CSV) into our CSV")
+    verb = verbs.add_parser("convert", help="turn a recording (LCM log, team .mat, WPI 21-column CSV) into our CSV")
     verb.add_argument("input", metavar="INPUT")
     verb.add_argument("output", metavar="OUTPUT.csv")
-    verb.add_argument("--format", choices=("team-mat", "wpi-csv"), help="default: detected")
+    verb.add_argument("--format", choices=("team-mat", "wpi-csv", "lcm-log"), help="default: detected")
     verb.add_argument("--variable", metavar="NAME", help="the .mat's variable, where several fit")
     verb.add_argument(
         "--rate", type=float, default=200.0, metavar="HZ", help="samples a second of the CSV; default: 200"
     )
     verb.add_argument(
-        "--arm", help="write joint coordinates of this arm, e.g. psm, instead of actuator coordinates (WPI)"
+        "--arm", help="e.g. psm; WPI: write its joint coordinates instead of the actuators'; LCM log: which arm"
     )
     verb.add_argument("--skip-invalid", action="store_true", help="leave out rows that are not numbers, and count them")
     verb.set_defaults(run=_convert)
@@ -295,6 +298,7 @@ def _parser() -> argparse.ArgumentParser:
 
     add_arm(verbs)
     add_run(verbs)
+    add_record(verbs)
     add_simulate(verbs)
     verb = verbs.add_parser(
         "teleop", help="simulate a master arm that leads a PSM, with your hand on sliders or a played one"
@@ -316,10 +320,13 @@ def _parser() -> argparse.ArgumentParser:
 _model_help = (
     "Prints the base parameters; with --latex, --python or --c the gravity torque and its regressor as source."
 )
+_slow_parts_help = "of a motion without rests, take where a joint is slow as poses"
 
 
 def _add_recording(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument("recording", metavar="RECORDING.csv", help="header with q1..qn, tau1..taun; t, qd1.. optional")
+    verb.add_argument(
+        "recording", metavar="RECORDING", help="CSV with header q1..qn, tau1..taun; t, qd1.. optional; or an LCM log"
+    )
     verb.add_argument(
         "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
     )

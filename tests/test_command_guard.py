@@ -8,7 +8,7 @@ import pytest
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.systems.command_check import decode
+from dvrk_drake.models.lcm_messages import decode
 from dvrk_drake.systems.command_guard import CommandGuard
 
 ARM = load_arm("mtml")

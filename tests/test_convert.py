@@ -309,7 +309,7 @@ def test_detect_format(tmp_path):
     assert detect_format(write_wpi(tmp_path, wpi_rows())) == "wpi-csv"
     binary = tmp_path / "model.pkl"
     binary.write_bytes(b"\x80\x04\x95\0\0\0")
-    assert_refused(r"model\.pkl: neither a MATLAB file .* nor a text file", detect_format, binary)
+    assert_refused(r"model\.pkl: neither an LCM log, a MATLAB file .* nor a text file", detect_format, binary)
     assert_refused("nowhere: no such file", detect_format, tmp_path / "nowhere")
     assert_refused("is not a file", detect_format, tmp_path)
 

@@ -14,12 +14,13 @@ from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.lcm_messages import is_status_of
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.dvrk_command_sender import DvrkCommandSender
 from dvrk_drake.systems.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.dvrk_status_receiver import DvrkStatusReceiver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.lcm_serializer import TolerantSerializer, is_status_of
+from dvrk_drake.systems.lcm_serializer import TolerantSerializer
 from dvrk_drake.systems.sim_dvrk_driver import apply_driver_config
 
 ARM = load_arm("mtml")

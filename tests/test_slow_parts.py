@@ -1,11 +1,14 @@
 """The slow parts of a motion: what is taken for a pose, and what it can tell."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dvrk_drake.analysis.convert import convert
+from dvrk_drake.analysis.poses import find_poses
+from dvrk_drake.analysis.rests import SAME_REST, rest_poses
 from dvrk_drake.analysis.slow_parts import slow_parts
 from dvrk_drake.analysis.static_identification import identify_static
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -21,19 +24,19 @@ def arm():
     return load_arm("psm")
 
 
-def motion(arm, poses, generator, travel=2.0, rest=0.4):
+def motion(arm, poses, generator, travel=2.0, rest=0.4, rate=RATE):
     """From pose to pose with a rest at each; torques are gravity's plus a viscous friction that spoils the travel."""
-    t_travel, t_rest = np.arange(0, travel, 1 / RATE), np.arange(0, rest, 1 / RATE)
+    t_travel, t_rest = np.arange(0, travel, 1 / rate), np.arange(0, rest, 1 / rate)
     s = t_travel / travel
     blend = 10 * s**3 - 15 * s**4 + 6 * s**5
     q = [np.tile(poses[0], (len(t_rest), 1))]
     for a, b in itertools.pairwise(poses):
         q += [a + blend[:, None] * (b - a), np.tile(b, (len(t_rest), 1))]
     q = np.vstack(q)
-    qd = np.gradient(q, 1 / RATE, axis=0)
+    qd = np.gradient(q, 1 / rate, axis=0)
     tau = IdentifiedModel.from_arm(arm).holding_torque(q) + 0.05 * arm.effort_limits * qd
     tau += 1e-3 * arm.effort_limits * generator.normal(size=tau.shape)
-    return Recording(q=q, qd=qd, tau=tau, t=np.arange(len(q)) / RATE)
+    return Recording(q=q, qd=qd, tau=tau, t=np.arange(len(q)) / rate)
 
 
 def test_rests_of_a_motion_are_found_and_identify_the_arm(arm):
@@ -63,13 +66,62 @@ def test_repetitions_are_one_part(arm):
     np.testing.assert_allclose(once.recording.q, thrice.recording.q, atol=1e-3)
 
 
+def test_slow_parts_at_1_khz_are_those_at_200_hz(arm):
+    poses = arm.sample_poses(6, np.random.default_rng(1), margin=0.1)
+    slow, fast = (slow_parts(motion(arm, poses, np.random.default_rng(2), rate=rate), arm) for rate in (200.0, 1000.0))
+    assert abs(len(slow.measured) - len(fast.measured)) <= 0.1 * len(slow.measured)
+    assert fast.measured.sum(axis=0).min() >= len(poses)
+
+
+def test_a_rest_does_not_reach_over_a_gap(arm):
+    """Where samples are missing the arm may have been anywhere."""
+    a, b = arm.sample_poses(2, np.random.default_rng(1), margin=0.1)
+    recording = motion(arm, [a, b], np.random.default_rng(2), rest=2.0)
+    late = recording.t >= 5.0  # in the middle of the rest at b
+    sag = 0.9 * arm.per_joint(*SAME_REST)
+    split = replace(recording, t=recording.t + 5.0 * late, q=recording.q + sag * late[:, None])
+    rests = rest_poses(split, arm)
+    assert len(rests) == 2
+    # Both halves are averaged as samples of one pose, each by its own later half.
+    np.testing.assert_allclose(rests.q[1], b + 0.5 * sag, atol=1e-4)
+
+
+@pytest.mark.parametrize("rate", [100.0, 1000.0])
+@pytest.mark.parametrize("with_speeds", [True, False])
+def test_rests_are_poses_of_all_joints(arm, rate, with_speeds):
+    generator = np.random.default_rng(3)
+    poses = arm.sample_poses(12, generator, margin=0.1)
+    recording = motion(arm, [*poses, poses[0]], generator, rest=1.0, rate=rate)
+    noisy = recording.qd + arm.per_joint(0.01, 0.001) * generator.normal(size=recording.q.shape)
+    rests = rest_poses(replace(recording, qd=noisy if with_speeds else None), arm)
+    assert len(rests) == len(poses), "the last pose is the first again"
+    # A rest begins when the arm is slow, not when it stands.
+    np.testing.assert_allclose(rests.q, poses, atol=1e-4)
+    truth = IdentifiedModel.from_arm(arm).holding_torque(poses)
+    assert np.all(np.abs(rests.tau - truth) < 1e-3 * arm.effort_limits)
+    found = find_poses(recording, arm)
+    assert found.measured is None
+    assert found.note == f"12 poses at which the arm rests are taken; {len(recording)} rows"
+
+
+def test_what_does_not_rest_is_left_as_it_is(arm):
+    generator = np.random.default_rng(4)
+    poses = arm.sample_poses(12, generator, margin=0.1)
+    moving = motion(arm, poses, generator, rest=0.0)
+    assert len(rest_poses(moving, arm)) == 0
+    assert find_poses(moving, arm).recording is moving
+    assert find_poses(moving, arm, take_slow_parts=True).measured.sum(axis=1).max() == 1
+    assert rest_poses(replace(moving, t=None, qd=None), arm) is None
+    assert rest_poses(replace(moving, t=0.1 * np.arange(len(moving))), arm) is None
+
+
 def test_what_has_no_slow_parts_is_refused(arm):
     q = np.zeros((50, 7))
     with pytest.raises(IdentificationError, match=r"need a motion: t that increases and qd1\.\.qd7 over 100 rows"):
         slow_parts(Recording(q=q, tau=q), arm)
     t = np.arange(400) * 0.1
     q = np.zeros((400, 7))
-    with pytest.raises(IdentificationError, match=r"samples 0\.1 s apart"):
+    with pytest.raises(IdentificationError, match=r"samples 0\.1 s apart are too far for slow parts; below 0\.05 s"):
         slow_parts(Recording(q=q, qd=q, tau=q, t=t), arm)
     with pytest.raises(RecordingError, match="has no efforts"):
         slow_parts(Recording(q=q, qd=q, t=t), arm)

@@ -1,6 +1,6 @@
-"""Public recordings of real arms, converted to the CSV of this project.
+"""LCM logs, and public recordings of real arms, converted to the CSV of this project.
 
-Two layouts, both of the WPI AIM lab; `docs/public_recordings.md` says how to obtain them.
+The public ones have two layouts, both of the WPI AIM lab; `docs/public_recordings.md` says how to obtain them.
 
 - "team-mat", https://github.com/WPI-AIM/dvrk_gravity_comp: a MATLAB array of 8 x 2 x N.
 - "wpi-csv", https://github.com/WPI-AIM/dvrk_dynamics_identification: a CSV of 21 columns without a header.
@@ -23,10 +23,11 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.csv_rows import is_number, parse_finite, parse_number, read_bytes, read_rows
+from dvrk_drake.models.lcm_log import is_lcm_log
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.recording import Recording, write_recording
+from dvrk_drake.models.recording import Recording, read_recording, write_recording
 
-Format = Literal["team-mat", "wpi-csv"]
+Format = Literal["team-mat", "wpi-csv", "lcm-log"]
 
 #: Nominal rate of the "wpi-csv" recordings [Hz].
 WPI_RATE = 200.0
@@ -66,7 +67,7 @@ def convert(
     arm: Arm | None = None,
     skip_invalid: bool = False,
 ) -> Conversion:
-    """Reads a public recording and writes it as the CSV that `read_recording` reads, at once or not at all.
+    """Reads a recording and writes it as the CSV that `read_recording` reads, at once or not at all.
 
     Args:
         path: the recording.
@@ -75,6 +76,7 @@ def convert(
         variable: "team-mat": which variable; needed if several fit.
         rate: "wpi-csv": samples a second [Hz].
         arm: "wpi-csv": write joint coordinates of this arm; otherwise the file's own, of the actuators.
+            "lcm-log": the arm whose statuses are read; needed if there are several.
         skip_invalid: leave out invalid rows (or poses) and count them, instead of refusing the file.
 
     Raises:
@@ -85,7 +87,12 @@ def convert(
         raise RecordingError(f'unknown format "{format}"; known formats: {", ".join(get_args(Format))}')
     if os.path.exists(output) and os.path.exists(path) and os.path.samefile(path, output):
         raise RecordingError(f"{output}: is the recording itself; name another output")
-    if (format or detect_format(path)) == "team-mat":
+    chosen = format or detect_format(path)
+    if chosen == "lcm-log":
+        if rate != WPI_RATE or variable is not None or skip_invalid:
+            raise RecordingError(f"{path}: --rate, --variable and --skip-invalid do not apply to an LCM log")
+        conversion = _read_lcm_log(Path(path), arm)
+    elif chosen == "team-mat":
         if rate != WPI_RATE:
             raise RecordingError(f"{path}: --rate does not apply to team-mat, whose poses have no time")
         if arm is not None:
@@ -125,18 +132,20 @@ def wpi_in_joint_coordinates(recording: Recording, arm: Arm) -> Recording:
 
 
 def detect_format(path: str | Path) -> Format:
-    """The format a file seems to have, from its first bytes: MATLAB or text. The reader judges the rest.
+    """The format a file seems to have, from its first bytes: LCM, MATLAB or text. The reader judges the rest.
 
     Raises:
         RecordingError: no such file, or it is neither.
     """
     path = Path(path)
+    if is_lcm_log(path):
+        return "lcm-log"
     content = read_bytes(path)
     if content[126:128] in (b"IM", b"MI") or content[:8] == _HDF5_MAGIC or path.suffix.lower() == ".mat":
         return "team-mat"
     if b"\0" not in content[:4096]:
         return "wpi-csv"
-    raise RecordingError(f"{path}: neither a MATLAB file (team-mat) nor a text file in UTF-8 (wpi-csv)")
+    raise RecordingError(f"{path}: neither an LCM log, a MATLAB file (team-mat) nor a text file in UTF-8 (wpi-csv)")
 
 
 def read_team_mat(path: str | Path, *, variable: str | None = None, skip_invalid: bool = False) -> Recording:
@@ -180,6 +189,13 @@ def read_wpi_csv(path: str | Path, rate: float = WPI_RATE, *, skip_invalid: bool
         RecordingError: not such a file, fewer than two rows, or a cell that is no finite number.
     """
     return _read_wpi_csv(Path(path), rate, skip_invalid).recording
+
+
+def _read_lcm_log(path: Path, arm: Arm | None) -> Conversion:
+    if not is_lcm_log(path):
+        raise RecordingError(f"{path}: is not an LCM log")
+    recording = read_recording(path, arm)
+    return Conversion(recording, list(recording.notes))
 
 
 def _read_team_mat(path: Path, variable: str | None, skip_invalid: bool) -> Conversion:

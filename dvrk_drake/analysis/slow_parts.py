@@ -7,16 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfiltfilt
 
+from dvrk_drake.analysis.rests import LEAST_ROWS, LONGEST_PERIOD, smooth_velocity, stationary_runs
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
 
 #: Slow: below this share of the joint's top speed, and of its top acceleration.
 SLOW_SPEED, SLOW_ACCELERATION = 0.1, 0.2
-#: Cut-off of the zero-phase low-pass before speeds are differentiated [Hz], and its order.
-CUT_OFF, ORDER = 10.0, 4
+#: Rows closer than this are averaged [s].
+LEAST_PERIOD = 0.005
 #: Fewest consecutive samples that make a slow part.
 LEAST_SAMPLES = 3
 #: A slow part ends where any joint is further than this from where it began [rad], [m]; those of one joint whose poses
@@ -40,26 +40,33 @@ def slow_parts(recording: Recording, arm: Arm) -> SlowParts:
     """Finds them, joint by joint, and averages each with its repetitions.
 
     While other joints still move, their velocities and accelerations leave a little inertial torque in it; and dry
-    friction stays in it, of either sign. Both are errors here: a motion wants dynamic identification.
+    friction stays in it, of either sign. Both are errors here: a motion wants dynamic identification, or rests of the
+    whole arm (`rest_poses`).
 
     Raises:
         RecordingError: no efforts, or another arm's.
         IdentificationError: no times or speeds, or nothing in it is slow.
     """
     moving = recording.in_joint_coordinates(arm)
-    tau, qd, t = moving.measured_effort(), moving.qd, moving.t
+    moving.measured_effort()
+    qd, t = moving.qd, moving.t
     where = recording.source or "recording"
-    if qd is None or t is None or len(t) < 100 or not np.all(np.diff(t) > 0):
+    if qd is None or t is None or len(t) < LEAST_ROWS or not np.all(np.diff(t) > 0):
         raise IdentificationError(
             f"{where}: slow parts need a motion: t that increases and qd1..qd{arm.num_joints} over 100 rows or more"
         )
     period = float(np.median(np.diff(t)))
-    if not period < 0.5 / CUT_OFF:
-        raise IdentificationError(f"{where}: samples {period:.3g} s apart are too far for slow parts; below 0.02 s")
-    v = sosfiltfilt(butter(ORDER, CUT_OFF, fs=1 / period, output="sos"), qd, axis=0)
+    if not period < LONGEST_PERIOD:
+        raise IdentificationError(
+            f"{where}: samples {period:.3g} s apart are too far for slow parts; below {LONGEST_PERIOD} s"
+        )
+    moving = _thinned(moving)
+    tau, t = moving.measured_effort(), np.asarray(moving.t)
+    v = smooth_velocity(moving)
     vd = np.gradient(v, t, axis=0)
     # The 99 % quantile, not the maximum: one spike must not make everything else slow.
     is_slow = np.abs(v) < SLOW_SPEED * np.quantile(np.abs(v), 0.99, axis=0)
+    is_slow &= np.diff(t, append=t[-1])[:, None] < LONGEST_PERIOD
     is_slow &= np.abs(vd) < SLOW_ACCELERATION * np.quantile(np.abs(vd), 0.99, axis=0)
     parts = [
         (joint, rows) for joint in range(arm.num_joints) for rows in _parts_of(is_slow[:, joint], joint, moving, arm)
@@ -82,26 +89,36 @@ def slow_parts(recording: Recording, arm: Arm) -> SlowParts:
     return SlowParts(means, measured)
 
 
+def _thinned(recording: Recording) -> Recording:
+    """Means over blocks of rows, such that about 200 a second are left: more say nothing new below the cut-off."""
+    t, qd, tau = recording.t, recording.qd, recording.measured_effort()
+    if t is None or qd is None:
+        return recording
+    size = int(LEAST_PERIOD / float(np.median(np.diff(t))) + 1e-6)
+    if size < 2:
+        return recording
+    blocks = len(t) // size
+
+    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return values[: blocks * size].reshape(blocks, size, *values.shape[1:]).mean(axis=1)
+
+    lines = None if recording.lines is None else recording.lines[: blocks * size : size]
+    return replace(recording, q=mean(recording.q), qd=mean(qd), tau=mean(tau), t=mean(t), lines=lines)
+
+
 def _parts_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Arm) -> list[NDArray[np.int_]]:
     """Rows of each slow part of one joint, repetitions joined; the other joints stay within `SAME_PART` in each."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_slow, [False]]).astype(int)))
     same = arm.per_joint(*SAME_PART)
-    runs = []
-    for first, end in edges.reshape(-1, 2):
-        start = first
-        while end - start >= LEAST_SAMPLES:
-            away = np.any(np.abs(moving.q[start:end] - moving.q[start]) > same, axis=1)
-            stop = start + int(np.argmax(away)) if np.any(away) else end
-            if stop - start >= LEAST_SAMPLES:
-                runs.append(np.arange(start, stop))
-            start = stop
     parts: list[NDArray[np.int_]] = []
-    for run in runs:
+    means = np.empty((0, arm.num_joints))
+    for run in stationary_runs(is_slow, moving.q, same, LEAST_SAMPLES):
         q = moving.q[run].mean(axis=0)
-        for i, part in enumerate(parts):
-            if np.all(np.abs(moving.q[part].mean(axis=0) - q) < same):
-                parts[i] = np.concatenate([part, run])
-                break
+        alike = np.flatnonzero(np.all(np.abs(means - q) < same, axis=1))
+        if len(alike):
+            part = alike[0]
+            parts[part] = np.concatenate([parts[part], run])
+            means[part] = moving.q[parts[part]].mean(axis=0)
         else:
             parts.append(run)
+            means = np.vstack([means, q])
     return parts

@@ -1,4 +1,4 @@
-"""A recording of an arm: positions and efforts over time or over poses, read from and written to CSV."""
+"""A recording of an arm: positions and efforts over time or over poses, read from CSV or an LCM log, written to CSV."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.csv_rows import is_number, parse_finite, read_rows
+from dvrk_drake.models.lcm_log import is_lcm_log
+from dvrk_drake.models.status_log import read_status_log
 
 Coordinates = Literal["joint", "actuator"]
 
@@ -34,8 +36,9 @@ class Recording:
         t: (m,) time, or None for poses.
         coordinates: whether q, qd and tau are of the joints or of the actuators.
         source: where it came from, for messages.
-        lines: (m,) line of each row in the source, for messages.
+        lines: (m,) line of each row in the source, of an LCM log the event's number, for messages.
         sha256: of the source's bytes, or "".
+        notes: what a user must know of how it was read, a line each: damage, messages left out.
     """
 
     q: NDArray[np.float64]
@@ -46,6 +49,7 @@ class Recording:
     source: str = ""
     lines: NDArray[np.int_] | None = None
     sha256: str = ""
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.q)
@@ -139,12 +143,16 @@ class Recording:
 
 
 def read_recording(path: str | Path, arm: Arm | None = None, coordinates: Coordinates = "joint") -> Recording:
-    """Reads a CSV with a header: q1..qn, optionally t, qd1..qdn and tau1..taun, in any order; ignores others.
+    """Reads a CSV, or an LCM log with the DVRK_STATUS messages of an arm; the file's first bytes tell which.
+
+    A CSV has a header: q1..qn, optionally t, qd1..qdn and tau1..taun, in any order; others are ignored. What is read of
+    a log: `read_status_log`.
 
     Args:
-        path: the CSV.
-        arm: whose joints are counted and named in messages; 7 joints without it, as all arms have so far.
-        coordinates: what q, qd and tau are of.
+        path: the CSV or log.
+        arm: whose joints are counted and named in messages, and whose statuses are read of a log; without it a CSV has
+            7 joints, as all arms have so far, and a log statuses of one arm only.
+        coordinates: what q, qd and tau are of; a log's are of the joints.
 
     Raises:
         RecordingError: names the file, the line and the column of what is wrong.
@@ -152,6 +160,15 @@ def read_recording(path: str | Path, arm: Arm | None = None, coordinates: Coordi
     if coordinates not in get_args(Coordinates):
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
     path = Path(path)
+    if is_lcm_log(path):
+        if coordinates != "joint":
+            raise RecordingError(f"{path}: an LCM log is in joint coordinates, not {coordinates}")
+        log = read_status_log(path, arm)
+        return Recording(log.q, log.tau, log.qd, log.t, "joint", str(path), log.events, log.sha256, log.notes)
+    return _read_csv(path, arm, coordinates)
+
+
+def _read_csv(path: Path, arm: Arm | None, coordinates: Coordinates) -> Recording:
     num_joints = arm.num_joints if arm else 7
     numbered, sha256 = read_rows(path)
     if not numbered:
@@ -166,7 +183,7 @@ def read_recording(path: str | Path, arm: Arm | None = None, coordinates: Coordi
         raise RecordingError(f"{path}:{header_line}: column {twice} is named twice")
     blocks = {}
     for prefix, needed in (("q", True), ("qd", False), ("tau", False)):
-        names = [f"{prefix}{i + 1}" for i in range(num_joints)]
+        names = column_names(prefix, num_joints)
         missing = [name for name in names if name not in header]
         if len(missing) == num_joints and not needed:
             continue
@@ -204,9 +221,13 @@ def read_recording(path: str | Path, arm: Arm | None = None, coordinates: Coordi
     )
 
 
+def column_names(prefix: str, num_joints: int) -> list[str]:
+    """The columns of q, qd, tau, or t in a CSV."""
+    return ["t"] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(num_joints)]
+
+
 def write_recording(recording: Recording, path: str | Path) -> None:
     """Writes the CSV that `read_recording` reads, at once or not at all, with every digit of every number."""
-    n = recording.q.shape[1]
     columns, header = [], []
     for prefix, block in (
         ("t", recording.t),
@@ -216,7 +237,7 @@ def write_recording(recording: Recording, path: str | Path) -> None:
     ):
         if block is not None:
             columns.append(block.reshape(len(recording), -1))
-            header += [prefix] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(n)]
+            header += column_names(prefix, recording.q.shape[1])
     write_csv(path, header, np.hstack(columns))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import select
 import time
 from collections import deque
 from collections.abc import Callable
@@ -13,10 +12,9 @@ import numpy as np
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.lcm_messages import command_channel, decode, describe_state, is_status_of, status_channel
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.processes.simulated_arm import describe_state
-from dvrk_drake.systems.command_check import decode
-from dvrk_drake.systems.lcm_serializer import command_channel, is_status_of, status_channel
+from dvrk_drake.processes.lcm_network import handle_message
 
 #: Without a status for this long there is no arm [s]; at first it may have to be started.
 _SILENCE, _FIRST_WAIT = 1.0, 10.0
@@ -49,8 +47,8 @@ class ArmLink:
         end = time.monotonic() + seconds
         self._is_new = False
         while not self._is_new and (left := end - time.monotonic()) > 0:
-            self._handle(left)
-        while self._handle(0.0):
+            handle_message(self._lcm, left)
+        while handle_message(self._lcm, 0.0):
             pass
         if not self._is_new or self._last is None:
             raise ControllerError(f"no status of {self.arm.name} for {seconds:g} s on {status_channel(self.arm)}")
@@ -59,13 +57,6 @@ class ArmLink:
     def send(self, command: lcmt_dvrk_command) -> None:
         """Publishes a command."""
         self._lcm.publish(command_channel(self.arm), command.encode())
-
-    def _handle(self, seconds: float) -> bool:
-        """Handles one message if it comes within that time; lcm's own handle_timeout fails when a signal comes."""
-        ready, _, _ = select.select([self._lcm.fileno()], [], [], seconds)
-        if ready:
-            self._lcm.handle()
-        return bool(ready)
 
     def _hear(self, channel: str, data: bytes) -> None:
         status = decode(lcmt_dvrk_status, data)

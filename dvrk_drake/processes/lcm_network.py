@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import select
 
 import lcm
 from pydrake.lcm import DrakeLcm
@@ -35,3 +36,11 @@ def open_lcm(url: str = "") -> DrakeLcm:
             "ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo"
         )
     return network
+
+
+def handle_message(network: lcm.LCM, seconds: float) -> bool:
+    """Handles one message if it comes within that time; lcm's own handle_timeout fails when a signal comes."""
+    ready, _, _ = select.select([network.fileno()], [], [], seconds)
+    if ready:
+        network.handle()
+    return bool(ready)

@@ -17,21 +17,16 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.errors import StationError
-from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.lcm_messages import command_channel, describe_state
 from dvrk_drake.processes.pace import Pace
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.command_guard import CommandGuard
 from dvrk_drake.systems.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.lcm_serializer import command_channel
 from dvrk_drake.systems.sim_dvrk_driver import apply_driver_config
 
 #: More commands in one step are a flood: the rest waits, and is stale when it is looked at.
 _MESSAGES_A_STEP = 200
-
-_STATES = {
-    value: name.removeprefix("STATE_").lower() for name, value in vars(lcmt_dvrk_status).items() if "STATE_" in name
-}
 
 
 def load_driver(path: str | Path) -> DvrkDriver:
@@ -127,11 +122,6 @@ class SimulatedArm:
         guard = self.guard
         sender = f", sender {guard.sender_id}" if guard.sender_id else ""
         return describe_state(guard.state, guard.fault_text) + sender
-
-
-def describe_state(guard_state: int, fault_text: str = "") -> str:
-    """A guard's state in words."""
-    return _STATES.get(guard_state, f"state {guard_state}") + (f": {fault_text}" if fault_text else "")
 
 
 def stop_on_signals() -> Callable[[], bool]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -10,19 +10,6 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 
 #: No joint is there, that fast or that strong [rad, m, rad/s, m/s, N m, N].
 ABSURD = 1e6
-
-Message = TypeVar("Message", lcmt_dvrk_command, lcmt_dvrk_status)
-
-
-def decode(message_type: type[Message], data: bytes) -> Message | None:
-    """The message of that type in `data`, or None if there is none.
-
-    A decoder made by lcm-gen raises whatever the garbage makes it stumble over: ValueError, struct.error, MemoryError.
-    """
-    try:
-        return message_type.decode(data)
-    except Exception:
-        return None
 
 
 def is_finite(*arrays: Any) -> bool:

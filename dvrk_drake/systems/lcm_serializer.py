@@ -1,4 +1,4 @@
-"""LCM messages on Drake's ports: which channel is whose, and a serializer that garbage cannot stop."""
+"""LCM messages on Drake's ports: a serializer that garbage cannot stop."""
 
 from __future__ import annotations
 
@@ -8,24 +8,7 @@ from typing import Any
 from pydrake.common.value import AbstractValue
 from pydrake.systems.lcm import PySerializer
 
-from dvrk_drake.lcmtypes import lcmt_dvrk_status
-from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.command_check import decode
-
-
-def command_channel(arm: Arm) -> str:
-    """DVRK_COMMAND_<ARM>."""
-    return f"DVRK_COMMAND_{arm.name.upper()}"
-
-
-def status_channel(arm: Arm) -> str:
-    """DVRK_STATUS_<ARM>."""
-    return f"DVRK_STATUS_{arm.name.upper()}"
-
-
-def is_status_of(arm: Arm) -> Callable[[lcmt_dvrk_status], bool]:
-    """Whether a status is of `arm`, by name and size; for TolerantSerializer."""
-    return lambda status: status.arm_name == arm.name and status.num_joints == arm.num_joints
+from dvrk_drake.models.lcm_messages import decode
 
 
 class TolerantSerializer(PySerializer):

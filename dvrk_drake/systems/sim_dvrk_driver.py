@@ -9,6 +9,7 @@ from pydrake.systems.lcm import LcmPublisherSystem
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.lcm_messages import command_channel, status_channel
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.command_guard import CommandGuard
 from dvrk_drake.systems.dvrk_command_receiver import DvrkCommandReceiver
@@ -16,7 +17,7 @@ from dvrk_drake.systems.dvrk_command_sender import draw_id
 from dvrk_drake.systems.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.dvrk_status_sender import DvrkStatusSender
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.lcm_serializer import TolerantSerializer, command_channel, status_channel
+from dvrk_drake.systems.lcm_serializer import TolerantSerializer
 
 
 class SimDvrkDriver(Diagram):

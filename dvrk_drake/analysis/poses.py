@@ -1,0 +1,49 @@
+"""The poses in a recording of any kind: poses already, a motion with rests, or one that has only slow parts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.rests import rest_poses
+from dvrk_drake.analysis.slow_parts import slow_parts
+from dvrk_drake.analysis.static_identification import LEAST_POSES
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.recording import Recording
+
+
+class Poses(NamedTuple):
+    """What `find_poses` found.
+
+    Attributes:
+        recording: one row a pose, or the recording as it was.
+        measured: (m, n) where an effort is a holding torque; None: everywhere.
+        note: where the poses are from, or "".
+    """
+
+    recording: Recording
+    measured: NDArray[np.bool_] | None
+    note: str
+
+
+def find_poses(recording: Recording, arm: Arm, take_slow_parts: bool = False) -> Poses:
+    """The rests of a motion if there are `LEAST_POSES`, else its slow parts if wanted, else the recording as it is.
+
+    Args:
+        recording: poses or a motion, in either coordinates.
+        arm: which was recorded.
+        take_slow_parts: of a motion without enough rests, see `slow_parts`.
+
+    Raises:
+        RecordingError: the recording does not fit the arm, or has no efforts.
+        IdentificationError: no slow parts, where they are wanted.
+    """
+    recording.check_fits(arm)
+    rests = rest_poses(recording, arm)
+    if rests is not None and len(rests) >= LEAST_POSES:
+        return Poses(rests, None, f"{len(rests)} poses at which the arm rests are taken; {len(recording)} rows")
+    if take_slow_parts:
+        return Poses(*slow_parts(recording, arm), note="where a joint is slow is taken for a pose of it")
+    return Poses(recording, None, "")

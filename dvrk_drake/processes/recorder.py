@@ -1,0 +1,121 @@
+"""A process that writes what one arm says over LCM into a file: `dvrk-drake record`."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from pathlib import Path
+
+import lcm
+
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.lcm_messages import STATUS_PREFIX, describe_state, status_channel
+from dvrk_drake.models.recording_stream import RecordingFile, check_stream_output, open_recording_file
+from dvrk_drake.models.status_stream import StatusStream
+from dvrk_drake.processes.lcm_network import handle_message
+
+#: How long the first status may take [s], and after how long without one the live line says so.
+FIRST_STATUS, SILENCE = 10.0, 0.5
+#: Longest wait for a message before it is looked whether to stop [s].
+_POLL = 0.1
+
+
+class Recorder:
+    """Appends every status of one arm to a new file as it arrives, by the wall clock.
+
+    Attributes:
+        stream: what was taken and what not.
+        num_received: messages on the arm's status channel.
+    """
+
+    def __init__(self, arm: Arm, path: str | Path, url: str) -> None:
+        """Of `arm` on the LCM network `url`; the file is made when its first status is there.
+
+        Raises:
+            RecordingError: there can be no new file at `path`.
+        """
+        check_stream_output(path)
+        self.stream = StatusStream(arm.name, arm.num_joints)
+        self.num_received = 0
+        self._arm, self._path, self._url = arm, path, url
+        self._channel = status_channel(arm)
+        self._file: RecordingFile | None = None
+        self._heard: Counter[str] = Counter()
+        self._arrivals: deque[float] = deque()
+        self._lcm = lcm.LCM(url)
+        # All arms' statuses, to say what there is where this one's are not.
+        self._subscription = self._lcm.subscribe(f"{STATUS_PREFIX}.*", self._receive)
+        self._subscription.set_queue_capacity(0)
+
+    def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
+        """Records until `stopped`, or for `duration` [s] from the first message on.
+
+        Args:
+            duration: may be infinite.
+            stopped: asked at least every 0.1 s.
+            show: called after every message, or every 0.1 s without, with what gives the live line.
+
+        Raises:
+            RecordingError: ended before the first status, none within 10 s, the file cannot be written, or two arms of
+                this name.
+        """
+        try:
+            end = time.monotonic() + FIRST_STATUS
+            while not stopped() and self.stream.last is None:
+                if time.monotonic() > end:
+                    raise RecordingError(self._why_silent())
+                handle_message(self._lcm, _POLL)
+            if self._file is None:
+                raise RecordingError(f"{self._path}: not made: ended before the first status of {self._arm.name}")
+            end = time.monotonic() + duration
+            while not stopped() and time.monotonic() < end:
+                handle_message(self._lcm, _POLL)
+                show(self.describe)
+        finally:
+            if self._file is not None:
+                self._file.close()
+
+    def describe(self) -> str:
+        """How it goes, in one line: rate, losses, what the arm does."""
+        now = time.monotonic()
+        while self._arrivals and self._arrivals[0] < now - 1:
+            self._arrivals.popleft()
+        status = self.stream.last
+        if status is None:
+            return f"waiting for {self._channel}"
+        if not self._arrivals or self._arrivals[-1] < now - SILENCE:
+            return f"{self._arm.name}: no status any more; {self.stream.num_taken} rows"
+        parts = [
+            f"{self._arm.name}: {self.stream.num_taken} rows",
+            f"{len(self._arrivals)} Hz",
+            f"{self.stream.num_lost} lost",
+            describe_state(status.guard_state, status.fault_text),
+        ]
+        return ", ".join(parts)
+
+    def _receive(self, channel: str, data: bytes) -> None:
+        if channel != self._channel:
+            self._heard[channel] += 1
+            return
+        self.num_received += 1
+        self._arrivals.append(time.monotonic())
+        status = self.stream.take(data)
+        if self._file is None:
+            if self.stream.last is None:
+                return
+            self._file = open_recording_file(self._path, self._arm, self.stream)
+        self._file.write(data, time.time_ns() // 1000, status)
+
+    def _why_silent(self) -> str:
+        where = f"on channel {self._channel} of {self._url}"
+        if self.num_received:
+            reasons = "; ".join(self.stream.notes())
+            return f"no status of {self._arm.name} within {FIRST_STATUS:.0f} s {where}: {reasons}"
+        if others := ", ".join(sorted(self._heard)):
+            return f"no message within {FIRST_STATUS:.0f} s {where}; there is {others}"
+        return (
+            f"no message within {FIRST_STATUS:.0f} s {where}: does the arm's process or bridge run, on this network? "
+            "Between machines the URL needs ?ttl=1, and each a multicast route (ip route add 239.255.0.0/16 dev DEVICE)"
+        )
