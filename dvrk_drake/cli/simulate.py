@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from dvrk_drake.cli_support import ProgressBar, check_output, made_folder, quiet_drake, until_stopped
+from dvrk_drake.cli.support import ProgressBar, check_output, made_folder, quiet_drake, until_stopped
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from dvrk_drake.analysis.simulation import Simulation
 
 
-def add_simulate(verbs: argparse._SubParsersAction) -> None:
+def add_verbs(verbs: argparse._SubParsersAction) -> None:
     """Adds the verb and its options."""
     verb = verbs.add_parser("simulate", help="simulate an arm under control, as a scenario file says, and record it")
     verb.add_argument("scenario", metavar="ARM_OR_SCENARIO", help="mtml, mtmr, psm: holds its home; or scenario.yaml")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 
-from dvrk_drake.cli_support import print_notes, seconds
+from dvrk_drake.cli.support import print_notes, seconds
 
 
-def add_record(verbs: argparse._SubParsersAction) -> None:
+def add_verbs(verbs: argparse._SubParsersAction) -> None:
     """Adds the verb and its options."""
     verb = verbs.add_parser(
         "record", help="record an arm over LCM; whatever ends it, the file is whole up to its last row"

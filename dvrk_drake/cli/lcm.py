@@ -5,11 +5,16 @@ from __future__ import annotations
 import argparse
 import sys
 
-from dvrk_drake.cli_support import add_gravity, mounted, quiet_drake
+from dvrk_drake.cli.support import add_gravity, mounted, quiet_drake
 
 
-def add_arm(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verb `arm` and its options."""
+def add_verbs(verbs: argparse._SubParsersAction) -> None:
+    """Adds the verbs and their options."""
+    _add_arm(verbs)
+    _add_run(verbs)
+
+
+def _add_arm(verbs: argparse._SubParsersAction) -> None:
     verb = verbs.add_parser("arm", help="play an arm behind LCM: a simulated one with a hardware driver's safeguards")
     verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
     verb.add_argument("--driver", metavar="FILE.yaml", help="configuration of its driver, fields as in DvrkDriver")
@@ -46,8 +51,7 @@ def _arm(options: argparse.Namespace) -> None:
     print(f"ended; {pace.late} ticks began more than a period late", flush=True)
 
 
-def add_run(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verb `run` and its options."""
+def _add_run(verbs: argparse._SubParsersAction) -> None:
     verb = verbs.add_parser("run", help="compensate or hold an arm over LCM")
     verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
     verb.add_argument("--model", metavar="MODEL.yaml", help="from identify; default: what the arm's SDF states")

@@ -1,0 +1,45 @@
+"""The command line: one verb a command. Bad input gives one line on stderr and exit code 2.
+
+Verbs import what they need when they run: drake and numba take seconds, `--help` should not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+
+from dvrk_drake.cli import demo, identify, lcm, model, record, simulate
+from dvrk_drake.cli.support import import_interruptibly
+from dvrk_drake.errors import DvrkDrakeError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one verb; returns the exit code: 0, or 2 for bad input."""
+    options = _parser().parse_args(arguments)
+    try:
+        import_interruptibly()
+        options.run(options)
+    except DvrkDrakeError as error:
+        print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:
+        # The reader (head, less) has seen enough.
+        sys.stderr.close()
+        return 0
+    except KeyboardInterrupt:
+        print("dvrk-drake: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="dvrk-drake", description="Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."
+    )
+    parser.add_argument("--version", action="version", version=version("dvrk-drake"))
+    verbs = parser.add_subparsers(required=True, metavar="VERB")
+    for module in (model, identify, simulate, demo, lcm, record):
+        module.add_verbs(verbs)
+    return parser

@@ -1,0 +1,71 @@
+"""The verbs that show what all of it is for, on simulated arms."""
+
+from __future__ import annotations
+
+import argparse
+
+from dvrk_drake.cli.support import (
+    ProgressBar,
+    check_output,
+    made_folder,
+    quiet_drake,
+    seed,
+)
+
+
+def add_verbs(verbs: argparse._SubParsersAction) -> None:
+    """Adds the verbs and their options."""
+    verb = verbs.add_parser("demo", help="simulate an arm, identify it, compensate it, hold it; writes a folder")
+    verb.add_argument("--output", default="demo_output", metavar="DIR", help="default: demo_output")
+    verb.add_argument("--arm", choices=("mtml", "mtmr", "psm"), default="mtml", help="default: mtml")
+    verb.add_argument("--seed", type=seed, default=0, help="of the simulated arm, its poses and noise; default: 0")
+    verb.set_defaults(run=_demo)
+
+    verb = verbs.add_parser(
+        "teleop", help="simulate a master arm that leads a PSM, with your hand on sliders or a played one"
+    )
+    verb.add_argument(
+        "--html", metavar="FILE", help="play a hand, write the recording and say how well the PSM followed"
+    )
+    verb.add_argument("--port", type=int, help="of the page; default: a free one")
+    verb.set_defaults(run=_teleop)
+
+
+def _demo(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.demo import run_demo
+    from dvrk_drake.analysis.tables import make_console, print_demo
+
+    quiet_drake()
+    output = made_folder(options.output)
+    with ProgressBar("") as (progress, task):
+        result = run_demo(
+            output,
+            options.arm,
+            options.seed,
+            lambda what, share: progress.update(task, description=what, completed=100 * share),
+        )
+    print_demo(make_console(), result, options.output)
+
+
+def _teleop(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.tables import make_console, print_teleoperation
+    from dvrk_drake.analysis.teleoperation_demo import play_teleoperation, run_live_teleoperation, start_scene
+    from dvrk_drake.models.atomic_file import atomic_write
+
+    quiet_drake()
+    if options.html is None:
+        meshcat = start_scene(options.port)
+        print(
+            f"MTML leads PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale under Open Controls; the "
+            "arms appear after some seconds; end with Stop, Escape or Ctrl-C",
+            flush=True,
+        )
+        run_live_teleoperation(meshcat)
+        return
+    check_output(options.html)
+    meshcat = start_scene(options.port)
+    with ProgressBar("playing") as (progress, task):
+        result = play_teleoperation(meshcat, progress=lambda share: progress.update(task, completed=100 * share))
+    with atomic_write(options.html) as stream:
+        stream.write(meshcat.StaticHtml())
+    print_teleoperation(make_console(), result, options.html)

@@ -1,0 +1,172 @@
+"""The verbs that learn from recordings and put to the test what was learnt."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from dvrk_drake.cli.support import (
+    ProgressBar,
+    add_gravity,
+    check_output,
+    made_folder,
+    mounted,
+    print_notes,
+)
+
+
+def add_verbs(verbs: argparse._SubParsersAction) -> None:
+    """Adds the verbs and their options."""
+    verb = verbs.add_parser("identify", help="identify a model from a recording of poses and holding torques")
+    _add_recording(verb)
+    verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, psm, or a YAML file")
+    verb.add_argument("--output", required=True, metavar="MODEL.yaml", help="the model file to write")
+    verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="default: robust")
+    verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
+    verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
+    add_gravity(verb)
+    verb.set_defaults(run=_identify)
+
+    verb = verbs.add_parser("validate", help="compare a model with a recording that it was not made from")
+    verb.add_argument("model", metavar="MODEL.yaml")
+    _add_recording(verb)
+    verb.add_argument("--json", metavar="FILE", help="write the errors as JSON")
+    verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
+    verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
+    verb.set_defaults(run=_validate)
+
+    verb = verbs.add_parser("predict", help="write a model's holding torques at a recording's poses")
+    verb.add_argument("model", metavar="MODEL.yaml")
+    _add_recording(verb)
+    verb.add_argument("--output", required=True, metavar="FILE.csv", help="columns tau1.., one row a row")
+    verb.set_defaults(run=_predict)
+
+    verb = verbs.add_parser("convert", help="turn a recording (LCM log, team .mat, WPI 21-column CSV) into our CSV")
+    verb.add_argument("input", metavar="INPUT")
+    verb.add_argument("output", metavar="OUTPUT.csv")
+    verb.add_argument("--format", choices=("team-mat", "wpi-csv", "lcm-log"), help="default: detected")
+    verb.add_argument("--variable", metavar="NAME", help="the .mat's variable, where several fit")
+    verb.add_argument(
+        "--rate", type=float, default=200.0, metavar="HZ", help="samples a second of the CSV; default: 200"
+    )
+    verb.add_argument(
+        "--arm", help="e.g. psm; WPI: write its joint coordinates instead of the actuators'; LCM log: which arm"
+    )
+    verb.add_argument("--skip-invalid", action="store_true", help="leave out rows that are not numbers, and count them")
+    verb.set_defaults(run=_convert)
+
+
+def _identify(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.plots import plot_identification
+    from dvrk_drake.analysis.poses import find_poses
+    from dvrk_drake.analysis.static_identification import identify_static
+    from dvrk_drake.analysis.tables import make_console, print_doubts, print_model
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.recording import read_recording
+
+    arm = mounted(load_arm(options.arm), options.gravity)
+    recording = read_recording(options.recording, arm, options.coordinates)
+    print_notes(options.recording, recording.notes)
+    check_output(options.output, options.recording)
+    console = make_console()
+    recording, measured, note = find_poses(recording, arm, options.slow_parts)
+    if note:
+        console.print(note)
+    with ProgressBar("identifying") as (progress, task):
+        result = identify_static(
+            recording, arm, options.method, lambda share: progress.update(task, completed=100 * share), measured
+        )
+    print_doubts(console, result.doubts)
+    print_model(console, result.model)
+    if len(result.recording) < len(recording):
+        console.print(
+            f"{len(recording)} rows are {len(result.recording)} distinct poses; samples of a pose are averaged"
+        )
+    result.model.save(options.output)
+    console.print(f"model: {options.output}")
+    if options.plots is not None:
+        plot_identification(made_folder(options.plots), result)
+        console.print(f"plots: {options.plots}")
+
+
+def _validate(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.plots import plot_validation
+    from dvrk_drake.analysis.poses import find_poses
+    from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
+    from dvrk_drake.analysis.validation import validate
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.recording import read_recording
+
+    model = IdentifiedModel.load(options.model)
+    arm = model.load_arm()
+    recording = read_recording(options.recording, arm, options.coordinates)
+    print_notes(options.recording, recording.notes)
+    if options.json is not None:
+        check_output(options.json, options.recording, options.model)
+    console = make_console()
+    recording, measured, note = find_poses(recording, arm, options.slow_parts)
+    if note:
+        console.print(note)
+    if motion := recording.motion(arm):
+        console.print(
+            f"the arm moves in this recording ({motion}): the model holds poses, and "
+            "knows nothing of inertia and of moving friction",
+            style="yellow",
+            soft_wrap=True,
+        )
+    validation = validate(model, recording, measured)
+    print_doubts(console, validation.doubts)
+    print_validation(console, validation)
+    if options.plots is not None:
+        plot_validation(made_folder(options.plots), model, validation, recording.in_joint_coordinates(arm))
+        console.print(f"plots: {options.plots}")
+    if options.json is not None:
+        with atomic_write(options.json) as stream:
+            json.dump(validation.as_dict(), stream, indent=2)
+            stream.write("\n")
+
+
+def _predict(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.validation import predict
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.models.recording import read_recording, write_csv
+
+    check_output(options.output, options.recording, options.model)
+    model = IdentifiedModel.load(options.model)
+    recording = read_recording(options.recording, model.load_arm(), options.coordinates)
+    print_notes(options.recording, recording.notes)
+    tau = predict(model, recording)
+    write_csv(options.output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
+
+
+def _convert(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.convert import convert
+    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.models.arm import load_arm
+
+    console = make_console()
+    recording, notes = convert(
+        options.input,
+        options.output,
+        format=options.format,
+        variable=options.variable,
+        rate=options.rate,
+        arm=None if options.arm is None else load_arm(options.arm),
+        skip_invalid=options.skip_invalid,
+    )
+    for note in notes:
+        console.print(note, soft_wrap=True)
+    console.print(f"{options.output}: {len(recording)} rows, {recording.coordinates} coordinates", soft_wrap=True)
+
+
+_slow_parts_help = "of a motion without rests, take where a joint is slow as poses"
+
+
+def _add_recording(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "recording", metavar="RECORDING", help="CSV with header q1..qn, tau1..taun; t, qd1.. optional; or an LCM log"
+    )
+    verb.add_argument(
+        "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
+    )

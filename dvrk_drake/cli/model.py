@@ -1,0 +1,85 @@
+"""The verbs that show an arm: its equations, its shape."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from dvrk_drake.cli.support import (
+    add_gravity,
+    check_output,
+    mounted,
+    quiet_drake,
+    until_stopped,
+)
+from dvrk_drake.errors import DvrkDrakeError
+
+
+def add_verbs(verbs: argparse._SubParsersAction) -> None:
+    """Adds the verbs and their options."""
+    verb = verbs.add_parser("model", help="show an arm's gravity torque and regressor", description=_model_help)
+    verb.add_argument("arm", help="mtml, mtmr, psm, or the path of an arm's YAML file")
+    shown = verb.add_mutually_exclusive_group()
+    for name in ("latex", "python", "c"):
+        shown.add_argument(f"--{name}", dest="format", action="store_const", const=name, help=f"write {name} source")
+    verb.add_argument("--frames", default="dh", help="link frames of the parameters: dh (dVRK) or paper (Table I)")
+    verb.add_argument("--serial", action="store_true", help="leave out the links of the linkage, as the paper does")
+    verb.add_argument("--output", metavar="FILE", help="write to a file instead of standard output")
+    add_gravity(verb)
+    verb.set_defaults(run=_model)
+
+    verb = verbs.add_parser("view", help="show an arm in a browser, with sliders that keep its linkage together")
+    verb.add_argument("arm", help="mtml, mtmr, psm, or the path of an arm's YAML file")
+    verb.add_argument("--port", type=int, help="of the page; default: a free one")
+    verb.set_defaults(run=_view)
+
+
+def _model(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.tables import make_console, print_symbolic_model
+    from dvrk_drake.dynamics import export
+    from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
+    from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.atomic_file import atomic_write
+
+    if options.output is not None:
+        if options.format is None:
+            raise DvrkDrakeError("--output needs to know what to write: --latex, --python or --c")
+        check_output(options.output)
+    arm = mounted(load_arm(options.arm), options.gravity)
+    gravity = derive_gravity(arm, options.frames, options.serial)
+    writers = {
+        "latex": lambda gravity: export.to_latex(gravity, SymbolicPlant(arm, options.frames).frame_poses()),
+        "python": export.to_python,
+        "c": export.to_c,
+    }
+    if options.format is None:
+        print_symbolic_model(make_console(), gravity)
+        return
+    text = writers[options.format](gravity)
+    if options.output is None:
+        sys.stdout.write(text)
+    else:
+        with atomic_write(options.output) as stream:
+            stream.write(text)
+
+
+def _view(options: argparse.Namespace) -> None:
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.systems.arm_view import ArmView, start_meshcat
+    from dvrk_drake.systems.camera import framing
+
+    quiet_drake()
+    arm = load_arm(options.arm)
+    meshcat = start_meshcat(*framing(arm), port=options.port)
+    view = ArmView(arm, meshcat)
+    view.add_sliders()
+    print(
+        f"{arm.name} at {meshcat.web_url()}; sliders under Open Controls; end with Stop, Escape or Ctrl-C", flush=True
+    )
+    until_stopped(meshcat, view.follow_sliders)
+
+
+_model_help = (
+    "Prints the base parameters; with --latex, --python or --c the gravity torque and its regressor as source."
+)
