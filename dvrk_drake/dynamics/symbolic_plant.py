@@ -157,7 +157,7 @@ def _parallel_sums(plant: MultibodyPlant, arm: Arm, q: Sequence[sympy.Symbol]) -
         if joint.type_name() != "revolute":
             continue
         axis = joint.frame_on_parent().CalcPoseInWorld(context).rotation() @ joint.revolute_axis()
-        angle = sympy.Add(*(exact_half(row[j]) * q[j] for j in np.flatnonzero(row)))
+        angle = sympy.Add(*(exact_half(row[j]) * q[int(j)] for j in np.flatnonzero(row)))
         parent_axis, parent_angle = turned.get(joint.parent_body().name(), (axis, sympy.Integer(0)))
         if not np.allclose(axis, parent_axis, atol=1e-12):
             parent_angle = sympy.Integer(0)

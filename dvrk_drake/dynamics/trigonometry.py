@@ -13,8 +13,8 @@ ROUNDING = 1e-14
 def simplify_trigonometry(expression: sympy.Expr, sums: Sequence[tuple[sympy.Expr, sympy.Expr]]) -> sympy.Expr:
     """Writes a polynomial in sin and cos of angles with the angles of parallel joints added up.
 
-    For a pair (a, b) in `sums`, in that order, products such as sin a cos b + cos a sin b become sin(a + b) where that is
-    shorter; cos^2 is eliminated, so that what is identically zero becomes 0. Coefficients of rounding's size are
+    For a pair (a, b) in `sums`, in that order, products such as sin a cos b + cos a sin b become sin(a + b) where that
+    is shorter; cos^2 is eliminated, so that what is identically zero becomes 0. Coefficients of rounding's size are
     dropped, so the result equals the expression at every pose to that. sympy's own trigsimp does the same by search and
     takes seconds.
     """
