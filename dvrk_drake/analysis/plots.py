@@ -79,7 +79,8 @@ def plot_measured_against_predicted(
     for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
         use, doubted = usable[:, j], measured_joints[:, j] & ~usable[:, j]
         if not np.any(use):
-            ax.set(title=f"J{j + 1} {name}: nothing measured", xticks=[], yticks=[])
+            ax.set_title(f"J{j + 1} {name}: nothing measured", fontsize=10)
+            ax.set(xticks=[], yticks=[])
             continue
         shown = np.concatenate([measured[use, j], predicted[use, j], [0.0]])
         pad = 0.05 * max(float(np.ptp(shown)), 1e-6)
@@ -102,7 +103,9 @@ def plot_measured_against_predicted(
         ax.tick_params(labelsize=7)
     for ax in axes.flat[len(names) :]:
         ax.axis("off")
-    axes.flat[0].legend(fontsize=7)
+    key = next((ax.get_legend_handles_labels() for ax in axes.flat if ax.has_data()), None)
+    if key:
+        figure.legend(*key, loc="lower right", fontsize=8)
     figure.suptitle(f"{model.arm}: holding torque, {len(recording)} rows of {Path(recording.source).name}")
     _save(figure, path)
 
@@ -156,7 +159,9 @@ def plot_positions(
         ax.grid(alpha=0.3)
     for ax in axes.flat[len(names) :]:
         ax.axis("off")
-    axes.flat[0].legend(fontsize=7)
+    key = next((ax.get_legend_handles_labels() for ax in axes.flat if ax.has_data()), None)
+    if key:
+        figure.legend(*key, loc="lower right", fontsize=8)
     figure.suptitle(title)
     _save(figure, path)
 
