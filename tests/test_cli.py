@@ -219,7 +219,9 @@ def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
         assert message in fails(capsys, "identify", bad, "--arm", "mtmr", "--output", out)
     recording = read_recording(poses)
     write_recording(Recording(q=np.degrees(recording.q), tau=recording.tau), bad)
-    assert "are these degrees?" in fails(capsys, "identify", bad, "--arm", "mtmr", "--output", out)
+    assert "are these degrees, or is it another arm?" in fails(
+        capsys, "identify", bad, "--arm", "mtmr", "--output", out
+    )
     write_recording(Recording(q=recording.q + 1.5 * np.eye(7)[5], tau=recording.tau), bad)
     assert "wrist_yaw (q6)" in fails(capsys, "validate", model, bad)
     (tmp_path / "m.yaml").write_text(model.read_text().replace("trust", "thrust"))

@@ -86,7 +86,7 @@ def test_trajectory_rests_at_each_pose_and_stays_inside_the_limits():
     times = np.arange(0, trajectory.end_time(), 0.01)
     assert not any(arm.limit_violations(trajectory.value(t).ravel(), tolerance=1e-9) for t in times)
     speed = max(np.abs(trajectory.EvalDerivative(t)).max() for t in times)
-    assert speed < 4.0 + 1e-6
+    assert speed < 1.7 + 1e-6
 
 
 def test_joint_effect_torque_is_minus_what_identification_calls_the_effect():

@@ -190,7 +190,9 @@ def test_poses_inside_the_limits_fit():
 def test_degrees_are_suspected():
     arm = load_arm("mtml")
     q = np.degrees(arm.sample_poses(20, np.random.default_rng(0)))
-    with pytest.raises(RecordingError, match=r"of MTML; are these degrees\? Positions must be in radians"):
+    with pytest.raises(
+        RecordingError, match=r"of MTML; are these degrees, or is it another arm\? Positions must be in rad"
+    ):
         Recording(q=q).check_fits(arm)
 
 
@@ -205,7 +207,9 @@ def test_a_prismatic_joint_in_millimetres_is_suspected():
     q = arm.sample_poses(20, np.random.default_rng(0))
     Recording(q=q).check_fits(arm)
     q[:, 2] *= 1000
-    with pytest.raises(RecordingError, match=r"insertion \(q3\) = .* 0\.\.0\.24 m of PSM; are these millimetres\?"):
+    with pytest.raises(
+        RecordingError, match=r"insertion \(q3\) = .* 0\.\.0\.24 m of PSM; are these millimetres or centimetres\?"
+    ):
         Recording(q=q).check_fits(arm)
 
 

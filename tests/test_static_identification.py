@@ -13,7 +13,7 @@ from dvrk_drake.analysis.validation import predict, validate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
-from dvrk_drake.errors import IdentificationError, ModelError
+from dvrk_drake.errors import IdentificationError, ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import Recording, read_recording
 
@@ -202,7 +202,7 @@ def test_a_joint_that_did_not_move_gets_no_torque(arm):
 
 def test_torques_in_the_wrong_unit_are_refused(arm):
     recording, _ = simulated(arm)
-    with pytest.raises(IdentificationError, match=r"are they in N m"):
+    with pytest.raises(RecordingError, match=r"are they in N m"):
         identify_static(dataclasses.replace(recording, tau=1000 * recording.tau), arm)
 
 

@@ -20,7 +20,7 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 
 #: Highest joint speed between poses [rad/s], [m/s].
-TRAVEL_SPEED = 4.0, 0.2
+TRAVEL_SPEED = 1.7, 0.2
 #: Least time on the way [s], time to settle [s], samples a pose.
 LEAST_TRAVEL, SETTLE, SAMPLES = 0.8, 1.0, 10
 #: Between two samples of a pose [s].

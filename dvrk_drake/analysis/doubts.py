@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
 
@@ -24,12 +25,13 @@ class Doubt:
     reason: str
 
 
-def find_doubts(recording: Recording, arm: Arm) -> list[Doubt]:
+def find_doubts(recording: Recording, arm: Arm, measured: NDArray[np.bool_] | None = None) -> list[Doubt]:
     """What can be doubted before any fit. A stop carries load, so it makes the torque of its own joints meaningless.
 
     Args:
         recording: in joint coordinates, with efforts.
         arm: whose limits count.
+        measured: (m, n) False where an effort is no holding torque and need not be doubted; by default all are.
     """
     doubts = []
     A, lower, upper = arm.limit_matrix()
@@ -50,8 +52,26 @@ def find_doubts(recording: Recording, arm: Arm) -> list[Doubt]:
             f"{arm.joint_names[joint]} effort {tau[row, joint]:.3g} exceeds its limit {arm.effort_limits[joint]:.3g}"
         )
         doubts.append(Doubt(int(row), (int(joint),), recording.where(int(row)), reason))
-    doubts.sort(key=lambda doubt: doubt.row)
-    return doubts
+    if measured is not None:
+        doubts = [doubt for doubt in doubts if np.any(measured[doubt.row, list(doubt.joints)])]
+    order = np.arange(len(recording)) if recording.lines is None else recording.lines
+    return sorted(doubts, key=lambda doubt: order[doubt.row])
+
+
+def check_effort_unit(recording: Recording, arm: Arm) -> None:
+    """Refuses efforts that no motor of the arm gives: they are in another unit.
+
+    Raises:
+        RecordingError: most efforts of a joint exceed its limit.
+    """
+    typical = np.median(np.abs(recording.measured_effort()), axis=0)
+    if np.any(typical > arm.effort_limits):
+        joint = int(np.argmax(typical / arm.effort_limits))
+        unit = "N" if arm.prismatic[joint] else "N m"
+        raise RecordingError(
+            f"{recording.source}: most efforts of {arm.joint_names[joint]} (tau{joint + 1}) exceed its limit of "
+            f"{arm.effort_limits[joint]:.3g} {unit}; are they in N m (N on a prismatic joint)?"
+        )
 
 
 def outlier_doubts(

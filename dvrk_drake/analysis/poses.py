@@ -13,6 +13,12 @@ from dvrk_drake.analysis.static_identification import LEAST_POSES
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
 
+#: What must be said where slow parts are used.
+SLOW_PARTS_NOTE = (
+    "where a joint is slow is taken for a pose of it; friction stays in its torque, and other joints may move: trust "
+    "the ten-fold errors, and another day's recording, not the fit"
+)
+
 
 class Poses(NamedTuple):
     """What `find_poses` found.
@@ -45,5 +51,5 @@ def find_poses(recording: Recording, arm: Arm, take_slow_parts: bool = False) ->
     if rests is not None and len(rests) >= LEAST_POSES:
         return Poses(rests, None, f"{len(rests)} poses at which the arm rests are taken; {len(recording)} rows")
     if take_slow_parts:
-        return Poses(*slow_parts(recording, arm), note="where a joint is slow is taken for a pose of it")
+        return Poses(*slow_parts(recording, arm), note=SLOW_PARTS_NOTE)
     return Poses(recording, None, "")

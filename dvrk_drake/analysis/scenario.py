@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.joint_effects import EFFECT_KINDS
+from dvrk_drake.dynamics.joint_effects import kinds_of
 from dvrk_drake.errors import ScenarioError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
@@ -139,7 +139,8 @@ class Scenario:
             raise ScenarioError(f'targets need controller.mode "hold"; it is "{self.controller.mode}"')
         for i, effect in enumerate(self.effects):
             _check_choice(f"effects[{i}].joint", effect.joint, arm.joint_names)
-            _check_choice(f"effects[{i}].kind", effect.kind, tuple(EFFECT_KINDS))
+            slides = bool(arm.prismatic[arm.joint_names.index(effect.joint)])
+            _check_choice(f"effects[{i}].kind", effect.kind, kinds_of(slides))
             _check_number(f"effects[{i}].coefficient", effect.coefficient, -1e3, 1e3)
         if self.model.load_arm().joint_names != arm.joint_names:
             raise ScenarioError(f"controller.model {self.controller.model} is of {self.model.arm}, not of {self.arm}")
@@ -159,9 +160,14 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
     if path.suffix in (".yaml", ".yml"):
         if not path.is_file():
             raise ScenarioError(f"{path}: no such scenario file")
-        content = _parse(path.read_text(encoding="utf-8"), str(path))
+        try:
+            content = _parse(path.read_text(encoding="utf-8"), str(path))
+        except (OSError, UnicodeDecodeError) as error:
+            raise ScenarioError(f"{path}: not a text file in UTF-8: {error}") from error
         if not isinstance(content, dict):
             raise ScenarioError(f"{path}: must be keys and values; {_known_keys()}")
+        if "mechanism" in content:
+            raise ScenarioError(f"{path}: is an arm's file, not a scenario; give an arm's name and --set arm={path}")
     else:
         content = {"arm": arm_or_file}
     for setting in settings:

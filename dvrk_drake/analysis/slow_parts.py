@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -106,12 +107,30 @@ def _thinned(recording: Recording) -> Recording:
     return replace(recording, q=mean(recording.q), qd=mean(qd), tau=mean(tau), t=mean(t), lines=lines)
 
 
+def _longest_of_each_pass(runs: Iterable[NDArray[np.int_]]) -> Iterator[NDArray[np.int_]]:
+    """One run of those that follow each other without a row between: friction is the same in all of them.
+
+    Left out one at a time they would vouch for each other.
+    """
+    longest: NDArray[np.int_] | None = None
+    last = -2
+    for run in runs:
+        if longest is not None and run[0] != last + 1:
+            yield longest
+            longest = None
+        if longest is None or len(run) > len(longest):
+            longest = run
+        last = int(run[-1])
+    if longest is not None:
+        yield longest
+
+
 def _parts_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Arm) -> list[NDArray[np.int_]]:
     """Rows of each slow part of one joint, repetitions joined; the other joints stay within `SAME_PART` in each."""
     same = arm.per_joint(*SAME_PART)
     parts: list[NDArray[np.int_]] = []
     means = np.empty((0, arm.num_joints))
-    for run in stationary_runs(is_slow, moving.q, same, LEAST_SAMPLES):
+    for run in _longest_of_each_pass(stationary_runs(is_slow, moving.q, same, LEAST_SAMPLES)):
         q = moving.q[run].mean(axis=0)
         alike = np.flatnonzero(np.all(np.abs(means - q) < same, axis=1))
         if len(alike):

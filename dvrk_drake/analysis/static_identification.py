@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.doubts import Doubt, find_doubts, outlier_doubts, usable_measurements
+from dvrk_drake.analysis.doubts import Doubt, check_effort_unit, find_doubts, outlier_doubts, usable_measurements
 from dvrk_drake.analysis.effect_selection import StaticProblem, select_effects
 from dvrk_drake.analysis.linear_fit import LinearFit, rms, weighted_fit
 from dvrk_drake.dynamics.identified_model import (
@@ -94,7 +94,7 @@ def identify_static(
     Y = gravity_model.regressor(recording.q)
     stacked = Y.reshape(-1, Y.shape[2]) if measured is None else Y[measured]
     rank = int(np.linalg.matrix_rank(stacked, tol=1e-9 * np.linalg.norm(stacked, 2)))
-    doubts = find_doubts(recording, arm)
+    doubts = find_doubts(recording, arm, measured)
     if measured is None:
         measured = np.ones(tau.shape, dtype=bool)
     usable = usable_measurements(tau.shape, doubts) & measured
@@ -185,13 +185,7 @@ def _check_poses(recording: Recording, arm: Arm) -> None:
             f"{recording.source}: has {len(recording)} distinct poses, too few to identify from; "
             f"at least {LEAST_POSES}, better 40 or more that cover the arm's range"
         )
-    typical = np.median(np.abs(recording.measured_effort()), axis=0)
-    if np.any(typical > arm.effort_limits):
-        joint = int(np.argmax(typical / arm.effort_limits))
-        raise IdentificationError(
-            f"{recording.source}: most efforts of {arm.joint_names[joint]} (tau{joint + 1}) exceed its limit of "
-            f"{arm.effort_limits[joint]:.3g}; are they in N m (N on a prismatic joint)?"
-        )
+    check_effort_unit(recording, arm)
 
 
 def _trust(problem: StaticProblem, left_out: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:

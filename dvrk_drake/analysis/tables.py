@@ -16,7 +16,7 @@ from dvrk_drake.analysis.simulation import Simulation
 from dvrk_drake.analysis.teleoperation_demo import TeleoperationResult
 from dvrk_drake.analysis.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity
+from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity, derive_gravity
 from dvrk_drake.models.arm import Arm, load_arm
 
 TABLE_WIDTH = 112
@@ -47,11 +47,11 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
         f"{model.arm}, {provenance.poses} poses, method {provenance.method}, rank {provenance.rank} of "
         f"{len(model.base_parameters)}, condition number {provenance.condition_number:.3g}\n"
     )
-    table = _table("Base parameters [kg m]", "", "value", "standard error", "|value| < 2 se")
-    for p in model.base_parameters:
-        table.add_row(
-            escape(p.name), f"{p.value:+.5f}", f"{p.standard_error:.5f}", "" if p.distinguishable else "zero?"
-        )
+    table = _table("Base parameters", "", "value", "standard error", "unit", "|value| < 2 se")
+    units = derive_gravity(model.load_arm()).base.units
+    for p, unit in zip(model.base_parameters, units, strict=True):
+        zero = "" if p.distinguishable else "zero?"
+        table.add_row(escape(p.name), f"{p.value:+.5f}", f"{p.standard_error:.5f}", unit, zero)
     console.print(table)
     if model.joint_effects:
         table = _table("Joint effects [N m; N if prismatic]", "", "value", "standard error", "|value| < 2 se")
@@ -160,9 +160,9 @@ def print_demo(console: Console, result: DemoResult, folder: str) -> None:
 def print_symbolic_model(console: Console, gravity: SymbolicGravity) -> None:
     """The base parameters of an arm with the values that its SDF gives them, and its joints' limits."""
     arm = gravity.arm
-    table = _table(f"{arm.name}: base parameters of gravity [kg m]", "", "nominal value")
-    for name, value in zip(gravity.base.names, gravity.base_values, strict=True):
-        table.add_row(escape(name), f"{value:+.5f}")
+    table = _table(f"{arm.name}: base parameters of gravity", "", "nominal value", "unit")
+    for name, value, unit in zip(gravity.base.names, gravity.base_values, gravity.base.units, strict=True):
+        table.add_row(escape(name), f"{value:+.5f}", unit)
     console.print(table)
     table = _table("Joints [rad, N m; m, N if prismatic]", "", "position", "effort limit")
     for i, name in enumerate(arm.joint_names):

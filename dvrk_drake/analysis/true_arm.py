@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context
 
 from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import Closure, add_arm
+from dvrk_drake.models.plant import Closure, add_arm, set_joint_damping
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 
@@ -40,7 +40,7 @@ class TrueArm:
 
     def station(self, meshcat: Meshcat | None = None) -> ArmStation:
         """A station that simulates it, once `prepare` was called with a context."""
-        return ArmStation(self.arm, meshcat=meshcat, closure=self.closure, modify_plant=self._add_damping)
+        return ArmStation(self.arm, meshcat=meshcat, closure=self.closure, modify_plant=self._damp)
 
     def prepare(self, station: ArmStation, context: Context) -> None:
         """Puts the true inertias into a station's context."""
@@ -50,9 +50,8 @@ class TrueArm:
         """A new system that plays the joint effects."""
         return JointEffectTorque(self.arm, self.effects, self.coefficients)
 
-    def _add_damping(self, plant: MultibodyPlant) -> None:
-        for name, damping in zip(self.arm.joint_names, self.damping, strict=True):
-            plant.GetJointByName(name).set_default_damping_vector([damping])
+    def _damp(self, plant: MultibodyPlant) -> None:
+        set_joint_damping(plant, self.arm, self.damping)
 
 
 def make_true_arm(

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.doubts import Doubt, find_doubts, usable_measurements
+from dvrk_drake.analysis.doubts import Doubt, check_effort_unit, find_doubts, usable_measurements
 from dvrk_drake.analysis.linear_fit import rms
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
@@ -86,9 +86,10 @@ def validate(
     measured = recording.measured_effort()
     residuals = measured - predict(model, recording)
     in_joints = recording.in_joint_coordinates(arm)
-    doubts = find_doubts(in_joints, arm)
     if measured_joints is None:
         measured_joints = np.ones(measured.shape, dtype=bool)
+    check_effort_unit(in_joints, arm)
+    doubts = find_doubts(in_joints, arm, measured_joints)
     usable = usable_measurements(measured.shape, doubts) & measured_joints
     if recording.coordinates == "actuator":
         # A doubt about a joint touches every actuator that drives it.

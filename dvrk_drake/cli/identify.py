@@ -68,6 +68,7 @@ def _identify(options: argparse.Namespace) -> None:
     recording = read_recording(options.recording, arm, options.coordinates)
     print_notes(options.recording, recording.notes)
     check_output(options.output, options.recording)
+    plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
     recording, measured, note = find_poses(recording, arm, options.slow_parts)
     if note:
@@ -84,8 +85,8 @@ def _identify(options: argparse.Namespace) -> None:
         )
     result.model.save(options.output)
     console.print(f"model: {options.output}")
-    if options.plots is not None:
-        plot_identification(made_folder(options.plots), result)
+    if plots is not None:
+        plot_identification(plots, result)
         console.print(f"plots: {options.plots}")
 
 
@@ -104,6 +105,7 @@ def _validate(options: argparse.Namespace) -> None:
     print_notes(options.recording, recording.notes)
     if options.json is not None:
         check_output(options.json, options.recording, options.model)
+    plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
     recording, measured, note = find_poses(recording, arm, options.slow_parts)
     if note:
@@ -118,13 +120,13 @@ def _validate(options: argparse.Namespace) -> None:
     validation = validate(model, recording, measured)
     print_doubts(console, validation.doubts)
     print_validation(console, validation)
-    if options.plots is not None:
-        plot_validation(made_folder(options.plots), model, validation, recording.in_joint_coordinates(arm))
-        console.print(f"plots: {options.plots}")
     if options.json is not None:
         with atomic_write(options.json) as stream:
             json.dump(validation.as_dict(), stream, indent=2)
             stream.write("\n")
+    if plots is not None:
+        plot_validation(plots, model, validation, recording.in_joint_coordinates(arm))
+        console.print(f"plots: {options.plots}")
 
 
 def _predict(options: argparse.Namespace) -> None:

@@ -41,9 +41,9 @@ def _simulate(options: argparse.Namespace) -> None:
 
     quiet_drake()
     scenario = load_scenario(options.scenario, options.set)
+    plots = None if options.plots is None else made_folder(options.plots)
     if options.output is not None:
         check_output(options.output, options.scenario, scenario.controller.model)
-    plots = None if options.plots is None else made_folder(options.plots)
     meshcat = start_meshcat(*framing(scenario.mounted_arm)) if options.meshcat else None
     if meshcat is not None:
         print(f"{scenario.mounted_arm.name} at {meshcat.web_url()}", flush=True)

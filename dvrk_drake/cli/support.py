@@ -9,6 +9,7 @@ import math
 import os
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -57,8 +58,13 @@ def check_output(path: str, *inputs: str) -> None:
         raise DvrkDrakeError(f"{path}: cannot be written: its folder does not exist")
     if target.exists() and not target.is_file():
         raise DvrkDrakeError(f"{path}: is not a regular file, so it cannot be replaced; name a file")
-    if not os.access(target if target.exists() else target.parent, os.W_OK):
-        raise DvrkDrakeError(f"{path}: cannot be written: no permission")
+    try:
+        if target.exists():
+            os.close(os.open(target, os.O_WRONLY))
+        with tempfile.TemporaryFile(dir=target.parent):
+            pass
+    except OSError as error:
+        raise DvrkDrakeError(f"{path}: cannot be written: {error.strerror}") from error
     for given in inputs:
         if target == Path(given).resolve():
             raise DvrkDrakeError(f"{path}: is an input; name another file to write")

@@ -33,11 +33,13 @@ class BaseParameters:
         columns: (b,) index of the standard parameter whose column stands for each base parameter.
         combination: (b, p) coefficients.
         names: (b,) such as "L2 (m2+...+m7) + m2 c2x".
+        units: (b,) "kg m", or "kg" of the mass that a prismatic joint lifts.
     """
 
     columns: tuple[int, ...]
     combination: NDArray[np.float64]
     names: tuple[str, ...]
+    units: tuple[str, ...]
 
 
 def reduce_to_base(
@@ -74,7 +76,8 @@ def reduce_to_base(
     solution = np.linalg.lstsq(regressor[:, columns], regressor, rcond=None)[0]
     combination = _snap(np.asarray(solution, dtype=np.float64), lengths)
     names = tuple(_readable(row, parameters, lengths) for row in combination)
-    return BaseParameters(tuple(columns), combination, names)
+    units = tuple("kg m" if parameters[column].axis else "kg" for column in columns)
+    return BaseParameters(tuple(columns), combination, names, units)
 
 
 def _snap(combination: NDArray[np.float64], lengths: Mapping[str, float]) -> NDArray[np.float64]:

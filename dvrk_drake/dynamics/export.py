@@ -22,11 +22,14 @@ def to_latex(gravity: SymbolicGravity, frame_poses: Mapping[str, sympy.Matrix]) 
     Y = sympy.Matrix(gravity.regressor).xreplace(short)
     lines = [
         f"% {_what(gravity)}: torque that holds it against gravity, tau = Y(q) beta.",
-        "% s_i = sin q_i, c_i = cos q_i, s_{ij} = sin(q_i + q_j); beta in kg m, m_i c_i in link frame i.",
+        "% s_i = sin q_i, c_i = cos q_i, s_{ij} = sin(q_i + q_j), s_{i - j / 2} = sin(q_i - q_j / 2);",
+        f"% m_i c_i in link frame i; {_lengths(gravity)}.",
         r"\begin{align*}",
         *(
-            rf"\beta_{{{i + 1}}} &= {_latex_name(text)} = {value:.5g} \\"
-            for i, (text, value) in enumerate(zip(gravity.base.names, gravity.base_values, strict=True))
+            rf"\beta_{{{i + 1}}} &= {_latex_name(text)} = {value:.5g}\ {_latex_unit(unit)} \\"
+            for i, (text, value, unit) in enumerate(
+                zip(gravity.base.names, gravity.base_values, gravity.base.units, strict=True)
+            )
         ),
         r"\end{align*}",
         r"\begin{align*}",
@@ -55,9 +58,9 @@ def to_python(gravity: SymbolicGravity) -> str:
     return (
         f'"""{_what(gravity)}: holding torque, tau = Y(q) beta [N m; N if prismatic].\n\n'
         "Made by dvrk-drake from its Drake model. q [rad; m if prismatic] in the dVRK's order and signs, g [m/s^2]\n"
-        "the size of gravity, beta [kg m] the base parameters below; out is filled: out[j], or out[j, k] for the\n"
-        'regressor (numpy).\n"""\n\nimport math\n\n'
-        f"#: (nominal value [kg m], meaning) of each base parameter.\nBASE_PARAMETERS = [\n{names}]\n\n\n"
+        f"the size of gravity, beta the base parameters below; {_lengths(gravity)}. out is filled: out[j], or\n"
+        'out[j, k] for the regressor (numpy).\n"""\n\nimport math\n\n'
+        f"#: (nominal value, meaning) of each base parameter.\nBASE_PARAMETERS = [\n{names}]\n\n\n"
         + codegen.python_source("gravity_torque", [*arguments, beta_argument], torque, "Fills out (n) with Y(q) beta.")
         + "\n\n"
         + codegen.python_source("gravity_regressor", arguments, regressor, "Fills out (n, b) with Y(q).")
@@ -72,7 +75,7 @@ def to_c(gravity: SymbolicGravity) -> str:
     header = (
         f"/* {_what(gravity)}: holding torque, tau = Y(q) beta [N m; N if prismatic].\n"
         " * Made by dvrk-drake from its Drake model. q [rad; m if prismatic] in the dVRK's order and signs, g [m/s^2]\n"
-        f" * the size of gravity, beta [kg m] the base parameters; nominal values:\n{table}\n */\n"
+        f" * the size of gravity, beta the base parameters, nominal values below; {_lengths(gravity)}.\n{table}\n */\n"
     )
     body = codegen.c_source(f"{prefix}_gravity_torque", [*arguments, beta_argument], torque)
     body += "\n" + codegen.c_source(f"{prefix}_gravity_regressor", arguments, regressor).replace(
@@ -99,7 +102,13 @@ def _functions(
 
 
 def _named_values(gravity: SymbolicGravity) -> list[tuple[str, float]]:
-    return [(n, float(v)) for n, v in zip(gravity.base.names, gravity.base_values, strict=True)]
+    """Each base parameter with its unit, and its value in the SDF."""
+    base = gravity.base
+    return [(f"{n} [{u}]", float(v)) for n, u, v in zip(base.names, base.units, gravity.base_values, strict=True)]
+
+
+def _lengths(gravity: SymbolicGravity) -> str:
+    return ", ".join(f"{name} = {length:g} m" for name, length in gravity.lengths.items())
 
 
 def _beta_symbols(gravity: SymbolicGravity) -> tuple[sympy.Symbol, ...]:
@@ -131,6 +140,10 @@ def _factor(e: sympy.Expr) -> str:
     """LaTeX of e as a factor: in brackets where it is a sum or begins with a minus."""
     text = sympy.latex(e)
     return rf"\left({text}\right)" if e.is_Add or text.startswith("-") else text
+
+
+def _latex_unit(unit: str) -> str:
+    return r"\mathrm{" + unit.replace(" ", r"\,") + "}"
 
 
 def _latex_name(text: str) -> str:

@@ -19,7 +19,7 @@ from dvrk_drake.models.atomic_file import atomic_write
 
 @dataclass
 class BaseParameterEstimate:
-    """A base parameter [kg m]; `distinguishable`: its size exceeds two standard errors."""
+    """A base parameter [kg m, or kg of a mass]; `distinguishable`: its size exceeds two standard errors."""
 
     name: str = ""
     value: float = 0.0

@@ -20,7 +20,7 @@ from dvrk_drake.models.arm import Arm
 class StaticModel:
     """Compiled regressor and torque of one structure (arm and joint effects); the parameters stay arguments.
 
-    Parameters theta are the b base parameters [kg m], then one coefficient per effect [N m, or N on a prismatic joint].
+    Parameters theta are the b base parameters [kg m, kg], then one coefficient per effect [N m; N if prismatic].
 
     Attributes:
         gravity: the symbolic derivation.

@@ -30,7 +30,8 @@ class SymbolicGravity:
         q: the n joint positions as sympy symbols q1..qn [rad, m].
         standard_parameters: mass and first moments of every link, in the named frames of the SDF.
         standard_values: (p,) their values in the SDF [kg, kg m].
-        base: the base parameters beta = base.combination standard_values [kg m].
+        lengths: named distances between the links' frames [m], as they stand in the base parameters' names.
+        base: the base parameters beta = base.combination standard_values, in base.units.
         regressor: sympy (n, b) in q and the symbol g = |gravity| [m/s^2]; d potential / dq.
         potential: sympy (1, b); potential beta is the part of the potential energy that depends on q [J].
     """
@@ -39,13 +40,14 @@ class SymbolicGravity:
     q: tuple[sympy.Symbol, ...]
     standard_parameters: tuple[StandardParameter, ...]
     standard_values: NDArray[np.float64]
+    lengths: dict[str, float]
     base: BaseParameters
     regressor: sympy.ImmutableDenseMatrix
     potential: sympy.ImmutableDenseMatrix
 
     @property
     def base_values(self) -> NDArray[np.float64]:
-        """(b,) base parameters of the SDF [kg m]."""
+        """(b,) base parameters of the SDF, in `base.units`."""
         return self.base.combination @ self.standard_values
 
     @property
@@ -68,12 +70,16 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
         serial: leaves out the links of the linkage (crank, coupler), as the paper does.
 
     Raises:
-        ArmError: the arm's SDF has no frames of that prefix, or gravity is (almost) zero.
+        ArmError: the arm's SDF has no frames of that prefix, gravity is (almost) zero, or `serial` of an arm whose
+            joints move other links than the numbered ones, as a PSM's jaw does.
     """
     if np.linalg.norm(arm.gravity) < 1.0:
         raise ArmError(f"{arm.name} is weightless: gravity must be 1 m/s^2 or more for a gravity model, on Earth 9.8")
     plant = SymbolicPlant(arm, frames)
     labels = [label for label in plant.bodies if label.isdigit() or not serial]
+    driven = {plant.numeric.GetJointByName(name).child_body().index() for name in arm.joint_names}
+    if serial and not driven <= {plant.bodies[label][0].index() for label in labels}:
+        raise ArmError(f"{arm.name} has joints whose links have no number: its links cannot be told from its linkage")
     parameters: list[StandardParameter] = []
     values: list[float] = []
     for label in labels:
@@ -83,11 +89,9 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
     energies = [plant.simplify(plant.to_sympy(energy)) for link in plant.potential_energy(labels) for energy in link]
     standard = sympy.Matrix([[energy.diff(q) for q in plant.q] for energy in energies]).T
 
+    lengths = _named_lengths(plant, frames)
     base = reduce_to_base(
-        _evaluate_at_random_poses(standard, plant.q, arm),
-        parameters,
-        _readable_preference(parameters),
-        _named_lengths(plant, frames),
+        _evaluate_at_random_poses(standard, plant.q, arm), parameters, _readable_preference(parameters), lengths
     )
     chosen = standard.extract(list(range(arm.num_joints)), list(base.columns))
     return SymbolicGravity(
@@ -95,6 +99,7 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
         q=plant.q,
         standard_parameters=tuple(parameters),
         standard_values=np.array(values),
+        lengths={name: length for name, length in lengths.items() if name != "1"},
         base=base,
         regressor=sympy.ImmutableDenseMatrix(GRAVITY * chosen.applyfunc(plant.simplify)),
         potential=sympy.ImmutableDenseMatrix([[GRAVITY * energies[column] for column in base.columns]]),
@@ -110,6 +115,8 @@ def _mass_and_moment(plant: MultibodyPlant, body: RigidBody, X_BF: RigidTransfor
     for joint in map(plant.get_joint, plant.GetJointIndices(body.model_instance())):
         child = joint.child_body()
         if joint.parent_body() == body and not any(f.body() == child for f in _named_frames(plant)):
+            if joint.type_name() != "revolute":
+                raise ArmError(f"{child.name()} needs a frame dh_<name>: it does not turn like a rotor")
             context = plant.CreateDefaultContext()
             p_FmCcm = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse() @ child.default_com()
             if np.linalg.norm(np.cross(p_FmCcm, joint.revolute_axis())) > 1e-9:

@@ -16,9 +16,13 @@ from pydrake.common.yaml import yaml_load_typed
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_schema import ArmDescription, CoupledLimit, Gains, Instrument, LoopClosure, Mechanism
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf, read_sdf_facts
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, compose_sdf, read_sdf_facts
+
+#: A joint that slides further has its limits in another unit [m].
+LONGEST_TRAVEL = 2.0
 
 Schema = TypeVar("Schema", ArmDescription, Mechanism, Instrument)
+Part = TypeVar("Part", Mechanism, Instrument)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +34,7 @@ class Arm:
         source: what `load_arm` loads it by: "mtml", or the absolute path of its YAML file.
         joint_names: the n independent joints.
         tree_joint_names: the joints of the SDF tree, linkage included.
-        sdf: package URLs of the model files: the arm's, then its instrument's if it has one.
+        sdf: package URLs or paths of the model files: the arm's, then its instrument's if it has one.
         position_lower, position_upper: (n,) limits of this arm.
         effort_limits: (n,) limits of the joint torques, from the SDF.
         prismatic: (n,) True for a joint that slides [m, N], False for one that turns [rad, N m].
@@ -157,12 +161,20 @@ def _load_yaml(schema: type[Schema], path: Path) -> Schema:
         raise ArmError(f"{path}: {error}") from error
 
 
-def _load_part(schema: type[Schema], arm_path: Path, kind: str, name: str) -> Schema:
+def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part:
+    if name.endswith((".yaml", ".yml")):
+        path = (arm_path.parent / name).resolve()
+        if not path.is_file():
+            raise ArmError(f"{arm_path}: {kind} {path}: no such file")
+        part = _load_yaml(schema, path)
+        if part.sdf and not part.sdf.startswith(PACKAGE_URL):
+            part.sdf = str(path.parent / part.sdf)
+        return part
     folder = MODELS_FOLDER / f"{kind}s"
     path = folder / f"{name}.yaml"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
-        raise ArmError(f'{arm_path}: unknown {kind} "{name}"; known {kind}s: {known}')
+        raise ArmError(f'{arm_path}: unknown {kind} "{name}"; known {kind}s: {known}, or the path of a YAML file')
     return _load_yaml(schema, path)
 
 
@@ -177,8 +189,8 @@ def _build_arm(
         raise ArmError(f"{path}: position_limits must name exactly {', '.join(mechanism.joints)}")
     if missing := set(joints) - set(facts.joint_names):
         raise ArmError(f"{path}: its SDF has no joint {', '.join(sorted(missing))}")
-    if any(len(limits) != 2 or limits[0] >= limits[1] for limits in position_limits.values()):
-        raise ArmError(f"{path}: each of position_limits must be [lower, upper] with lower < upper")
+    for joint, limits_of_joint in position_limits.items():
+        _check_limits(path, joint, limits_of_joint, joint in facts.prismatic)
     limits = np.array([position_limits[j] for j in joints])
     gains = Gains(*(getattr(mechanism.gains, k) + getattr(instrument.gains, k) for k in ("kp", "kd", "ki")))
     for which, values in dataclasses.asdict(gains).items():
@@ -208,6 +220,13 @@ def _build_arm(
         gravity=_checked_gravity(description.gravity),
         gains=gains,
     )
+
+
+def _check_limits(path: Path, joint: str, limits: list[float], prismatic: bool) -> None:
+    if len(limits) != 2 or not limits[0] < limits[1] or not np.all(np.isfinite(limits)):
+        raise ArmError(f"{path}: position_limits.{joint} must be [lower, upper], finite, with lower < upper")
+    if prismatic and max(map(abs, limits)) > LONGEST_TRAVEL:
+        raise ArmError(f"{path}: position_limits.{joint} = {limits} must be in m, at most {LONGEST_TRAVEL:g} m")
 
 
 def _coupled_limits(path: Path, description: ArmDescription, mechanism: Mechanism) -> tuple[CoupledLimit, ...]:

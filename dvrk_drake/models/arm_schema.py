@@ -1,4 +1,4 @@
-"""Schemas of `arms/*.yaml` and `mechanisms/*.yaml`, for yaml_load_typed: a typo in a file is an error.
+"""Schemas of `arms/*.yaml`, `mechanisms/*.yaml` and `instruments/*.yaml`, for yaml_load_typed: a typo is an error.
 
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
@@ -63,8 +63,10 @@ class Instrument:
 class ArmDescription:
     """Schema of `arms/*.yaml`.
 
-    `gravity` is the gravity vector [m/s^2] in the arm's base frame. `coupled_limits` replaces [lower, upper] of the
-    mechanism's coupled limits by name, for an arm whose stops were calibrated.
+    `mechanism` and `instrument` are names of files in their folders, or paths of YAML files from the arm's own folder;
+    the `sdf` of such a file is a path from the folder that it is in. `gravity` is the gravity vector [m/s^2] in the
+    arm's base frame. `coupled_limits` replaces [lower, upper] of the mechanism's coupled limits by name, for an arm
+    whose stops were calibrated.
     """
 
     name: str = ""

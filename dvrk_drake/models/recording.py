@@ -21,6 +21,8 @@ Coordinates = Literal["joint", "actuator"]
 
 #: A pose further than this outside the limits is refused [rad], [m]; nearer ones are real: stops give way.
 LIMIT_TOLERANCE = 0.2, 0.02
+#: No position, speed or effort of these arms is larger, in whatever unit it may be by mistake.
+LARGEST = 1e6
 #: RMS joint speed above which a recording counts as a motion [rad/s], [m/s].
 REST_SPEED = 0.05, 0.005
 
@@ -112,6 +114,7 @@ class Recording:
         Raises:
             RecordingError: wrong number of joints, a unit suspected to be wrong, or a pose far outside the limits.
         """
+        self._check_sizes()
         q = self.in_joint_coordinates(arm).q
         excess = np.maximum(arm.position_lower - q, q - arm.position_upper) / arm.per_joint(*LIMIT_TOLERANCE)
         row, joint = np.unravel_index(np.argmax(excess), excess.shape)
@@ -127,12 +130,21 @@ class Recording:
         turning = np.max(shares[~arm.prismatic])
         # Another arm or other coordinates exceed the limits by a factor of 2 or 3, degrees by up to 57.
         if outside > 0.3 and turning > 4 and np.radians(turning) <= 1.2:
-            message += "; are these degrees? Positions must be in radians (m on a prismatic joint)"
+            message += "; are these degrees, or is it another arm? Positions must be in rad (m on a prismatic joint)"
         elif arm.prismatic[joint] and shares[joint] > 4:
-            message += "; are these millimetres? A prismatic joint must be in m, its effort in N"
+            message += "; are these millimetres or centimetres? A prismatic joint must be in m, its effort in N"
         else:
             message += "; is this the right arm, and are the coordinates (joint or actuator) right?"
         raise RecordingError(message)
+
+    def _check_sizes(self) -> None:
+        for name, values in (("q", self.q), ("qd", self.qd), ("tau", self.tau)):
+            if values is not None and np.any(np.abs(values) > LARGEST):
+                row, joint = np.argwhere(np.abs(values) > LARGEST)[0]
+                raise RecordingError(
+                    f"{self.where(int(row))}: {name}{joint + 1} = {values[row, joint]:g} is no reading of an arm; "
+                    f"at most {LARGEST:g}"
+                )
 
     def _check_joint_count(self, arm: Arm) -> None:
         if self.q.shape[1] != arm.num_joints:

@@ -53,7 +53,16 @@ def compose_sdf(urls: Sequence[str]) -> ElementTree.Element:
                 _add_shapes(links[part.get("name", "")], part)
             else:
                 model.append(part)
+                if part.tag == "link":
+                    _add_to_filter_groups(model, part.get("name", ""))
     return root
+
+
+def _add_to_filter_groups(model: ElementTree.Element, link: str) -> None:
+    """An instrument's link touches its arm as little as the arm's own links touch each other."""
+    for group in model.findall(f"{DRAKE}collision_filter_group"):
+        member = ElementTree.SubElement(group, f"{DRAKE}member")
+        member.text = link
 
 
 def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
