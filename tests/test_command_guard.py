@@ -463,7 +463,9 @@ def test_velocity_feed_forward_passes_where_the_position_is_followed():
     output = bench.run(Command.POSITION, 1, velocity=[0.01] * N)
     np.testing.assert_array_equal(output.velocity, np.full(N, 0.01))
     output = bench.run(Command.POSITION, 1, velocity=[100.0] * N)
-    np.testing.assert_array_equal(output.velocity, bench.guard.limits.speed)
+    # Shoulder and elbow together would lead to the coupled limit: test_command_guard_attacks.py.
+    free = [0, 3, 4, 5, 6]
+    np.testing.assert_array_equal(output.velocity[free], bench.guard.limits.speed[free])
 
 
 def test_holding_after_position_commands_keeps_the_target_unless_the_arm_is_elsewhere():

@@ -181,6 +181,40 @@ def test_a_fault_is_reset_through_the_sender():
     assert arm.statuses[-1].guard_state == Status.STATE_HOLD
 
 
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_a_feed_forward_velocity_pushes_no_joint_beyond_its_limit(name):
+    """Positions that stand just inside the limits, with velocities that lead outward; no stop of the plant helps."""
+    lcm = DrakeLcm("memq://")
+    arm = SimulatedArm(lcm, name, modify_plant=without_stops)
+    A, lower, upper = arm.arm.limit_matrix()
+    outward = np.where(np.arange(7) == 2, -1.0, 1.0)  # shoulder and elbow apart, for the coupled limit's sake
+    goal = np.where(outward > 0, arm.arm.position_upper - 1e-3, arm.arm.position_lower + 1e-3)
+    sender = Sending(lcm, arm.arm, desired_state=np.concatenate([POSES[name], np.zeros(7)]))
+    run(lcm, 300, arm, sender)
+    sender.fix("desired_state", np.concatenate([goal, np.zeros(7)]))
+    run(lcm, 1500, arm, sender)
+    sender.fix("desired_state", np.concatenate([goal, 100 * outward]))
+    margin = np.minimum(0.05, 0.05 * (upper - lower))
+    for _ in range(500):
+        run(lcm, 1, arm, sender)
+        c = A @ np.array(arm.statuses[-1].position)
+        assert np.all(np.maximum(c - upper, lower - c) < 0.5 * margin)
+    assert arm.statuses[-1].guard_state == Status.STATE_POSITION
+
+
+def test_an_effort_and_the_arms_own_gravity_compensation_stay_inside_the_limits_together():
+    lcm = DrakeLcm("memq://")
+    arm = SimulatedArm(lcm, driver=DvrkDriver(gravity_compensation=True))
+    sender = Sending(lcm, effort=np.zeros(7))
+    run(lcm, 300, arm, sender)
+    for sign in (1, -1):
+        sender.fix("effort", sign * ARM.effort_limits)
+        run(lcm, 30, arm, sender)
+        commanded = [s.effort_commanded for s in arm.statuses[-30:]]
+        assert np.all(np.abs(commanded) <= ARM.effort_limits)
+        assert np.any(np.abs(commanded) == ARM.effort_limits)
+
+
 def without_stops(plant):
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
@@ -347,7 +381,7 @@ def test_driver_is_loaded_from_yaml_and_checked():
         DvrkDriver(control_modes=["speed"])
     with pytest.raises(StationError, match="status_period"):
         DvrkDriver(status_period=0.0)
-    with pytest.raises(StationError, match="expiry must be at most 1 s"):
+    with pytest.raises(StationError, match="expiry must be 0.002 to 1; got 5.0"):
         DvrkDriver(guard=type(driver.guard)(expiry=5.0))
-    with pytest.raises(StationError, match="margin must be above 0"):
+    with pytest.raises(StationError, match="margin must be 0.001 to 0.3"):
         type(driver.guard)(margin=float("nan"))
