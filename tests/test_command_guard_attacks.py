@@ -166,7 +166,9 @@ def test_a_velocity_leads_a_position_controller_to_no_pose_beyond_the_limits(nam
 def test_a_start_with_a_velocity_that_leads_away_is_refused():
     bench = Bench()
     bench.run(Command.POSITION, 240, velocity=list(0.9 * 0.05 / LOOK_AHEAD * np.eye(N)[4]))
-    assert bench.send(Command.POSITION, velocity=list(1.1 * 0.05 / LOOK_AHEAD * np.eye(N)[4])) == Status.REFUSAL_START_FAR
+    assert (
+        bench.send(Command.POSITION, velocity=list(1.1 * 0.05 / LOOK_AHEAD * np.eye(N)[4])) == Status.REFUSAL_START_FAR
+    )
     assert bench.guard.state == Status.STATE_HOLD
 
 

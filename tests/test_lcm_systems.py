@@ -250,6 +250,25 @@ def test_all_the_effort_that_motors_have_pushes_no_joint_beyond_its_limit(name, 
     assert (status.guard_state, status.fault_text) == (Status.STATE_EFFORT, "")
 
 
+@pytest.mark.parametrize(("name", "joint"), [("mtml", 3), ("mtml", 5), ("mtml", 6), ("psm", 3), ("psm", 4), ("psm", 6)])
+def test_a_wrist_that_leans_on_a_soft_wall_comes_to_rest(name, joint):
+    """The light joints, on which a wall that is too stiff for a period of delay makes the motors hammer."""
+    lcm = DrakeLcm("memq://")
+    arm = SimulatedArm(lcm, name, modify_plant=without_stops)
+    held = IdentifiedModel.from_arm(arm.arm).holding_torque(POSES[name])
+    push = 0.6 * arm.arm.effort_limits * np.eye(7)[joint]
+    sender = Sending(lcm, arm.arm, effort=held)
+    run(lcm, 300, arm, sender)
+    for k in range(1000):
+        sender.fix("effort", held + push * min(1.0, k / 200))
+        run(lcm, 1, arm, sender)
+    last = arm.statuses[-100:]
+    assert last[-1].joint_flags[joint] & Status.FLAG_POSITION_LIMIT
+    effort = np.array([status.effort_commanded[joint] for status in last])
+    assert np.abs(np.diff(effort)).max() < 0.01 * arm.arm.effort_limits[joint]
+    assert np.abs([status.velocity[joint] for status in last]).max() < 0.1
+
+
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_a_limp_arm_falls_into_the_soft_wall(name):
     worst, status = pushed(name, np.zeros(7), 2.0)

@@ -79,7 +79,7 @@ class lcmt_dvrk_status(object):
     effort is more than commands may use
     """
     REFUSAL_START_OUTSIDE = 14
-    """ starting with efforts while the pose is beyond a position limit by more than half of the soft wall's width """
+    """ starting with efforts while the pose is beyond a position limit by more than half of the margin """
     REFUSAL_OTHER_SENDER = 15
     """ another sender is in command; this is a fault as well """
     FLAG_EFFORT_CLAMPED = 1

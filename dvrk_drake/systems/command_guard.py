@@ -75,11 +75,11 @@ class CommandGuard:
 
     **Start guard**: before commands act they must have come without a gap of `expiry` and without a refusal for
     `start_time`, all near the present: efforts near the measured ones, positions near the measured ones, also where the
-    feed-forward velocity leads; for efforts the pose must not be beyond a limit by half the soft wall's width, nor the
+    feed-forward velocity leads; for efforts the pose must not be beyond a limit by half the margin, nor the
     present effort beyond what commands may use. A sender that starts with something else is refused, so a restarted or
     confused controller moves nothing.
 
-    **Faults** are latched: two senders at once, a pose beyond a limit (by half the soft wall's width) while efforts
+    **Faults** are latched: two senders at once, a pose beyond a limit (by half the margin) while efforts
     act, a measurement that is not finite, the arm's clock going backwards or standing still, and what a driver reports.
     The reset must be meant: the flag must change from false to true in a HOLD command, and a cause that lasts faults
     again.
@@ -92,7 +92,9 @@ class CommandGuard:
     not be synchronised, and a jump of either is seen. A jump of the arm's clock forward expires what is in force.
     """
 
-    def __init__(self, arm: Arm, session_id: int, settings: GuardSettings | None = None, modes: tuple[int, ...] | None = None):
+    def __init__(
+        self, arm: Arm, session_id: int, settings: GuardSettings | None = None, modes: tuple[int, ...] | None = None
+    ):
         """A guard in HOLD.
 
         Args:
@@ -198,9 +200,7 @@ class CommandGuard:
         self.output = self._output(min(max(dt, 0.0), _LONGEST_STEP))
         return self.output
 
-    def report_fault(
-        self, text: str, code: int = lcmt_dvrk_status.FAULT_DRIVER, *, has_power: bool = True
-    ) -> None:
+    def report_fault(self, text: str, code: int = lcmt_dvrk_status.FAULT_DRIVER, *, has_power: bool = True) -> None:
         """Latches a fault, for drivers whose arm reports one: before each `step`, as long as it lasts.
 
         Args:

@@ -19,17 +19,21 @@ Flags = NDArray[np.int8]
 
 _ROUNDING = 1e-12
 
+#: How many times the gains of the position controller, which 1 kHz permits, a soft wall may have; more chatters.
+_WALL_GAIN = 4.0
+
 
 class GuardLimits:
     """Limits of one arm, for n joints in its order.
 
-    **Effort commands** meet a soft wall in the margin before each position limit lower <= A q <= upper, the joint box
-    and the coupled limits alike: a spring and damper along the limit's own coordinate c = A_k q,
+    **Effort commands** meet a soft wall before each position limit lower <= A q <= upper, the joint box and the coupled
+    limits alike: a spring and damper along the limit's own coordinate c = A_k q,
 
         lambda = 2 F_k clip(depth, 0, 1),  tau -= A_k' lambda,
 
     F_k the effort that outweighs every motor that can push along c, and depth that of c + T_k dc/dt in the wall: 0
-    where the margin begins, 1 at the limit. So at half of the margin no outward command is left, and at the limit all
+    where it begins, 1 at the limit. It is as wide as the margin, or wider where its gains would exceed four times those
+    of the joint's position controller: one period late, they would chatter. So at half of its width no outward command is left, and at the limit all
     that the motors have is directed inward; what approaches fast is met earlier, by T_k, the ratio Kd/Kp of the joint's
     position controller. The arm is never pulled, only pushed back. Without efforts (a falling arm) the wall pushes all
     the same. Joints that are faster than they may be are braked: above 1.25 times the speed nothing drives them on.
@@ -62,6 +66,8 @@ class GuardLimits:
         self._wall_effort = np.array([max(self.effort_limits[row != 0] / np.abs(row[row != 0])) for row in self.A])
         self._look_ahead = np.divide(arm.gains.kd, arm.gains.kp)
         self._wall_look_ahead = np.array([max(self._look_ahead[row != 0]) for row in self.A])
+        softest = 2 * self._wall_effort[:, None] * self.A**2 / (_WALL_GAIN * np.array(arm.gains.kp))
+        self._wall_width = np.maximum(self.margin, softest.max(axis=1))
         self._wall_flags = np.full(len(self.A), lcmt_dvrk_status.FLAG_COUPLED_LIMIT, np.int8)
         self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT
 
@@ -109,7 +115,7 @@ class GuardLimits:
         braking = 4 * limit * np.sign(v) * np.clip(np.abs(v) / self.speed - 1, 0, 0.5)
         flags[braking != 0] |= lcmt_dvrk_status.FLAG_SPEED_LIMIT
         c = self.A @ q + self._wall_look_ahead * (self.A @ v)
-        to_upper, to_lower = (self.upper - c) / self.margin, (c - self.lower) / self.margin
+        to_upper, to_lower = (self.upper - c) / self._wall_width, (c - self.lower) / self._wall_width
         walls = 2 * self._wall_effort * (np.clip(1 - to_lower, 0, 1) - np.clip(1 - to_upper, 0, 1))
         for k in np.flatnonzero(walls):
             flags[self.A[k] != 0] |= self._wall_flags[k]
