@@ -83,7 +83,7 @@ def test_a_command_that_is_changed_after_it_was_accepted_does_not_act():
 def test_whoever_changes_the_output_does_not_change_the_guard():
     bench = Bench().started()
     for array in (bench.output.position, bench.output.velocity, bench.output.effort):
-        array += 1.0
+        array[:] = 1.0
     np.testing.assert_array_equal(bench.output.velocity, np.ones(N))
     np.testing.assert_allclose(bench.tick().effort, 0.05 * LIMIT)
     np.testing.assert_array_equal(bench.run(Command.HOLD, 1).position, Q)
@@ -165,10 +165,9 @@ def test_a_velocity_leads_a_position_controller_to_no_pose_beyond_the_limits(nam
 
 def test_a_start_with_a_velocity_that_leads_away_is_refused():
     bench = Bench()
-    bench.run(Command.POSITION, 240, velocity=list(0.9 * 0.05 / LOOK_AHEAD * np.eye(N)[4]))
-    assert (
-        bench.send(Command.POSITION, velocity=list(1.1 * 0.05 / LOOK_AHEAD * np.eye(N)[4])) == Status.REFUSAL_START_FAR
-    )
+    farthest = 0.05 / LOOK_AHEAD * np.eye(N)[4]
+    bench.run(Command.POSITION, 240, velocity=list(0.9 * farthest))
+    assert bench.send(Command.POSITION, velocity=list(1.1 * farthest)) == Status.REFUSAL_START_FAR
     assert bench.guard.state == Status.STATE_HOLD
 
 

@@ -400,7 +400,7 @@ def test_driver_is_loaded_from_yaml_and_checked():
         DvrkDriver(control_modes=["speed"])
     with pytest.raises(StationError, match="status_period"):
         DvrkDriver(status_period=0.0)
-    with pytest.raises(StationError, match="expiry must be 0.002 to 1; got 5.0"):
+    with pytest.raises(StationError, match=r"expiry must be 0\.002 to 1; got 5.0"):
         DvrkDriver(guard=type(driver.guard)(expiry=5.0))
-    with pytest.raises(StationError, match="margin must be 0.001 to 0.3"):
+    with pytest.raises(StationError, match=r"margin must be 0\.001 to 0\.3"):
         type(driver.guard)(margin=float("nan"))

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 
-
 #: Commands are counted in an int64 of the status; nobody loses as many, but a sequence may jump by more.
 _MOST_LOST = 2**63 - 1
 

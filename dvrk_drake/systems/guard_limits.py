@@ -33,11 +33,11 @@ class GuardLimits:
 
     F_k the effort that outweighs every motor that can push along c, and depth that of c + T_k dc/dt in the wall: 0
     where it begins, 1 at the limit. It is as wide as the margin, or wider where its gains would exceed four times those
-    of the joint's position controller: one period late, they would chatter. So at half of its width no outward command is left, and at the limit all
-    that the motors have is directed inward; what approaches fast is met earlier, by T_k, the ratio Kd/Kp of the joint's
-    position controller. The arm is never pulled, only pushed back. Without efforts (a falling arm) the wall pushes all
-    the same. Joints that are faster than they may be are braked: above 1.25 times the speed nothing drives them on.
-    Commands are clamped and limited in rate before; what the wall adds is not delayed.
+    of the joint's position controller: one period late, they would chatter. So at half of its width no outward command
+    is left, and at the limit all that the motors have is directed inward; what approaches fast is met earlier, by T_k,
+    the ratio Kd/Kp of the joint's position controller. The arm is never pulled, only pushed back. Without efforts (a
+    falling arm) the wall pushes all the same. Joints that are faster than they may be are braked: above 1.25 times the
+    speed nothing drives them on. Commands are clamped and limited in rate before; what the wall adds is not delayed.
 
     **Position commands** move a target that is limited in rate and never leaves the limits; a target that starts
     outside moves no further out. A position controller goes Kd/Kp v beyond a target that stands with a feed-forward v,
@@ -67,7 +67,7 @@ class GuardLimits:
         self._look_ahead = np.divide(arm.gains.kd, arm.gains.kp)
         self._wall_look_ahead = np.array([max(self._look_ahead[row != 0]) for row in self.A])
         softest = 2 * self._wall_effort[:, None] * self.A**2 / (_WALL_GAIN * np.array(arm.gains.kp))
-        self._wall_width = np.maximum(self.margin, softest.max(axis=1))
+        self.wall_width = np.maximum(self.margin, softest.max(axis=1))
         self._wall_flags = np.full(len(self.A), lcmt_dvrk_status.FLAG_COUPLED_LIMIT, np.int8)
         self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT
 
@@ -115,7 +115,7 @@ class GuardLimits:
         braking = 4 * limit * np.sign(v) * np.clip(np.abs(v) / self.speed - 1, 0, 0.5)
         flags[braking != 0] |= lcmt_dvrk_status.FLAG_SPEED_LIMIT
         c = self.A @ q + self._wall_look_ahead * (self.A @ v)
-        to_upper, to_lower = (self.upper - c) / self._wall_width, (c - self.lower) / self._wall_width
+        to_upper, to_lower = (self.upper - c) / self.wall_width, (c - self.lower) / self.wall_width
         walls = 2 * self._wall_effort * (np.clip(1 - to_lower, 0, 1) - np.clip(1 - to_upper, 0, 1))
         for k in np.flatnonzero(walls):
             flags[self.A[k] != 0] |= self._wall_flags[k]

@@ -31,7 +31,8 @@ class GuardSettings:
         clock_tolerance: by how much a sender's clock and the arm's may differ between two commands [s].
         start_effort: how far from the present effort effort commands may start, as a fraction of the effort limit.
         margin: least width of the soft wall before each position limit [rad], how far from the present pose position
-            commands may start, and twice how far beyond a limit is a fault while efforts act; at most `margin_fraction` of the range, which counts on short or prismatic joints.
+            commands may start, and twice how far beyond a limit is a fault while efforts act; at most
+            `margin_fraction` of the range, which counts on short or prismatic joints.
         margin_fraction: see margin.
         effort_fraction: of each effort limit that effort commands may use; soft wall and brake always have all of it.
         effort_rise_time: in which the commanded effort may grow from zero to its limit [s].
