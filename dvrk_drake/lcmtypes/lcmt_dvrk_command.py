@@ -97,7 +97,7 @@ class lcmt_dvrk_command(object):
 
         self.velocity = []
         """
-        POSITION: desired velocities [rad/s, m/s]; else ignored, but finite
+        POSITION: desired velocities [rad/s, m/s], 0 where the position stands; else ignored, but finite
         LCM Type: double[num_joints]
         """
 

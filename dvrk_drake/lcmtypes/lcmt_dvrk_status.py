@@ -40,13 +40,14 @@ class lcmt_dvrk_status(object):
     FAULT_MEASUREMENT = 3
     """ measured positions, velocities or efforts were not finite """
     FAULT_CLOCK = 4
-    """ the arm's own clock went backwards """
+    """ the arm's own clock went backwards or stood still """
     FAULT_DRIVER = 5
     """ for bridges: whatever the arm itself reports, told in fault_text """
     REFUSAL_NONE = 0
     """
-    refusal_code, why a command was not taken: none was refused so far. A refused command changes nothing (but see
-    REFUSAL_OTHER_SENDER and REFUSAL_CLOCK_JUMP) and does not keep an older one alive
+    refusal_code, why a command was not taken: none was refused so far. A refused command does not act and does not keep
+    an older one alive; it changes nothing, but that its sender starts anew if it was STARTING (and see
+    REFUSAL_OTHER_SENDER and REFUSAL_CLOCK_JUMP)
     """
     REFUSAL_UNREADABLE = 1
     """ not an lcmt_dvrk_command: garbage, or another version of this file """
@@ -73,9 +74,12 @@ class lcmt_dvrk_status(object):
     REFUSAL_BAD_RESET = 12
     """ reset_fault with another mode than HOLD """
     REFUSAL_START_FAR = 13
-    """ starting: the command is too far from the present effort or pose """
+    """
+    starting: the command is too far from the present effort or pose, also where its velocity leads, or the present
+    effort is more than commands may use
+    """
     REFUSAL_START_OUTSIDE = 14
-    """ starting with efforts while the pose is outside the position limits """
+    """ starting with efforts while the pose is beyond a position limit by more than half of the margin """
     REFUSAL_OTHER_SENDER = 15
     """ another sender is in command; this is a fault as well """
     FLAG_EFFORT_CLAMPED = 1
@@ -170,7 +174,7 @@ class lcmt_dvrk_status(object):
 
         self.num_lost = 0
         """
-        commands missing in the sequence since the arm started
+        commands missing in the sequence since the arm started, at most 2^63 - 1
         LCM Type: int64_t
         """
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.systems.command_check import is_finite, refusal_by_itself
 from dvrk_drake.systems.command_stream import CommandStream
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 #: No longer time between two steps is made up for in rate limits [s].
 _LONGEST_STEP = 0.01
 
+#: By a clock that stands still nothing expires; Drake takes two steps at the time at which it starts.
+_MOST_STEPS_AT_ONE_TIME = 10
+
 _PASSIVE = (lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD)
 _ACTIVE = {
     lcmt_dvrk_command.POSITION: lcmt_dvrk_status.STATE_POSITION,
@@ -30,9 +34,15 @@ _ACTIVE = {
 
 @dataclass
 class _Force:
-    """The command in force or being watched, when it was accepted, and since when its stream has been good [us]."""
+    """The command in force or being watched, when it was accepted, and since when its stream has been good [us].
+
+    The numbers that act are copies, which whoever made the command cannot change any more.
+    """
 
     command: lcmt_dvrk_command = field(default_factory=lcmt_dvrk_command)
+    position: Vector = field(default_factory=lambda: np.zeros(0))
+    velocity: Vector = field(default_factory=lambda: np.zeros(0))
+    effort: Vector = field(default_factory=lambda: np.zeros(0))
     accepted: int = 0
     good_since: int = 0
 
@@ -64,30 +74,40 @@ class CommandGuard:
     is not accepted now. It does not act and does not keep an older command alive, so bad commands end in HOLD.
 
     **Start guard**: before commands act they must have come without a gap of `expiry` and without a refusal for
-    `start_time`, all near the present: efforts near the measured ones, positions near the measured ones; for efforts
-    the pose must also be inside the limits. A sender that starts with something else is refused, so a restarted or
+    `start_time`, all near the present: efforts near the measured ones, positions near the measured ones, also where the
+    feed-forward velocity leads; for efforts the pose must not be beyond a limit by half the margin, nor the
+    present effort beyond what commands may use. A sender that starts with something else is refused, so a restarted or
     confused controller moves nothing.
 
-    **Faults** are latched: two senders at once, a pose beyond a limit (by half the soft wall's width) while efforts
-    act, a measurement that is not finite, the arm's clock going backwards, and what a driver reports. The reset must be
-    meant: the flag must change from false to true in a HOLD command, and a cause that lasts faults again.
+    **Faults** are latched: two senders at once, a pose beyond a limit (by half the margin) while efforts
+    act, a measurement that is not finite, the arm's clock going backwards or standing still, and what a driver reports.
+    The reset must be meant: the flag must change from false to true in a HOLD command, and a cause that lasts faults
+    again.
 
-    **Without a bump**: HOLD latches the measured pose, or keeps the target that was regulated to while it is near it;
-    POSITION starts from the held pose; EFFORT starts from the measured effort; each at its limited rate.
+    **Without a bump**: HOLD keeps the target that was regulated to, after POSITION only while the arm is near it, and
+    else latches the measured pose; POSITION starts from the held pose; EFFORT starts from the measured effort, and the
+    soft wall, for whoever starts inside it, comes on in `start_time`; each at its limited rate.
 
     **Clocks**: the sender's and the arm's are never compared, only how far each went between two commands; so they need
     not be synchronised, and a jump of either is seen. A jump of the arm's clock forward expires what is in force.
     """
 
-    def __init__(self, arm: Arm, session_id: int, settings: GuardSettings | None = None, modes: tuple[int, ...] = ()):
+    def __init__(
+        self, arm: Arm, session_id: int, settings: GuardSettings | None = None, modes: tuple[int, ...] | None = None
+    ):
         """A guard in HOLD.
 
         Args:
             arm: whose limits are kept.
             session_id: not 0; drawn anew whenever the arm starts.
             settings: the defaults of GuardSettings if None.
-            modes: which of POSITION and EFFORT are accepted; both if empty.
+            modes: which of POSITION and EFFORT are accepted; both if None.
+
+        Raises:
+            StationError: no session, or settings or an arm's gains that guard nothing.
         """
+        if session_id == 0:
+            raise StationError("session_id must not be 0, which a command has that was never filled in")
         self.settings = settings or GuardSettings()
         self.settings.check()
         self.limits = GuardLimits(arm, self.settings)
@@ -96,15 +116,18 @@ class CommandGuard:
         self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
         self.refusal_code = lcmt_dvrk_status.REFUSAL_NONE
         self.counts = GuardCounts()
-        self._modes = modes or tuple(_ACTIVE)
+        self._modes = tuple(_ACTIVE) if modes is None else modes
         self._expiry = round(1e6 * self.settings.expiry)
         self._stream = CommandStream(self._expiry, round(1e6 * self.settings.clock_tolerance))
         self._force = _Force()
         self._utime: int | None = None
+        self._steps_at_one_time = 0
         self._powered = True
         self._q: Vector | None = None
         self._v = self._effort = np.zeros(self.num_joints)
         self._target = self._last_effort = np.zeros(self.num_joints)
+        # What the walls add at once where efforts begin to act; it is taken back, less and less.
+        self._kick = np.zeros(self.num_joints)
         self.output = self._output(0.0)
 
     def __deepcopy__(self, memo: object) -> CommandGuard:
@@ -166,6 +189,9 @@ class CommandGuard:
             self._stream.forget()
             self._force = _Force(accepted=utime)
             self.report_fault(f"the arm's clock went back by {-dt:.6f} s", lcmt_dvrk_status.FAULT_CLOCK)
+        self._steps_at_one_time = 0 if dt else self._steps_at_one_time + 1
+        if self._steps_at_one_time > _MOST_STEPS_AT_ONE_TIME:
+            self.report_fault("the arm's clock stands still", lcmt_dvrk_status.FAULT_CLOCK)
         self._utime = utime
         self._measure(np.array(q, float), np.array(v, float), np.array(effort, float))
         self._expire(utime)
@@ -174,17 +200,21 @@ class CommandGuard:
         self.output = self._output(min(max(dt, 0.0), _LONGEST_STEP))
         return self.output
 
-    def report_fault(self, text: str, code: int = lcmt_dvrk_status.FAULT_DRIVER) -> None:
-        """Latches a fault, for drivers whose arm reports one; the first one stays until it is reset."""
+    def report_fault(self, text: str, code: int = lcmt_dvrk_status.FAULT_DRIVER, *, has_power: bool = True) -> None:
+        """Latches a fault, for drivers whose arm reports one: before each `step`, as long as it lasts.
+
+        Args:
+            text: what it is, with its numbers; the first one stays until it is reset.
+            code: lcmt_dvrk_status.FAULT_*.
+            has_power: False if the motors cannot hold the arm. It is as OFF then, and a reset holds it where it is
+                found, not where it was.
+        """
         if self.state != lcmt_dvrk_status.STATE_FAULT:
             powered = self._powered
             self._hold()
-            self.state, self.fault_code, self.fault_text, self._powered = (
-                lcmt_dvrk_status.STATE_FAULT,
-                code,
-                text,
-                powered,
-            )
+            self.state, self._powered = lcmt_dvrk_status.STATE_FAULT, powered
+            self.fault_code, self.fault_text = code, text
+        self._powered &= has_power
 
     def _is_watched_or_in_force(self) -> bool:
         return self.state in (lcmt_dvrk_status.STATE_STARTING, *_ACTIVE.values())
@@ -195,10 +225,9 @@ class CommandGuard:
     def _measure(self, q: Vector, v: Vector, effort: Vector) -> None:
         shape = (self.num_joints,)
         if not (q.shape == v.shape == effort.shape == shape and is_finite(q, v, effort)):
-            self.report_fault(
-                "the measured positions, velocities or efforts are not finite", lcmt_dvrk_status.FAULT_MEASUREMENT
-            )
-            self._q, self._powered = None, False
+            text = f"the measured positions, velocities or efforts are not {self.num_joints} finite numbers each"
+            self.report_fault(text, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=False)
+            self._q = None
             return
         if self._q is None:
             self._target = q.copy()
@@ -226,17 +255,8 @@ class CommandGuard:
         if command.control_mode < 0 or not self.accepted_modes >> command.control_mode & 1:
             return lcmt_dvrk_status.REFUSAL_BAD_MODE
         if command.control_mode in _ACTIVE and self.state != _ACTIVE[command.control_mode]:
-            return self._refusal_to_start(command)
+            return self.limits.refusal_to_start(command, self._measured_q(), self._effort)
         return lcmt_dvrk_status.REFUSAL_NONE
-
-    def _refusal_to_start(self, command: lcmt_dvrk_command) -> int:
-        if command.control_mode == lcmt_dvrk_command.EFFORT:
-            if self.limits.beyond(self._measured_q()):
-                return lcmt_dvrk_status.REFUSAL_START_OUTSIDE
-            far = np.abs(np.asarray(command.effort) - self._effort) > self.limits.start_effort
-        else:
-            far = np.abs(np.asarray(command.position) - self._measured_q()) > self.limits.start_position
-        return lcmt_dvrk_status.REFUSAL_START_FAR if np.any(far) else lcmt_dvrk_status.REFUSAL_NONE
 
     def _accept(self, command: lcmt_dvrk_command, utime: int) -> None:
         self.counts.accepted += 1
@@ -245,6 +265,9 @@ class CommandGuard:
         mode, force = command.control_mode, self._force
         goes_on = self.state == lcmt_dvrk_status.STATE_STARTING and mode == force.command.control_mode
         force.command, force.accepted = command, utime
+        force.position, force.velocity, force.effort = (
+            np.array(numbers, float) for numbers in (command.position, command.velocity, command.effort)
+        )
         if mode == lcmt_dvrk_command.OFF:
             self.state, self._powered = lcmt_dvrk_status.STATE_OFF, False
         elif mode == lcmt_dvrk_command.HOLD:
@@ -258,7 +281,10 @@ class CommandGuard:
             self._hold()
             self.state, force.good_since = lcmt_dvrk_status.STATE_STARTING, utime
         elif utime - force.good_since >= 1e6 * self.settings.start_time:
-            self._last_effort = np.clip(self._effort, -self.limits.effort_limits, self.limits.effort_limits)
+            limits = self.limits
+            self._last_effort = np.clip(self._effort, -limits.command_limits, limits.command_limits)
+            restrained, _ = limits.restrain_effort(self._last_effort, self._measured_q(), self._v)
+            self._kick = restrained - self._last_effort
             self.state = _ACTIVE[mode]
 
     def _hold(self) -> None:
@@ -274,17 +300,20 @@ class CommandGuard:
         self.state, self._powered = lcmt_dvrk_status.STATE_HOLD, True
 
     def _output(self, dt: float) -> GuardOutput:
-        zero, flags = np.zeros(self.num_joints), np.zeros(self.num_joints, np.int8)
-        command, q = self._force.command, self._measured_q()
+        n, limits, force = self.num_joints, self.limits, self._force
+        velocity, effort, flags = np.zeros(n), np.zeros(n), np.zeros(n, np.int8)
+        q = self._measured_q()
         if not self._powered:
-            return GuardOutput(lcmt_dvrk_command.OFF, q, zero, zero, flags)
+            return GuardOutput(lcmt_dvrk_command.OFF, q.copy(), velocity, effort, flags)
         if self.state == lcmt_dvrk_status.STATE_POSITION:
-            self._target, flags = self.limits.limit_position(np.asarray(command.position), self._target, dt)
-            velocity = self.limits.limit_velocity(np.asarray(command.velocity), flags)
-            return GuardOutput(lcmt_dvrk_command.POSITION, self._target.copy(), velocity, zero, flags)
-        if self.state == lcmt_dvrk_status.STATE_EFFORT:
-            wanted = np.asarray(command.effort)
-            self._last_effort, flags = self.limits.follow_effort(wanted, self._last_effort, dt)
-            effort, restrained = self.limits.restrain_effort(self._last_effort, q, self._v)
-            return GuardOutput(lcmt_dvrk_command.EFFORT, q, zero, effort, flags | restrained)
-        return GuardOutput(lcmt_dvrk_command.HOLD, self._target.copy(), zero, zero, flags)
+            self._target, flags = limits.limit_position(force.position, self._target, dt)
+            velocity = limits.limit_velocity(force.velocity, self._target, flags)
+            return GuardOutput(lcmt_dvrk_command.POSITION, self._target.copy(), velocity, effort, flags)
+        if self.state == lcmt_dvrk_status.STATE_EFFORT and self._utime is not None:
+            self._last_effort, flags = limits.follow_effort(force.effort, self._last_effort, dt)
+            effort, restrained = limits.restrain_effort(self._last_effort, q, self._v)
+            acted_for = 1e-6 * (self._utime - force.good_since) - self.settings.start_time
+            kick = self._kick * min(max(1.0 - acted_for / self.settings.start_time, 0.0), 1.0)
+            effort = np.clip(effort - kick, -limits.effort_limits, limits.effort_limits)
+            return GuardOutput(lcmt_dvrk_command.EFFORT, q.copy(), velocity, effort, flags | restrained)
+        return GuardOutput(lcmt_dvrk_command.HOLD, self._target.copy(), velocity, effort, flags)

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 
+#: Commands are counted in an int64 of the status; nobody loses as many, but a sequence may jump by more.
+_MOST_LOST = 2**63 - 1
+
 
 @dataclass
 class CommandStream:
@@ -51,7 +54,7 @@ class CommandStream:
     def accept(self, command: lcmt_dvrk_command, utime: int) -> bool:
         """Goes on to this command; True if it asks for a reset: reset_fault changed from false to true."""
         if self._last is not None:
-            self.lost += command.sequence - self._last.sequence - 1
+            self.lost = min(self.lost + command.sequence - self._last.sequence - 1, _MOST_LOST)
         self._last, self._arrival = command, utime
         resets = command.reset_fault and self._can_reset
         self._can_reset = not command.reset_fault

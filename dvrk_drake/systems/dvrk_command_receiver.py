@@ -48,8 +48,8 @@ class DvrkCommandReceiver(LeafSystem):
       commands are understood without it.
     - `control_mode` (1): lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT, what is in force.
     - `desired_state` (2n): where that position controller shall go; the measured pose at rest while efforts act.
-    - `effort` (n): what the motors shall apply: zero when off, the guarded command in EFFORT, else
-      `position_control_effort`.
+    - `effort` (n): what the motors shall apply: zero when off, the guarded command in EFFORT (with the
+      arm's own gravity compensation inside the effort limits), else `position_control_effort`.
     - `guard`: the CommandGuard, to be read only.
 
     Its clock is the context's time after `start_utime`. The guard is abstract state; it is updated every `period`, and
@@ -67,7 +67,7 @@ class DvrkCommandReceiver(LeafSystem):
         """Of `arm` with a `guard` of it.
 
         Args:
-            arm: for the number of its joints.
+            arm: for the number of its joints and their effort limits.
             guard: its state at first; each context has its own.
             start_utime: the arm's clock at time zero of the context [us].
             period: of the update [s].
@@ -75,6 +75,7 @@ class DvrkCommandReceiver(LeafSystem):
         super().__init__()
         n = arm.num_joints
         self._num_joints, self._start_utime = n, start_utime
+        self._effort_limits = arm.effort_limits
         self._command = self.DeclareAbstractInputPort("lcmt_dvrk_command", AbstractValue.Make(lcmt_dvrk_command()))
         self._state = self.DeclareVectorInputPort("state_estimated", 2 * n)
         self._effort = self.DeclareVectorInputPort("effort_measured", n)
@@ -134,7 +135,7 @@ class DvrkCommandReceiver(LeafSystem):
             output.SetZero()
         elif told.control_mode == lcmt_dvrk_command.EFFORT:
             gravity = self._gravity.Eval(context) if self._gravity.HasValue(context) else 0.0
-            output.SetFromVector(told.effort + gravity)
+            output.SetFromVector(np.clip(told.effort + gravity, -self._effort_limits, self._effort_limits))
         else:
             output.SetFromVector(self._position_control.Eval(context))
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.errors import StationError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.systems.guard_settings import GuardSettings
 
 if TYPE_CHECKING:
@@ -18,30 +19,42 @@ Flags = NDArray[np.int8]
 
 _ROUNDING = 1e-12
 
+#: How many times the gains of the position controller, which 1 kHz permits, a soft wall may have; more chatters.
+_WALL_GAIN = 4.0
+
 
 class GuardLimits:
     """Limits of one arm, for n joints in its order.
 
-    **Effort commands** meet a soft wall in the margin before each position limit lower <= A q <= upper, the joint box
-    and the coupled limits alike: a spring and damper along the limit's own coordinate c = A_k q,
+    **Effort commands** meet a soft wall before each position limit lower <= A q <= upper, the joint box and the coupled
+    limits alike: a spring and damper along the limit's own coordinate c = A_k q,
 
         lambda = 2 F_k clip(depth, 0, 1),  tau -= A_k' lambda,
 
     F_k the effort that outweighs every motor that can push along c, and depth that of c + T_k dc/dt in the wall: 0
-    where the margin begins, 1 at the limit. So at half of the margin no outward command is left, and at the limit all
-    that the motors have is directed inward; what approaches fast is met earlier, by T_k, the ratio Kd/Kp of the joint's
-    position controller. The arm is never pulled, only pushed back. Without efforts (a falling arm) the wall pushes all
-    the same. Joints that are faster than they may be are braked: above 1.25 times the speed nothing drives them on.
-    Commands are clamped and limited in rate before; what the wall adds is not delayed.
+    where it begins, 1 at the limit. It is as wide as the margin, or wider where its gains would exceed four times those
+    of the joint's position controller: one period late, they would chatter. So at half of its width no outward command
+    is left, and at the limit all that the motors have is directed inward; what approaches fast is met earlier, by T_k,
+    the ratio Kd/Kp of the joint's position controller. The arm is never pulled, only pushed back. Without efforts (a
+    falling arm) the wall pushes all the same. Joints that are faster than they may be are braked: above 1.25 times the
+    speed nothing drives them on. Commands are clamped and limited in rate before; what the wall adds is not delayed.
 
     **Position commands** move a target that is limited in rate and never leaves the limits; a target that starts
-    outside moves no further out.
+    outside moves no further out. A position controller goes Kd/Kp v beyond a target that stands with a feed-forward v,
+    so the velocity is limited until that point is inside as well.
     """
 
     def __init__(self, arm: Arm, settings: GuardSettings) -> None:
-        """Of `arm`."""
+        """Of `arm`.
+
+        Raises:
+            StationError: a joint has no gain kp, so nothing holds it.
+        """
         n = arm.num_joints
+        if not np.all(np.array(arm.gains.kp) > 0):
+            raise StationError(f"{arm.name}: all gains.kp must be positive; got {arm.gains.kp}")
         self.effort_limits = np.array(arm.effort_limits)
+        self.command_limits = settings.effort_fraction * self.effort_limits
         self.A, self.lower, self.upper = arm.limit_matrix()
         self.names = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
         width = self.upper - self.lower
@@ -51,8 +64,10 @@ class GuardLimits:
         self.speed = width[:n] / settings.traverse_time
         self._effort_rate = self.effort_limits / settings.effort_rise_time
         self._wall_effort = np.array([max(self.effort_limits[row != 0] / np.abs(row[row != 0])) for row in self.A])
-        look_ahead = np.divide(arm.gains.kd, arm.gains.kp)
-        self._look_ahead = np.array([max(look_ahead[row != 0]) for row in self.A])
+        self._look_ahead = np.divide(arm.gains.kd, arm.gains.kp)
+        self._wall_look_ahead = np.array([max(self._look_ahead[row != 0]) for row in self.A])
+        softest = 2 * self._wall_effort[:, None] * self.A**2 / (_WALL_GAIN * np.array(arm.gains.kp))
+        self.wall_width = np.maximum(self.margin, softest.max(axis=1))
         self._wall_flags = np.full(len(self.A), lcmt_dvrk_status.FLAG_COUPLED_LIMIT, np.int8)
         self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT
 
@@ -65,12 +80,25 @@ class GuardLimits:
             return ""
         return f"{self.names[k]} = {c[k]:.4g} is beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}"
 
+    def refusal_to_start(self, command: lcmt_dvrk_command, q: Vector, effort: Vector) -> int:
+        """REFUSAL_START_* of a command that would begin to act at the measured q and effort (n,), or REFUSAL_NONE."""
+        if command.control_mode == lcmt_dvrk_command.EFFORT:
+            if self.beyond(q):
+                return lcmt_dvrk_status.REFUSAL_START_OUTSIDE
+            far = np.abs(np.asarray(command.effort) - effort) > self.start_effort
+            far |= np.abs(effort) > self.command_limits + self.start_effort
+        else:
+            away = np.asarray(command.position) - q
+            ahead = away + self._look_ahead * np.asarray(command.velocity)
+            far = np.maximum(np.abs(away), np.abs(ahead)) > self.start_position
+        return lcmt_dvrk_status.REFUSAL_START_FAR if np.any(far) else lcmt_dvrk_status.REFUSAL_NONE
+
     def follow_effort(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:
         """Effort (n,) `dt` seconds after `last`, which follows `command` clamped and at a limited rate; joint flags.
 
         All are (n,) [N m, N] and finite; `last` is inside the effort limits.
         """
-        clamped = np.clip(command, -self.effort_limits, self.effort_limits)
+        clamped = np.clip(command, -self.command_limits, self.command_limits)
         step = self._effort_rate * dt
         effort = np.clip(clamped, last - step, last + step)
         flags = np.where(clamped != command, lcmt_dvrk_status.FLAG_EFFORT_CLAMPED, 0).astype(np.int8)
@@ -86,8 +114,8 @@ class GuardLimits:
         flags = np.zeros(len(effort), np.int8)
         braking = 4 * limit * np.sign(v) * np.clip(np.abs(v) / self.speed - 1, 0, 0.5)
         flags[braking != 0] |= lcmt_dvrk_status.FLAG_SPEED_LIMIT
-        c = self.A @ q + self._look_ahead * (self.A @ v)
-        to_upper, to_lower = (self.upper - c) / self.margin, (c - self.lower) / self.margin
+        c = self.A @ q + self._wall_look_ahead * (self.A @ v)
+        to_upper, to_lower = (self.upper - c) / self.wall_width, (c - self.lower) / self.wall_width
         walls = 2 * self._wall_effort * (np.clip(1 - to_lower, 0, 1) - np.clip(1 - to_upper, 0, 1))
         for k in np.flatnonzero(walls):
             flags[self.A[k] != 0] |= self._wall_flags[k]
@@ -95,10 +123,25 @@ class GuardLimits:
 
     def limit_position(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:
         """Target (n,) for `command`, `dt` seconds after the target `last`, and the flags of the joints."""
-        n = len(last)
         step = self.speed * dt
         target = np.clip(command, last - step, last + step)
         flags = np.where(target != command, lcmt_dvrk_status.FLAG_RATE_LIMITED, 0).astype(np.int8)
+        inside, limited = self._inside(target, last)
+        return inside, flags | limited
+
+    def limit_velocity(self, command: Vector, target: Vector, flags: Flags) -> Vector:
+        """Feed-forward velocity (n,) at `target`: the command's where its position is followed as it is, else zero."""
+        velocity = np.where(flags == 0, np.clip(command, -self.speed, self.speed), 0.0)
+        wanted = self._look_ahead * velocity
+        ahead, _ = self._inside(target + wanted, target)
+        cut = ahead != target + wanted
+        part = np.divide(ahead - target, wanted, out=np.ones_like(wanted), where=cut & (wanted != 0))
+        return velocity * np.clip(part, 0, 1)
+
+    def _inside(self, target: Vector, last: Vector) -> tuple[Vector, Flags]:
+        """`target` kept inside the limits, or no further outside than `last`; joint flags."""
+        n = len(last)
+        flags = np.zeros(n, np.int8)
         c = self.A @ last
         lower, upper = np.minimum(self.lower, c), np.maximum(self.upper, c)
         inside = np.clip(target, lower[:n], upper[:n])
@@ -117,7 +160,3 @@ class GuardLimits:
             # Coupled limits that share joints can undo one another's correction: then stay.
             return last.copy(), flags
         return inside, flags
-
-    def limit_velocity(self, command: Vector, flags: Flags) -> Vector:
-        """Feed-forward velocity (n,): of the command where its position is followed as it is, else zero."""
-        return np.where(flags == 0, np.clip(command, -self.speed, self.speed), 0.0)

@@ -7,6 +7,19 @@ from dataclasses import dataclass
 
 from dvrk_drake.errors import StationError
 
+#: Lowest and highest value of each: outside, the guard would guard nothing, or nobody could command.
+_ALLOWED = {
+    "expiry": (0.002, 1.0),
+    "start_time": (0.05, 10.0),
+    "clock_tolerance": (0.001, 1.0),
+    "start_effort": (0.001, 0.25),
+    "margin": (0.001, 0.3),
+    "margin_fraction": (0.001, 0.25),
+    "effort_fraction": (0.01, 1.0),
+    "effort_rise_time": (0.002, 10.0),
+    "traverse_time": (0.1, 100.0),
+}
+
 
 @dataclass
 class GuardSettings:
@@ -17,9 +30,11 @@ class GuardSettings:
         start_time: how long commands must be good before they act [s].
         clock_tolerance: by how much a sender's clock and the arm's may differ between two commands [s].
         start_effort: how far from the present effort effort commands may start, as a fraction of the effort limit.
-        margin: width of the soft wall before each position limit [rad], and how far from the present pose position
-            commands may start; at most `margin_fraction` of the range, which counts on short or prismatic joints.
+        margin: least width of the soft wall before each position limit [rad], how far from the present pose position
+            commands may start, and twice how far beyond a limit is a fault while efforts act; at most
+            `margin_fraction` of the range, which counts on short or prismatic joints.
         margin_fraction: see margin.
+        effort_fraction: of each effort limit that effort commands may use; soft wall and brake always have all of it.
         effort_rise_time: in which the commanded effort may grow from zero to its limit [s].
         traverse_time: in which a joint may cross its range [s]: the speed that it may have. Commanded positions go no
             faster, and while efforts act it is braked above.
@@ -31,6 +46,7 @@ class GuardSettings:
     start_effort: float = 0.1
     margin: float = 0.05
     margin_fraction: float = 0.05
+    effort_fraction: float = 1.0
     effort_rise_time: float = 0.02
     traverse_time: float = 0.5
 
@@ -41,10 +57,8 @@ class GuardSettings:
         """Refuses settings that switch the guard off.
 
         Raises:
-            StationError: one is not positive, or commands would act for longer than a second without a sender.
+            StationError: one is outside its range.
         """
-        for name, value in vars(self).items():
-            if not 0 < value < 10:
-                raise StationError(f"guard settings: {name} must be above 0 and below 10; got {value}")
-        if self.expiry > 1.0:
-            raise StationError(f"guard settings: expiry must be at most 1 s; got {self.expiry}")
+        for name, (lowest, highest) in _ALLOWED.items():
+            if not lowest <= (value := getattr(self, name)) <= highest:
+                raise StationError(f"guard settings: {name} must be {lowest:g} to {highest:g}; got {value}")

@@ -1,0 +1,285 @@
+"""What was tried to get past the watchdog: limits at their edges, clocks, messages, settings, lost power."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from test_command_guard import ARM, LIMIT, MS, SESSION, Bench, N, Q
+
+from dvrk_drake.errors import StationError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.systems.command_guard import CommandGuard
+from dvrk_drake.systems.dvrk_status_sender import fill_in_guard
+from dvrk_drake.systems.guard_settings import GuardSettings
+
+A, LOWER, UPPER = ARM.limit_matrix()
+LOOK_AHEAD = np.array(ARM.gains.kd) / np.array(ARM.gains.kp)
+
+
+# The arm's clock
+
+
+def test_a_clock_that_stands_still_is_a_fault_since_nothing_expires_by_it():
+    bench = Bench().started()
+    for _ in range(10):
+        output = bench.guard.step(bench.utime, bench.q, bench.v, bench.effort)
+    assert output.control_mode == Command.EFFORT
+    output = bench.guard.step(bench.utime, bench.q, bench.v, bench.effort)
+    assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_CLOCK)
+
+
+@pytest.mark.parametrize("seconds", [1e-6, 0.011, 0.0499, 3.0, 1e9])
+def test_a_long_step_moves_efforts_and_targets_no_further_than_ten_milliseconds(seconds):
+    for mode in (Command.EFFORT, Command.POSITION):
+        bench = Bench().started(mode)
+        before = bench.output
+        bench.send(mode, effort=list(-LIMIT), position=list(Q + 5.0))
+        bench.utime += round(1e6 * seconds)
+        output = bench.guard.step(bench.utime, bench.q, bench.v, bench.effort)
+        assert output.control_mode == (mode if seconds <= 0.05 else Command.HOLD)
+        dt = min(seconds, 0.01)
+        assert np.all(np.abs(output.effort - before.effort) <= dt / 0.02 * LIMIT + 1e-12) or seconds > 0.05
+        assert np.all(np.abs(output.position - before.position) <= dt * bench.guard.limits.speed + 1e-12)
+
+
+def test_two_controllers_that_alternate_at_the_expiry_never_act():
+    for gap, fault in ((50 * MS, True), (50 * MS + 1, False)):
+        bench = Bench()
+        for k in range(40):
+            bench.send(sender=5 + k % 2)
+            bench.utime += gap
+            bench.guard.step(bench.utime, bench.q, bench.v, bench.effort)
+            assert bench.guard.output.control_mode == Command.HOLD
+        assert (bench.guard.fault_code == Status.FAULT_DUPLICATE_SENDER) == fault
+
+
+# The messages
+
+
+def test_a_jump_of_the_sequence_leaves_a_status_that_can_be_sent():
+    bench = Bench()
+    for sender in (5, 6):
+        assert bench.send(Command.HOLD, sequence=-(2**63), sender=sender) == Status.REFUSAL_NONE
+        bench.tick()
+        assert bench.send(Command.HOLD, sequence=2**63 - 1, sender=sender) == Status.REFUSAL_NONE
+        bench.tick(60)
+    status = Status()
+    fill_in_guard(status, bench.guard)
+    assert Status.decode(status.encode()).num_lost == 2**63 - 1
+
+
+def test_a_command_that_is_changed_after_it_was_accepted_does_not_act():
+    bench = Bench()
+    for _ in range(260):
+        command = bench.command(effort=np.array(bench.effort))
+        assert bench.guard.receive(command, bench.utime) == Status.REFUSAL_NONE
+        bench.tick()
+    command.effort[:] = np.nan
+    np.testing.assert_allclose(bench.tick().effort, 0.05 * LIMIT)
+
+
+def test_whoever_changes_the_output_does_not_change_the_guard():
+    bench = Bench().started()
+    for array in (bench.output.position, bench.output.velocity, bench.output.effort):
+        array[:] = 1.0
+    np.testing.assert_array_equal(bench.output.velocity, np.ones(N))
+    np.testing.assert_allclose(bench.tick().effort, 0.05 * LIMIT)
+    np.testing.assert_array_equal(bench.run(Command.HOLD, 1).position, Q)
+
+
+def test_a_session_that_an_empty_command_has_is_refused():
+    with pytest.raises(StationError, match="session_id must not be 0"):
+        CommandGuard(ARM, 0)
+
+
+# What is configured
+
+
+def test_no_mode_accepted_is_not_every_mode_accepted():
+    bench = Bench(modes=())
+    assert bench.guard.accepted_modes == 0b0011
+    assert bench.send(Command.EFFORT) == bench.send(Command.POSITION) == Status.REFUSAL_BAD_MODE
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("start_effort", 2.0),  # any effort would be near any other
+        ("margin", 2.0),  # any pose would be near any other
+        ("margin_fraction", 0.5),  # both walls would fill the range
+        ("effort_fraction", 1.1),
+        ("effort_rise_time", 1e-6),
+        ("traverse_time", 1e-3),
+        ("clock_tolerance", 5.0),
+        ("expiry", 1.1),
+        ("start_time", 1e-3),
+    ],
+)
+def test_settings_that_switch_the_guard_off_are_refused(name, value):
+    for bad in (value, 0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(StationError, match=f"guard settings: {name} must be"):
+            GuardSettings(**{name: bad})
+
+
+def test_an_arm_that_nothing_holds_is_refused():
+    gains = dataclasses.replace(ARM.gains, kp=[0.0, *ARM.gains.kp[1:]])
+    with pytest.raises(StationError, match=r"MTML: all gains\.kp must be positive"):
+        CommandGuard(dataclasses.replace(ARM, gains=gains), SESSION)
+
+
+def test_a_fraction_of_the_effort_limits_clamps_commands_and_refuses_a_start_that_would_drop_the_arm():
+    bench = Bench(settings=GuardSettings(effort_fraction=0.1)).started()
+    output = bench.run(Command.EFFORT, 50, effort=list(LIMIT))
+    np.testing.assert_allclose(output.effort, 0.1 * LIMIT)
+    assert np.all(output.joint_flags & Status.FLAG_EFFORT_CLAMPED)
+    # The wall has all of the effort all the same.
+    bench.q = Q.copy()
+    bench.q[0] = ARM.position_upper[0]
+    assert bench.run(Command.EFFORT, 1, effort=list(LIMIT)).effort[0] == -LIMIT[0]
+    bench = Bench(settings=GuardSettings(effort_fraction=0.1))
+    bench.effort = 0.21 * LIMIT
+    bench.tick()
+    assert bench.send(Command.EFFORT) == Status.REFUSAL_START_FAR
+
+
+# Feed-forward velocity
+
+
+@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+def test_a_velocity_leads_a_position_controller_to_no_pose_beyond_the_limits(name):
+    arm = load_arm(name)
+    A, lower, upper = arm.limit_matrix()
+    look_ahead = np.array(arm.gains.kd) / np.array(arm.gains.kp)
+    bench = Bench(arm).started(Command.POSITION)
+    generator = np.random.default_rng(2)
+    for q in arm.sample_poses(30, generator):
+        # The way there takes up to the traverse time.
+        bench.run(Command.POSITION, 520, position=list(q))
+        bench.run(Command.POSITION, 1, position=list(q), velocity=list(1e5 * generator.normal(size=arm.num_joints)))
+        ahead = bench.output.position + look_ahead * bench.output.velocity
+        assert np.all((A @ ahead <= upper + 1e-9) & (A @ ahead >= lower - 1e-9))
+        assert np.any(bench.output.velocity)
+
+
+def test_a_start_with_a_velocity_that_leads_away_is_refused():
+    bench = Bench()
+    farthest = 0.05 / LOOK_AHEAD * np.eye(N)[4]
+    bench.run(Command.POSITION, 240, velocity=list(0.9 * farthest))
+    assert bench.send(Command.POSITION, velocity=list(1.1 * farthest)) == Status.REFUSAL_START_FAR
+    assert bench.guard.state == Status.STATE_HOLD
+
+
+# Limits
+
+
+def test_efforts_that_begin_to_act_inside_the_wall_begin_without_a_kick():
+    for side in (1, -1):
+        bench = Bench()
+        bench.q = Q.copy()
+        bench.q[0] = (UPPER if side > 0 else LOWER)[0]
+        bench.tick()
+        bench.run(Command.EFFORT, 250)
+        last, steps = bench.effort[0], []
+        for _ in range(300):
+            bench.run(Command.EFFORT, 1)
+            steps.append(bench.output.effort[0] - last)
+            last = bench.output.effort[0]
+        assert max(np.abs(steps)) <= LIMIT[0] / 20  # the rate of efforts
+        assert last == -side * LIMIT[0]
+
+
+def test_a_wall_that_one_starts_beside_is_there_at_once():
+    """Efforts outward as soon as they act, from where the wall begins: as strong as it is later."""
+    q = Q.copy()
+    q[0] = UPPER[0] - 0.05
+    efforts = []
+    for acting in (1, 500):
+        bench = Bench()
+        bench.q = q.copy()
+        bench.tick()
+        bench.run(Command.EFFORT, 250 + acting)
+        bench.q = q + 0.04 * np.eye(N)[0]
+        efforts.append(bench.run(Command.EFFORT, 30, effort=list(LIMIT)).effort[0])
+    assert efforts[0] == efforts[1] < 0
+
+
+def test_shoulder_and_elbow_at_their_ends_never_leave_the_coupled_limit():
+    """Targets, from every corner of the two joints that the coupled limit leaves, with jumps to any other."""
+    bench = Bench()
+    limits = bench.guard.limits
+    generator = np.random.default_rng(0)
+    target = Q.copy()
+    for k in range(20_000):
+        if k % 40 == 0:
+            command = Q.copy()
+            command[1:3] = np.where(generator.random(2) < 0.5, LOWER[1:3], UPPER[1:3]) + generator.choice([-9, 0, 9])
+        target, _ = limits.limit_position(command, target, 0.01)
+        assert np.all((A @ target <= UPPER + 1e-9) & (A @ target >= LOWER - 1e-9))
+
+
+def test_a_target_that_starts_outside_every_limit_only_comes_back():
+    limits = Bench().guard.limits
+    generator = np.random.default_rng(1)
+    for _ in range(300):
+        target = Q + generator.normal(size=N)
+        for _ in range(20):
+            before = A @ target
+            target, _ = limits.limit_position(Q + 3 * generator.normal(size=N), target, 0.01)
+            after = A @ target
+            assert np.all(after <= np.maximum(UPPER, before) + 1e-9)
+            assert np.all(after >= np.minimum(LOWER, before) - 1e-9)
+
+
+@pytest.mark.parametrize("excess", [0.0, 0.0249, 0.0251, 0.3])
+def test_a_reset_outside_the_limits_holds_there_and_efforts_do_not_start(excess):
+    bench = Bench().started()
+    bench.q = Q.copy()
+    bench.q[0] = UPPER[0] + 0.3
+    bench.tick()
+    assert bench.guard.fault_code == Status.FAULT_POSITION_LIMIT
+    bench.q[0] = UPPER[0] + excess
+    bench.tick()
+    bench.run(Command.HOLD, 1)
+    output = bench.run(Command.HOLD, 1, reset_fault=True)
+    assert (output.control_mode, bench.guard.state) == (Command.HOLD, Status.STATE_HOLD)
+    code = bench.send(Command.EFFORT)
+    assert code == (Status.REFUSAL_START_OUTSIDE if excess > 0.025 else Status.REFUSAL_NONE)
+
+
+@pytest.mark.parametrize("velocity", [1e5, -1e5])
+def test_a_huge_velocity_gives_no_more_effort_than_the_motors_limit(velocity):
+    bench = Bench().started()
+    bench.v = np.full(N, velocity)
+    output = bench.tick()
+    assert np.all(np.abs(output.effort) <= LIMIT)
+    bench.v = np.zeros(N)
+    np.testing.assert_allclose(bench.tick().effort, 0.05 * LIMIT)
+
+
+# A real arm's power
+
+
+def test_an_arm_that_lost_its_power_is_held_where_it_fell_not_where_it_was():
+    for mode in (Command.HOLD, Command.POSITION):
+        bench = Bench()
+        bench.run(mode, 260)
+        for _ in range(100):
+            bench.guard.report_fault("operating state DISABLED", has_power=False)
+            output = bench.tick()
+            assert (output.control_mode, bench.guard.fault_code) == (Command.OFF, Status.FAULT_DRIVER)
+            bench.q = bench.q - 0.003
+        bench.run(Command.HOLD, 1)
+        output = bench.run(Command.HOLD, 1, reset_fault=True)
+        assert output.control_mode == Command.HOLD
+        np.testing.assert_array_equal(output.position, bench.q)
+
+
+def test_power_lost_in_a_fault_is_noticed_and_keeps_the_first_text():
+    bench = Bench()
+    bench.guard.report_fault("the amplifier is hot")
+    assert bench.tick().control_mode == Command.HOLD
+    bench.guard.report_fault("operating state DISABLED", has_power=False)
+    assert bench.tick().control_mode == Command.OFF
+    assert bench.guard.fault_text == "the amplifier is hot"

@@ -1,0 +1,193 @@
+"""The bridge in docs/connecting_a_real_dvrk.md, against an arm and a network that are not real."""
+
+import re
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.systems.guard_settings import GuardSettings
+
+DOCUMENT = Path(__file__).parents[1] / "docs" / "connecting_a_real_dvrk.md"
+ARM = load_arm("mtml")
+N = ARM.num_joints
+HELD = 0.02 * ARM.effort_limits
+
+
+class Network:
+    """As much of lcm.LCM as a bridge uses: what is published is handled later, in order."""
+
+    def __init__(self):
+        self.handlers, self.queue, self.published = {}, deque(), []
+
+    def subscribe(self, channel, handler):
+        self.handlers[channel] = handler
+        return self
+
+    def set_queue_capacity(self, capacity):
+        assert capacity >= 100
+
+    def publish(self, channel, data):
+        self.published.append((channel, data))
+
+    def handle_timeout(self, milliseconds):
+        if not self.queue:
+            return 0
+        self.handlers["DVRK_COMMAND_MTML"]("DVRK_COMMAND_MTML", self.queue.popleft())
+        return 1
+
+
+class Crtk:
+    """The ROS side of an arm that stays where it is, and notes what it was told last."""
+
+    def __init__(self):
+        self.q, self.age, self.state, self.told = np.full(N, 0.1), 0.0, "ENABLED", []
+
+    def measured(self):
+        return self.q, np.zeros(N), HELD, self.age
+
+    def operating_state(self):
+        return self.state
+
+    def use_gravity_compensation(self, on):
+        return on
+
+    def servo_jf(self, effort):
+        self.told.append(("servo_jf", np.array(effort)))
+
+    def servo_jp(self, position, velocity):
+        self.told.append(("servo_jp", np.array(position)))
+
+    def state_command(self, command):
+        self.told.append((command, None))
+        self.state = "DISABLED"
+
+    def hold(self):
+        self.told.append(("hold", None))
+
+
+class Scene:
+    """Runs the document's bridge; `script(scene, k)` is called before each of its periods."""
+
+    def __init__(self, script, periods, settings=None):
+        self.crtk, self.network, self.utime, self.statuses = Crtk(), Network(), 10**15, []
+        self.script, self.periods, self.k, self.settings = script, periods, -1, settings or GuardSettings()
+
+    def run(self):
+        namespace = {}
+        for block in re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL):
+            exec(block, namespace)
+        namespace["run_bridge"](self.crtk, ARM, self.settings, self.network, lambda: self.utime, self.next_period)
+        self.hear()
+        return self
+
+    def hear(self):
+        while self.network.published:
+            channel, data = self.network.published.pop(0)
+            assert channel == "DVRK_STATUS_MTML"
+            self.statuses.append(Status.decode(data))
+
+    def next_period(self):
+        self.hear()
+        self.k += 1
+        self.utime += 1000
+        if self.k < self.periods:
+            self.script(self, self.k)
+        return self.k < self.periods
+
+    def send(self, mode, sender=3, **fields):
+        if not self.statuses:
+            return
+        status, command = self.statuses[-1], Command()
+        command.utime, command.sequence, command.sender_id = self.utime, status.sequence, sender
+        command.session_id, command.status_utime = status.session_id, status.utime
+        command.arm_name, command.num_joints, command.control_mode = "MTML", N, mode
+        command.position, command.velocity, command.effort = list(status.position), [0.0] * N, list(HELD)
+        for name, value in fields.items():
+            setattr(command, name, value)
+        self.network.queue.append(command.encode())
+
+    def topics(self, begin, end):
+        return {topic for topic, _ in self.crtk.told[begin:end]}
+
+
+def test_efforts_act_after_the_start_guard_and_a_dead_controller_is_followed_by_a_hold():
+    scene = Scene(lambda scene, k: k < 400 and scene.send(Command.EFFORT), 500).run()
+    assert scene.topics(0, 250) == {"servo_jp"}
+    assert scene.topics(260, 445) == {"servo_jf"}
+    assert scene.topics(455, 500) == {"servo_jp"}
+    np.testing.assert_allclose(scene.crtk.told[400][1], HELD)
+    assert scene.crtk.told[500:] == [("hold", None)]
+    assert [s.sequence for s in scene.statuses] == list(range(1, 501))
+    assert {s.session_id for s in scene.statuses} == {scene.statuses[0].session_id} != {0}
+    assert scene.statuses[-1].num_expired == 1
+    np.testing.assert_allclose(scene.statuses[400].effort_commanded, HELD)
+
+
+def test_a_measurement_that_stops_ends_efforts():
+    def script(scene, k):
+        scene.send(Command.EFFORT)
+        scene.crtk.age = max(0, k - 300) * 1e-3
+
+    scene = Scene(script, 400).run()
+    assert scene.topics(260, 350) == {"servo_jf"}
+    assert scene.topics(351, 400) == {"servo_jp"}
+    assert scene.statuses[-1].fault_text == "measured_js is 0.051 s old"
+
+
+def test_an_arm_that_is_switched_off_is_sent_no_pose_and_held_where_it_fell():
+    def script(scene, k):
+        crtk = scene.crtk
+        if k == 300:
+            crtk.state = "DISABLED"
+        if 300 < k <= 400:
+            crtk.q = crtk.q - 1e-3
+        if k == 450:
+            crtk.state = "ENABLED"
+        if k < 455:
+            scene.send(Command.EFFORT if k < 300 else Command.HOLD)
+        elif k < 460:
+            scene.send(Command.HOLD, reset_fault=True)
+
+    scene = Scene(script, 500).run()
+    assert scene.topics(290, 300) == {"servo_jf"}
+    assert scene.topics(300, 455) == {"hold"}
+    assert scene.topics(457, 500) == {"servo_jp"}
+    np.testing.assert_array_equal(scene.crtk.told[470][1], scene.crtk.q)
+    assert scene.statuses[299].guard_state == Status.STATE_EFFORT
+    assert {s.fault_text for s in scene.statuses[300:455]} == {"operating_state is DISABLED"}
+    assert scene.statuses[-1].guard_state == Status.STATE_HOLD
+
+
+def test_off_disables_the_arm():
+    scene = Scene(lambda scene, k: scene.send(Command.OFF if k >= 300 else Command.HOLD), 320).run()
+    assert scene.topics(0, 300) == {"servo_jp"}
+    topics = [topic for topic, _ in scene.crtk.told[300:]]
+    assert topics[0] == "disable" and set(topics[1:]) == {"hold"}
+    assert scene.statuses[-1].fault_text == "operating_state is DISABLED"
+
+
+def test_two_controllers_are_a_fault():
+    def script(scene, k):
+        scene.send(Command.EFFORT)
+        if k == 300:
+            scene.send(Command.EFFORT, sender=4)
+
+    scene = Scene(script, 320).run()
+    assert scene.statuses[-1].fault_code == Status.FAULT_DUPLICATE_SENDER
+    assert scene.topics(301, 320) == {"servo_jp"}
+
+
+def test_a_tenth_of_the_limits_as_the_checklist_has_it():
+    (text,) = set(re.findall(r"`(GuardSettings\(.*?\))`", DOCUMENT.read_text(encoding="utf-8")))
+    settings = eval(text)
+    scene = Scene(lambda scene, k: scene.send(Command.EFFORT, effort=list(HELD if k < 300 else ARM.effort_limits)), 600)
+    scene.settings = settings
+    scene.run()
+    efforts = np.array([effort for topic, effort in scene.crtk.told if topic == "servo_jf"])
+    assert efforts.max(axis=0) == pytest.approx(0.1 * ARM.effort_limits)
+    assert np.all(np.abs(np.diff(efforts, axis=0)) <= 0.005 * ARM.effort_limits * (1 + 1e-9))
