@@ -133,7 +133,7 @@ class Collector:
     def _check(self, status: lcmt_dvrk_status) -> None:
         if not self._controller.acting:
             raise CollectionError(
-                f"{self._arm.name} took over and holds: commands came too late for it (--realtime, fewer programs beside)"
+                f"{self._arm.name} took over and holds: commands came too late for it (use --realtime)"
             )
         n = self._arm.num_joints
         away = np.abs(self._q - self._desired[:n]) / self._astray
