@@ -16,6 +16,8 @@ from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.leg import Leg, beside
 from dvrk_drake.processes.rest_detector import RestDetector
 
+#: The way goes on by no more than this between two statuses [s]: after a pause of the computer it does not jump.
+_LONGEST_STEP = 0.01
 #: How long the arm may take to let efforts act [s].
 _START = 10.0
 #: The arm rests within this [rad], [m] for so long [s]; a pose at which it does not within `_SETTLE` [s] is left out.
@@ -94,7 +96,8 @@ class Collector:
         span = arm.position_upper - arm.position_lower
         self._speed, self._astray = span / settings.traverse_time, _ASTRAY * span
         self._approach = _APPROACH * arm.effort_limits / np.asarray(arm.gains.kp)
-        self._time, self._q, self._tau = 0.0, np.zeros(arm.num_joints), np.zeros(arm.num_joints)
+        self._time, self._heard = 0.0, 0.0
+        self._q = self._tau = np.zeros(arm.num_joints)
         self._desired = np.zeros(2 * arm.num_joints)
         self._leg_end = 0.0
         self._stopping = self._led = False
@@ -105,7 +108,9 @@ class Collector:
 
     def lead(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:
         """The desired state (2n) at `time` [s], after that status."""
-        self._time, self._q, self._tau = time, np.array(status.position), np.array(status.effort_measured)
+        self._time += min(max(time - self._heard, 0.0), _LONGEST_STEP)
+        self._heard = time
+        self._q, self._tau = np.array(status.position), np.array(status.effort_measured)
         if self.finished:
             return self._desired
         try:
