@@ -3,9 +3,7 @@
 Run by itself, this file starts itself again inside a network namespace; the tests of that run are the real ones.
 """
 
-import os
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -14,6 +12,7 @@ from pathlib import Path
 import lcm
 import numpy as np
 import pytest
+from own_network import end, inside, outside, run_inside, start
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -21,48 +20,12 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes.pace import make_realtime
 from dvrk_drake.systems.dvrk_command_sender import draw_id
 
-INSIDE = "DVRK_DRAKE_OWN_NETWORK"
-NETWORK = "ip link set lo up && ip link set lo multicast on && ip route add 239.255.0.0/16 dev lo"
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
 
-inside = pytest.mark.skipif(INSIDE not in os.environ, reason="runs in a network of its own, started by the test below")
 
-
-def unshare():
-    """How to get a network of one's own; real root keeps its right to real-time scheduling that way."""
-    for command in (["unshare", "-n"], ["unshare", "-rn"]):
-        try:
-            done = subprocess.run([*command, "sh", "-c", NETWORK], capture_output=True, timeout=20, check=False)
-        except OSError:
-            continue
-        if done.returncode == 0:
-            return command
-    pytest.skip("a network of its own is not permitted here (unshare -rn, ip)")
-
-
-@pytest.mark.skipif(INSIDE in os.environ, reason="is inside already")
+@outside
 def test_in_a_network_of_its_own():
-    command = [*unshare(), "sh", "-c", f'{NETWORK} && exec "$@"', "sh"]
-    pytest_run = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-x",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "no:xdist",
-        "-rs",
-        "-s",
-        __file__,
-    ]
-    environment = {**os.environ, INSIDE: "1", "OMP_NUM_THREADS": "1"}
-    environment.pop("LCM_DEFAULT_URL", None)
-    done = subprocess.run(
-        [*command, *pytest_run], env=environment, capture_output=True, text=True, timeout=400, check=False
-    )
-    print(done.stdout[-6000:], done.stderr[-3000:])
-    assert done.returncode == 0
+    run_inside(__file__)
 
 
 class Observer:
@@ -100,10 +63,6 @@ class Observer:
         raise AssertionError(f"{what}: not within {seconds} s; state {last.guard_state}, refusal {last.refusal_code}")
 
 
-def start(*arguments):
-    return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-
-
 def start_arm(name):
     pose = [str(q) for q in POSES[name]]
     return start(sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", name, "--realtime", "--pose", *pose)
@@ -111,12 +70,6 @@ def start_arm(name):
 
 def start_controller(name, *options):
     return start(sys.executable, str(Path(__file__).with_name("lcm_controller.py")), name, *options)
-
-
-def end(process, number=signal.SIGKILL):
-    process.send_signal(number)
-    process.wait(20)
-    return process.stdout.read()
 
 
 @pytest.fixture(scope="module", params=["mtml", "psm"])

@@ -91,7 +91,7 @@ def test_a_long_name_of_a_parameter_costs_no_digit(capsys):
     assert "(m3+...+m6+m_finger_1+m_finger_2) - m_counterweight" in text
     assert main(["model", "psm", "--latex"]) == 0
     text = capsys.readouterr().out
-    assert "s_{7 / 2}" in text and "10^{-1" not in text
+    assert "s_{6 - 7 / 2}" in text and "10^{-1" not in text
 
 
 @pytest.mark.parametrize(

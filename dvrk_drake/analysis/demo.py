@@ -162,11 +162,10 @@ def run_demo(
     t_step, step = _step(true_arm, model, plan, lambda share: progress("releasing and holding", (2 + share) / 3))
 
     progress("drawing", 0.0)
-    names = arm.joint_names
     plot_identification(output, identification)
     plot_torque_error(
         output / "fresh_torque_error.png",
-        names,
+        arm,
         np.array([j.rms_torque for j in fresh.joints]),
         {
             "identified": np.array([j.rms_error for j in fresh.joints]),

@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.doubts import usable_measurements
+from dvrk_drake.analysis.doubts import Doubt, usable_measurements
 from dvrk_drake.analysis.static_identification import StaticIdentification
 from dvrk_drake.analysis.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -29,12 +29,13 @@ def _labels(names: tuple[str, ...]) -> list[str]:
 
 def plot_torque_error(
     path: Path,
-    names: tuple[str, ...],
+    arm: Arm,
     rms_zero: NDArray[np.float64],
     rms_model: dict[str, NDArray[np.float64]],
     title: str,
 ) -> None:
-    """RMS torque error per joint (n,) [N m], zero torque beside each model; log scale, as joints differ by decades."""
+    """RMS torque error per joint (n,) [N m, N], zero torque beside each model; log scale: joints differ by decades."""
+    names = arm.joint_names
     figure, axes = plt.subplots(figsize=(11, 5), layout="constrained")
     bars = {"zero torque": rms_zero, **rms_model}
     colours = [ZERO_COLOUR, MODEL_COLOUR, MEASURED_COLOUR, "#edae49"]
@@ -46,7 +47,8 @@ def plot_torque_error(
     if any(np.any(values > 0) for values in bars.values()):
         axes.set_yscale("log")
     axes.set_xticks(range(len(names)), _labels(names), fontsize=8)
-    axes.set_ylabel("RMS torque error [N m]")
+    forces = "".join(f"; J{j + 1}: N" for j in np.flatnonzero(arm.prismatic))
+    axes.set_ylabel(f"RMS torque error [N m{forces}]")
     axes.set_title(title)
     axes.margins(y=0.25)
     axes.legend(fontsize=8)
@@ -54,7 +56,11 @@ def plot_torque_error(
 
 
 def plot_measured_against_predicted(
-    path: Path, model: IdentifiedModel, recording: Recording, usable: NDArray[np.bool_]
+    path: Path,
+    model: IdentifiedModel,
+    recording: Recording,
+    measured_joints: NDArray[np.bool_],
+    doubts: list[Doubt],
 ) -> None:
     """One panel a joint: predicted over measured torque of every pose.
 
@@ -62,21 +68,28 @@ def plot_measured_against_predicted(
         path: PNG to write.
         model: what predicts.
         recording: in joint coordinates.
-        usable: (m, n); what is doubted is drawn as a cross, and does not stretch the axes.
+        measured_joints: (m, n); what is no holding torque is not drawn.
+        doubts: what is doubted is drawn as a cross, and does not stretch the axes.
     """
-    names = model.load_arm().joint_names
+    usable = usable_measurements(recording.q.shape, doubts) & measured_joints
+    arm = model.load_arm()
+    names = arm.joint_names
     measured, predicted = recording.measured_effort(), model.holding_torque(recording.q)
     figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained")
     for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
-        use = usable[:, j]
+        use, doubted = usable[:, j], measured_joints[:, j] & ~usable[:, j]
+        if not np.any(use):
+            ax.set_title(f"J{j + 1} {name}: nothing measured", fontsize=10)
+            ax.set(xticks=[], yticks=[])
+            continue
         shown = np.concatenate([measured[use, j], predicted[use, j], [0.0]])
         pad = 0.05 * max(float(np.ptp(shown)), 1e-6)
         limits = np.array([shown.min() - pad, shown.max() + pad])
         ax.plot(limits, limits, color="black", linewidth=0.8, label="measured = predicted")
         ax.plot(measured[use, j], predicted[use, j], ".", color=MODEL_COLOUR, label="one pose")
         ax.plot(
-            np.clip(measured[~use, j], *limits),
-            np.clip(predicted[~use, j], *limits),
+            np.clip(measured[doubted, j], *limits),
+            np.clip(predicted[doubted, j], *limits),
             "x",
             color=MEASURED_COLOUR,
             label="doubted (at the edge: outside)",
@@ -84,12 +97,15 @@ def plot_measured_against_predicted(
         ax.set(xlim=limits, ylim=limits)
         ax.locator_params(nbins=5)
         ax.set_title(f"J{j + 1} {name}", fontsize=10)
-        ax.set_xlabel("measured [N m]", fontsize=8)
-        ax.set_ylabel("predicted [N m]", fontsize=8)
+        unit = "N" if arm.prismatic[j] else "N m"
+        ax.set_xlabel(f"measured [{unit}]", fontsize=8)
+        ax.set_ylabel(f"predicted [{unit}]", fontsize=8)
         ax.tick_params(labelsize=7)
     for ax in axes.flat[len(names) :]:
         ax.axis("off")
-    axes.flat[0].legend(fontsize=7)
+    key = next((ax.get_legend_handles_labels() for ax in axes.flat if ax.has_data()), None)
+    if key:
+        figure.legend(*key, loc="lower right", fontsize=8)
     figure.suptitle(f"{model.arm}: holding torque, {len(recording)} rows of {Path(recording.source).name}")
     _save(figure, path)
 
@@ -100,7 +116,7 @@ def plot_identification(folder: Path, result: StaticIdentification) -> None:
     joints = result.model.joints
     plot_torque_error(
         folder / "torque_error.png",
-        tuple(j.name for j in joints),
+        result.model.load_arm(),
         np.array([j.rms_zero_torque_undoubted for j in joints]),
         {
             "leave-one-out": np.array([j.rms_leave_one_out_undoubted for j in joints]),
@@ -108,21 +124,19 @@ def plot_identification(folder: Path, result: StaticIdentification) -> None:
         },
         f"{result.model.arm}: poses not used for fitting ({Path(recording.source).name}, without doubted ones)",
     )
-    usable = usable_measurements(recording.q.shape, result.doubts)
-    plot_measured_against_predicted(folder / "predicted.png", result.model, recording, usable)
+    plot_measured_against_predicted(folder / "predicted.png", result.model, recording, result.measured, result.doubts)
 
 
 def plot_validation(folder: Path, model: IdentifiedModel, validation: Validation, recording: Recording) -> None:
     """Writes torque_error.png and predicted.png of a validation; `recording` in joint coordinates."""
     plot_torque_error(
         folder / "torque_error.png",
-        tuple(j.name for j in validation.joints),
+        model.load_arm(),
         np.array([j.rms_torque for j in validation.joints]),
         {"model": np.array([j.rms_error for j in validation.joints])},
         f"{model.arm}: all {validation.poses} poses of {Path(recording.source).name}",
     )
-    usable = usable_measurements(recording.q.shape, validation.doubts)
-    plot_measured_against_predicted(folder / "predicted.png", model, recording, usable)
+    plot_measured_against_predicted(folder / "predicted.png", model, recording, validation.measured, validation.doubts)
 
 
 def plot_positions(
@@ -145,7 +159,9 @@ def plot_positions(
         ax.grid(alpha=0.3)
     for ax in axes.flat[len(names) :]:
         ax.axis("off")
-    axes.flat[0].legend(fontsize=7)
+    key = next((ax.get_legend_handles_labels() for ax in axes.flat if ax.has_data()), None)
+    if key:
+        figure.legend(*key, loc="lower right", fontsize=8)
     figure.suptitle(title)
     _save(figure, path)
 

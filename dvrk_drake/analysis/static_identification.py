@@ -42,13 +42,17 @@ FOLDS = 10
 
 @dataclass(frozen=True)
 class StaticIdentification:
-    """A model with what a report of it needs: the poses used, in joint coordinates, doubts, and (m, n) residuals."""
+    """A model with what a report of it needs: the poses used, in joint coordinates, doubts, and (m, n) residuals.
+
+    `measured` (m, n) is False where an effort is no holding torque.
+    """
 
     model: IdentifiedModel
     recording: Recording
     doubts: list[Doubt]
     residuals: NDArray[np.float64]
     left_out_residuals: NDArray[np.float64]
+    measured: NDArray[np.bool_]
 
 
 def identify_static(
@@ -139,7 +143,7 @@ def identify_static(
             version=version("dvrk-drake"),
         ),
     )
-    return StaticIdentification(model, recording, doubts, fit.residuals, fit.left_out_residuals)
+    return StaticIdentification(model, recording, doubts, fit.residuals, fit.left_out_residuals, measured)
 
 
 def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:

@@ -34,12 +34,16 @@ class JointError:
 
 @dataclass(frozen=True)
 class Validation:
-    """Errors of `model` on one recording; residuals are measured minus predicted, (m, n)."""
+    """Errors of `model` on one recording; residuals are measured minus predicted, (m, n).
+
+    `measured` (m, n) is False where an effort is no holding torque.
+    """
 
     joints: list[JointError]
     poses: int
     residuals: NDArray[np.float64]
     doubts: list[Doubt]
+    measured: NDArray[np.bool_]
 
     def as_dict(self) -> dict:
         """What `validate --json` writes."""
@@ -90,7 +94,7 @@ def validate(
         # A doubt about a joint touches every actuator that drives it.
         usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
     errors = _joint_errors(arm, measured, residuals, measured_joints, usable)
-    return Validation(errors, len(recording), residuals, doubts)
+    return Validation(errors, len(recording), residuals, doubts, measured_joints)
 
 
 def _joint_errors(

@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
-from dvrk_drake.dynamics.trigonometry import simplify_trigonometry
+from dvrk_drake.dynamics.trigonometry import exact_half, simplify_trigonometry
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, tree_selector
@@ -51,7 +51,7 @@ class SymbolicPlant:
             symbolic.to_sympy(symbolic.Expression(v), memo=self._memo): s
             for v, s in zip(self.drake_q, self.q, strict=True)
         }
-        self._parallel = _parallel_pairs(self.numeric, arm)
+        self._sums = _parallel_sums(self.numeric, arm, self.q)
         q_plant = np.empty(self._plant.num_positions(), dtype=object)
         q_plant[tree_selector(self.numeric, arm)] = _tree_positions(arm, self.drake_q)
         self._plant.SetPositions(self._context, q_plant)
@@ -63,8 +63,8 @@ class SymbolicPlant:
         return symbolic.to_sympy(expression, memo=self._memo).xreplace(self._ours)
 
     def simplify(self, expression: sympy.Expr) -> sympy.Expr:
-        """`simplify_trigonometry` with the sums of this arm's parallel joints as one angle."""
-        return simplify_trigonometry(expression, self.q, self._parallel)
+        """`simplify_trigonometry` with the angles of this arm's parallel joints added up."""
+        return simplify_trigonometry(expression, self._sums)
 
     def frame_poses(self) -> dict[str, sympy.ImmutableDenseMatrix]:
         """X_0F(q), the pose of every link frame in frame 0: label -> 4 x 4 (the paper's II.A and III.B) [m]."""
@@ -144,15 +144,24 @@ def arm_instance(plant: MultibodyPlant) -> ModelInstanceIndex:
     return plant.GetBodyByName("base_link").model_instance()
 
 
-def _parallel_pairs(plant: MultibodyPlant, arm: Arm) -> list[tuple[int, int]]:
-    """Neighbouring independent joints that turn about parallel axes: their angles appear as a sum."""
+def _parallel_sums(plant: MultibodyPlant, arm: Arm, q: Sequence[sympy.Symbol]) -> list[tuple[sympy.Expr, sympy.Expr]]:
+    """Pairs of angles that add up, base first: those of a body and of a joint on it with the same axis.
+
+    Both are sums of multiples of q, as the linkage has it: a bar that turns back adds the negative of what it undoes.
+    """
     context = plant.CreateDefaultContext()
-    pairs = []
-    joints = [plant.GetJointByName(name) for name in arm.joint_names]
-    for i in range(len(joints) - 1):
-        a, b = joints[i], joints[i + 1]
-        if a.type_name() == b.type_name() == "revolute" and b.parent_body() == a.child_body():
-            axes = [j.frame_on_parent().CalcPoseInWorld(context).rotation() @ j.revolute_axis() for j in (a, b)]
-            if np.allclose(axes[0], axes[1], atol=1e-12):
-                pairs.append((i, i + 1))
-    return pairs
+    turned: dict[str, tuple[NDArray[np.float64], sympy.Expr]] = {}  # body -> its axis and angle about it
+    sums = []
+    for name, row in zip(arm.tree_joint_names, arm.linkage.matrix, strict=True):
+        joint = plant.GetJointByName(name)
+        if joint.type_name() != "revolute":
+            continue
+        axis = joint.frame_on_parent().CalcPoseInWorld(context).rotation() @ joint.revolute_axis()
+        angle = sympy.Add(*(exact_half(row[j]) * q[int(j)] for j in np.flatnonzero(row)))
+        parent_axis, parent_angle = turned.get(joint.parent_body().name(), (axis, sympy.Integer(0)))
+        if not np.allclose(axis, parent_axis, atol=1e-12):
+            parent_angle = sympy.Integer(0)
+        if parent_angle != 0 and (parent_angle, angle) not in sums:
+            sums.append((parent_angle, angle))
+        turned[joint.child_body().name()] = axis, parent_angle + angle
+    return sums

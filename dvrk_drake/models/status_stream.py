@@ -69,24 +69,27 @@ class StatusStream:
         """Why a status cannot be used, or ""; the sequence is followed through those that cannot."""
         if status.arm_name != self.arm_name or status.num_joints != self.num_joints:
             return _FOREIGN
+        continues = self._follow_session(status.session_id)
         if self.last is not None and status.utime <= self.last.utime:
             return _LATE
-        self._follow(status)
+        if continues and self.last is not None:
+            self.num_lost += max(0, status.sequence - self.last.sequence - 1)
+        self.last = status
         if not all(map(math.isfinite, measurements(status))):
             return _NOT_FINITE
         return _OFF if status.guard_state == lcmt_dvrk_status.STATE_OFF else ""
 
-    def _follow(self, status: lcmt_dvrk_status) -> None:
-        if self.last is not None and self.last.session_id == status.session_id:
-            self.num_lost += max(0, status.sequence - self.last.sequence - 1)
-        elif status.session_id in self._sessions:
+    def _follow_session(self, session_id: int) -> bool:
+        """Whether this is the session of the message before; a session that comes back was never ended."""
+        if self._sessions and self._sessions[-1] == session_id:
+            return True
+        if session_id in self._sessions:
             raise RecordingError(
                 f"two arms called {self.arm_name} send at the same time (sessions "
                 f"{' and '.join(map(str, self._sessions))}): end one, or give them networks of their own"
             )
-        else:
-            self._sessions.append(status.session_id)
-        self.last = status
+        self._sessions.append(session_id)
+        return False
 
 
 def measurements(status: lcmt_dvrk_status) -> tuple[float, ...]:

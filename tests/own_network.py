@@ -1,0 +1,66 @@
+"""A network of their own for tests over real UDP multicast.
+
+A test file starts itself again inside a network namespace; the tests of that run are the real ones:
+
+    @outside
+    def test_in_a_network_of_its_own():
+        run_inside(__file__)
+
+    @inside
+    def test_...
+"""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+INSIDE = "DVRK_DRAKE_OWN_NETWORK"
+NETWORK = "ip link set lo up && ip link set lo multicast on && ip route add 239.255.0.0/16 dev lo"
+
+inside = pytest.mark.skipif(INSIDE not in os.environ, reason="runs in a network of its own, started by the test below")
+outside = pytest.mark.skipif(INSIDE in os.environ, reason="is inside already")
+
+
+def unshare():
+    """How to get a network of one's own; real root keeps its right to real-time scheduling that way."""
+    for command in (["unshare", "-n"], ["unshare", "-rn"]):
+        try:
+            done = subprocess.run([*command, "sh", "-c", NETWORK], capture_output=True, timeout=20, check=False)
+        except OSError:
+            continue
+        if done.returncode == 0:
+            return command
+    pytest.skip("a network of its own is not permitted here (unshare -rn, ip)")
+
+
+def run_inside(test_file, seconds=400):
+    """Runs a test file in a network of its own."""
+    command = [*unshare(), "sh", "-c", f'{NETWORK} && exec "$@"', "sh"]
+    pytest_run = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "-rs", "-s"]
+    environment = {**os.environ, INSIDE: "1", "OMP_NUM_THREADS": "1"}
+    environment.pop("LCM_DEFAULT_URL", None)
+    done = subprocess.run(
+        [*command, *pytest_run, test_file],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=seconds,
+        check=False,
+    )
+    print(done.stdout[-6000:], done.stderr[-3000:])
+    assert done.returncode == 0
+
+
+def start(*arguments):
+    """A process whose output can be read when it has ended."""
+    return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def end(process, number=signal.SIGKILL):
+    """Ends it and gives what it said."""
+    process.send_signal(number)
+    process.wait(20)
+    return process.stdout.read()
