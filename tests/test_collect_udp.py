@@ -3,15 +3,14 @@
 As in test_lcm_udp.py, this file starts itself again inside a network namespace.
 """
 
-import os
 import signal
-import subprocess
 import sys
 import time
 
 import numpy as np
 import pytest
-from test_lcm_udp import INSIDE, NETWORK, Observer, end, inside, start, unshare
+from own_network import end, inside, outside, run_inside, start
+from test_lcm_udp import Observer
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -24,15 +23,9 @@ from dvrk_drake.models.recording import read_recording
 POSES = 8
 
 
-@pytest.mark.skipif(INSIDE in os.environ, reason="is inside already")
+@outside
 def test_in_a_network_of_its_own():
-    pytest_run = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "-rs", "-s"]
-    environment = {**os.environ, INSIDE: "1", "OMP_NUM_THREADS": "1"}
-    environment.pop("LCM_DEFAULT_URL", None)
-    command = [*unshare(), "sh", "-c", f'{NETWORK} && exec "$@"', "sh", *pytest_run, __file__]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400, check=False)
-    print(done.stdout[-6000:], done.stderr[-3000:])
-    assert done.returncode == 0
+    run_inside(__file__)
 
 
 def dvrk_drake(*arguments):
