@@ -31,3 +31,7 @@ class StationError(DvrkDrakeError):
 
 class ScenarioError(DvrkDrakeError):
     """A scenario that cannot be read or simulated."""
+
+
+class CollectionError(DvrkDrakeError):
+    """Poses that cannot be visited, or a collection of measurements that cannot go on."""

@@ -24,14 +24,12 @@ from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import REST_SPEED, Recording
+from dvrk_drake.models.recording import REST_SPEED, SAME_POSE, Recording
 
 Method = Literal["robust", "paper"]
 
 #: Fewest distinct poses that are accepted.
 LEAST_POSES = 8
-#: Rows whose joints all agree this well are samples of one pose [rad], [m].
-SAME_POSE = 0.01, 0.001
 #: A joint whose measured torque stays below this share of its effort limit says nothing about its model, unless
 #: leave-one-out explains most of it: less than the second share of it is left.
 LEAST_TORQUE, CLEAR_GAIN_RATIO = 0.02, 0.5

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+from typing import TYPE_CHECKING
 
 from dvrk_drake.cli.support import add_gravity, mounted, quiet_drake
+
+if TYPE_CHECKING:
+    from dvrk_drake.processes.arm_controller import ArmController
+    from dvrk_drake.systems.gravity_pid_controller import Mode
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -53,23 +58,47 @@ def _arm(options: argparse.Namespace) -> None:
 
 def _add_run(verbs: argparse._SubParsersAction) -> None:
     verb = verbs.add_parser("run", help="compensate or hold an arm over LCM")
-    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
-    verb.add_argument("--model", metavar="MODEL.yaml", help="from identify; default: what the arm's SDF states")
+    add_control(verb)
     verb.add_argument("--mode", choices=("gravity", "hold"), default="gravity", help="default: gravity")
-    verb.add_argument("--lcm-url", default="", metavar="URL", help="default: LCM_DEFAULT_URL, or LCM's own")
-    verb.add_argument("--realtime", action="store_true", help="real-time scheduling, or a warning where not permitted")
     verb.set_defaults(run=_run)
 
 
 def _run(options: argparse.Namespace) -> None:
+    from dvrk_drake.processes.control import ArmLink, control
+    from dvrk_drake.processes.simulated_arm import stop_on_signals
+
+    controller, url, period = ready_controller(options, options.mode)
+    arm = controller.arm
+    stopped = stop_on_signals()
+    print(f"{options.mode} of {arm.name} at {1 / period:.0f} Hz; Ctrl-C leaves it to its own hold", flush=True)
+    line_end = "\r" if sys.stdout.isatty() else "\n"
+    # A link of its own: what was said while the controller was compiled is past.
+    control(ArmLink(arm, url), controller, stopped, lambda line: print(f"{line:100}", end=line_end, flush=True))
+    print(f"{arm.name} holds by itself", flush=True)
+
+
+def add_control(verb: argparse.ArgumentParser) -> None:
+    """Adds the options of `ready_controller`."""
+    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
+    verb.add_argument("--model", metavar="MODEL.yaml", help="from identify; default: what the arm's SDF states")
+    verb.add_argument("--lcm-url", default="", metavar="URL", help="default: LCM_DEFAULT_URL, or LCM's own")
+    verb.add_argument("--realtime", action="store_true", help="real-time scheduling, or a warning where not permitted")
+
+
+def ready_controller(options: argparse.Namespace, mode: Mode) -> tuple[ArmController, str, float]:
+    """A controller of an arm that may be controlled, the URL of the network, and the period of its statuses [s].
+
+    Raises:
+        ModelError: the model is of another arm.
+        ControllerError: no arm there, or one that may not be controlled now.
+    """
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.errors import ModelError
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.arm_controller import ArmController
-    from dvrk_drake.processes.control import ArmLink, control, first_status
+    from dvrk_drake.processes.control import ArmLink, first_status
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.pace import make_realtime, settle_memory
-    from dvrk_drake.processes.simulated_arm import stop_on_signals
 
     quiet_drake()
     arm = load_arm(options.arm)
@@ -80,16 +109,11 @@ def _run(options: argparse.Namespace) -> None:
     status, period = first_status(ArmLink(arm, url))
     if status.gravity_compensation:
         _warn(f"{arm.name} adds gravity compensation of its own: switch it off, or it is compensated twice")
-    controller = ArmController(arm, model, options.mode, period)
-    stopped = stop_on_signals()
+    controller = ArmController(arm, model, mode, period)
     if options.realtime and (warning := make_realtime()):
         _warn(warning)
     settle_memory()
-    print(f"{options.mode} of {arm.name} at {1 / period:.0f} Hz; Ctrl-C leaves it to its own hold", flush=True)
-    line_end = "\r" if sys.stdout.isatty() else "\n"
-    # A link of its own: what was said while the controller was compiled is past.
-    control(ArmLink(arm, url), controller, stopped, lambda line: print(f"{line:100}", end=line_end, flush=True))
-    print(f"{arm.name} holds by itself", flush=True)
+    return controller, url, period
 
 
 def _warn(text: str) -> None:

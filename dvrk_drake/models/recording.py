@@ -25,6 +25,8 @@ LIMIT_TOLERANCE = 0.2, 0.02
 LARGEST = 1e6
 #: RMS joint speed above which a recording counts as a motion [rad/s], [m/s].
 REST_SPEED = 0.05, 0.005
+#: Poses whose joints all agree this well are one pose [rad], [m].
+SAME_POSE = 0.01, 0.001
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,6 @@
 """Recordings that are written while they are made: whatever ends the process, the file is whole up to its last row.
 
-Each row is one write of the operating system on an unbuffered file. What was written survives a killed process; the
-last moments before a power failure are the disk's.
+What was written survives a killed process; the last moments before a power failure are the disk's.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from typing import Protocol
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.growing_file import GrowingFile
 from dvrk_drake.models.lcm_log import LcmEvent, event_bytes
 from dvrk_drake.models.lcm_messages import status_channel
 from dvrk_drake.models.recording import column_names
@@ -65,31 +65,7 @@ def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> Rec
     return _CsvFile(path, stream) if Path(path).suffix == ".csv" else _LogFile(path, status_channel(arm))
 
 
-class _File:
-    """What both kinds share: made anew, unbuffered, and cut back to the last whole row where the disk is full."""
-
-    def __init__(self, path: str | Path) -> None:
-        self._path = path
-        try:
-            self._file = open(path, "xb", buffering=0)  # noqa: SIM115
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
-
-    def append(self, row: bytes) -> None:
-        end = self._file.tell()
-        try:
-            written = self._file.write(row)
-        except OSError as error:
-            raise RecordingError(f"{self._path}: cannot be written any more: {error.strerror}; ends here") from error
-        if written != len(row):
-            self._file.truncate(end)
-            raise RecordingError(f"{self._path}: cannot be written any more: no space left; ends here")
-
-    def close(self) -> None:
-        self._file.close()
-
-
-class _CsvFile(_File):
+class _CsvFile(GrowingFile):
     def __init__(self, path: str | Path, stream: StatusStream) -> None:
         super().__init__(path)
         self._stream = stream
@@ -106,7 +82,7 @@ class _CsvFile(_File):
         return (",".join([*map(repr, numbers), *map(str, origin)]) + "\n").encode()
 
 
-class _LogFile(_File):
+class _LogFile(GrowingFile):
     def __init__(self, path: str | Path, channel: str) -> None:
         super().__init__(path)
         self._channel, self._number = channel, 0

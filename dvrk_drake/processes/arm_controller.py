@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import DiagramBuilder
 
@@ -21,6 +22,9 @@ class ArmController:
     A Diagram of DvrkStatusReceiver, GravityPidController, EffortRamp and DvrkCommandSender, stepped by forced updates:
     one status in, one command out, nothing in between waits for a period. Whenever efforts do not act yet, or not any
     more, it commands the measured efforts; when they begin to act it ramps to its own, and latches the pose to hold.
+
+    Attributes:
+        arm: which it controls.
     """
 
     def __init__(self, arm: Arm, model: IdentifiedModel, mode: Mode, period: float) -> None:
@@ -33,7 +37,7 @@ class ArmController:
             period: in which statuses come [s].
         """
         builder = DiagramBuilder()
-        self._mode = mode
+        self.arm, self._mode = arm, mode
         receiver = builder.AddSystem(DvrkStatusReceiver(arm))
         self._controller = builder.AddSystem(GravityPidController(model, period=period, mode="gravity"))
         self._ramp = builder.AddSystem(EffortRamp(arm.num_joints, period=period))
@@ -53,8 +57,23 @@ class ArmController:
         """By which the arm tells this controller from others."""
         return self._sender.sender_id
 
-    def answer(self, status: lcmt_dvrk_status, time: float) -> lcmt_dvrk_command:
-        """The command that answers `status` at `time` [s] of the controller's own clock."""
+    @property
+    def acting(self) -> bool:
+        """Whether, at the last status, this controller's efforts acted."""
+        return self._acting
+
+    @property
+    def ramped(self) -> bool:
+        """Whether they have become the wanted ones in full."""
+        return self._acting and self._ramp.share(self._ramp.GetMyContextFromRoot(self._context)) >= 1
+
+    def answer(
+        self, status: lcmt_dvrk_status, time: float, desired_state: NDArray[np.float64] | None = None
+    ) -> lcmt_dvrk_command:
+        """The command that answers `status` at `time` [s] of the controller's own clock.
+
+        `desired_state` (2n: q_d, then v_d) is what "hold" regulates to; without it, always, the latched pose.
+        """
         context = self._context
         context.SetTime(time)
         self._diagram.GetInputPort("lcmt_dvrk_status").FixValue(context, AbstractValue.Make(status))
@@ -66,6 +85,9 @@ class ArmController:
             controller_context = self._controller.GetMyMutableContextFromRoot(context)
             self._controller.SetMode(controller_context, self._mode if acts else "gravity")
             self._acting = acts
+        if desired_state is not None:
+            controller_context = self._controller.GetMyMutableContextFromRoot(context)
+            self._controller.GetInputPort("desired_state").FixValue(controller_context, desired_state)
         state = self._diagram.AllocateDiscreteVariables()
         self._diagram.CalcForcedDiscreteVariableUpdate(context, state)
         context.SetDiscreteState(state)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import lcm
 import numpy as np
+from numpy.typing import NDArray
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
@@ -85,7 +86,17 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
     return status, 1e-6 * (later.utime - status.utime) / (later.sequence - status.sequence)
 
 
-def control(link: ArmLink, controller: ArmController, stopped: Callable[[], bool], tell: Callable[[str], None]) -> None:
+#: Hears a status and the time [s], and says the desired state (2n), or None for the controller's own.
+Lead = Callable[[lcmt_dvrk_status, float], NDArray[np.float64] | None]
+
+
+def control(
+    link: ArmLink,
+    controller: ArmController,
+    stopped: Callable[[], bool],
+    tell: Callable[[str], None],
+    lead: Lead = lambda status, time: None,
+) -> None:
     """Answers every status until `stopped`, then leaves the arm to its own hold.
 
     Args:
@@ -93,6 +104,7 @@ def control(link: ArmLink, controller: ArmController, stopped: Callable[[], bool
         controller: makes the commands.
         stopped: asked once a status.
         tell: hears the live status a few times a second.
+        lead: where to, asked once a status.
 
     Raises:
         ControllerError: the arm fell silent, faulted or was restarted.
@@ -108,7 +120,7 @@ def control(link: ArmLink, controller: ArmController, stopped: Callable[[], bool
         if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
             raise ControllerError(f"{link.arm.name} has a fault: {status.fault_text}")
         now = time.monotonic() - start
-        link.send(controller.answer(status, now))
+        link.send(controller.answer(status, now, lead(status, now)))
         answered += 1
         if status.command_sender_id == controller.sender_id:
             trips.append(now - 1e-6 * status.command_utime)

@@ -1,0 +1,150 @@
+"""The verb `collect`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from dvrk_drake.cli.lcm import add_control, ready_controller
+from dvrk_drake.cli.support import check_output, seconds, seed
+from dvrk_drake.errors import CollectionError
+
+if TYPE_CHECKING:
+    from dvrk_drake.processes.live_line import LiveLine
+
+
+def add_verbs(verbs: argparse._SubParsersAction) -> None:
+    """Adds the verb and its options."""
+    verb = verbs.add_parser(
+        "collect", help="collect poses and holding torques of an arm over LCM; the same command again goes on"
+    )
+    add_control(verb)
+    verb.add_argument("--poses", required=True, metavar="POSES.yaml", help="file of the poses")
+    task = verb.add_mutually_exclusive_group(required=True)
+    task.add_argument("--output", metavar="POSES.csv", help="visit the poses, and add a row for each to this file")
+    task.add_argument("--teach", action="store_true", help="add poses to the file that you show by hand, with Enter")
+    task.add_argument("--random", type=int, metavar="N", help="add N random poses to the file")
+    verb.add_argument("--at-rest", action="store_true", help="with --teach: also take where the arm rests for a second")
+    verb.add_argument("--seed", type=seed, default=0, help="of --random; default: 0")
+    verb.add_argument(
+        "--both-sides",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="measure each pose approached from below and from above, and average: cancels dry friction; the default",
+    )
+    verb.add_argument(
+        "--traverse-time", type=seconds, default=5.0, metavar="S", help="to cross a joint's range; default: 5"
+    )
+    verb.set_defaults(run=_collect)
+
+
+def _collect(options: argparse.Namespace) -> None:
+    check_output(options.poses)
+    if options.random is not None:
+        _add_random_poses(options)
+    elif options.teach:
+        _teach(options)
+    else:
+        _visit(options)
+
+
+def _add_random_poses(options: argparse.Namespace) -> None:
+    import numpy as np
+
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.pose_file import load_poses_if_any, save_poses
+
+    if options.random < 1:
+        raise CollectionError(f"--random must be 1 pose or more; got {options.random}")
+    arm = load_arm(options.arm)
+    poses = load_poses_if_any(options.poses, arm)
+    # Near its limits an arm's guard pushes back, and there is no room to come from both sides.
+    added = arm.sample_poses(options.random, np.random.default_rng(options.seed), margin=0.1)
+    poses = np.vstack([poses, added])
+    save_poses(poses, arm, options.poses)
+    print(f"{options.poses}: {len(poses)} poses of {arm.name}")
+
+
+def _teach(options: argparse.Namespace) -> None:
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.pose_file import load_poses_if_any
+    from dvrk_drake.processes.control import ArmLink, control
+    from dvrk_drake.processes.live_line import LiveLine
+    from dvrk_drake.processes.simulated_arm import stop_on_signals
+    from dvrk_drake.processes.teacher import EnterKey, Teacher
+
+    load_poses_if_any(options.poses, load_arm(options.arm))  # refused before the arm is asked
+    controller, url, _ = ready_controller(options, "gravity")
+    line, stopped = LiveLine(sys.stderr), stop_on_signals()
+    teacher = Teacher(
+        controller, options.poses, at_rest=options.at_rest, told=EnterKey(sys.stdin), report=_reporter(line)
+    )
+    when = "Enter, or a second's rest, takes" if options.at_rest else "Enter takes"
+    print(f"the weight of {controller.arm.name} is carried: move it by hand; {when} a pose, Ctrl-C ends", flush=True)
+    try:
+        control(
+            ArmLink(controller.arm, url),
+            controller,
+            stopped,
+            lambda text: line.show(lambda: f"{len(teacher.poses)} poses; {text}"),
+            teacher.lead,
+        )
+    finally:
+        teacher.close()
+        line.clear()
+    print(f"{options.poses}: {len(teacher.poses)} poses; {controller.arm.name} holds by itself", flush=True)
+
+
+def _visit(options: argparse.Namespace) -> None:
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.collection_file import CollectionFile
+    from dvrk_drake.models.pose_file import load_poses
+    from dvrk_drake.processes.collector import CollectionSettings, Collector
+    from dvrk_drake.processes.control import ArmLink, control
+    from dvrk_drake.processes.live_line import LiveLine
+    from dvrk_drake.processes.simulated_arm import stop_on_signals
+
+    settings = CollectionSettings(options.traverse_time, options.both_sides)
+    arm = load_arm(options.arm)
+    poses = load_poses(options.poses, arm)
+    check_output(options.output, options.poses, options.model or "")
+    output = CollectionFile(options.output, arm, options.both_sides)
+    num_done = output.finished(poses).sum()
+    if num_done == len(poses):
+        print(f"{options.output}: has all {len(poses)} poses already")
+        return
+    controller, url, _ = ready_controller(options, "hold")
+    line, stopped = LiveLine(sys.stderr), stop_on_signals()
+    collector = Collector(poses, controller, output, settings, stopped=stopped, report=_reporter(line))
+    print(f"{len(poses) - num_done} poses of {arm.name} to visit; Ctrl-C stops, the same command goes on", flush=True)
+    try:
+        control(
+            ArmLink(arm, url),
+            controller,
+            lambda: collector.finished,
+            lambda text: line.show(lambda: f"{collector.describe()}; {text}"),
+            collector.lead,
+        )
+    finally:
+        collector.close()
+        line.clear()
+        print(f"{options.output}: {collector.done.sum()} of {len(poses)} poses", flush=True)
+    if collector.problem is not None:
+        raise collector.problem
+    if stopped():
+        raise KeyboardInterrupt
+    if collector.unsettled:
+        numbers = ", ".join(map(str, collector.unsettled))
+        raise CollectionError(f"poses left out: {numbers}; the arm did not come to rest there. Run again to try again")
+
+
+def _reporter(line: LiveLine) -> Callable[[str], None]:
+    """Prints lines of which the live one is no part."""
+
+    def report(text: str) -> None:
+        line.clear()
+        print(text, flush=True)
+
+    return report

@@ -1,0 +1,242 @@
+"""Leads an arm from pose to pose and measures what holds it there: steps 4 to 6 of the paper's section III.G."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.errors import CollectionError, DvrkDrakeError
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.models.collection_file import CollectionFile
+from dvrk_drake.processes.arm_controller import ArmController
+from dvrk_drake.processes.leg import Leg, beside
+from dvrk_drake.processes.rest_detector import RestDetector
+
+#: The way goes on by no more than this between two statuses [s]: after a pause of the computer it does not jump.
+_LONGEST_STEP = 0.01
+#: How long the arm may take to let efforts act [s].
+_START = 10.0
+#: The arm rests within this [rad], [m] for so long [s]; a pose at which it does not within `_SETTLE` [s] is left out.
+_REST, _REST_TIME, _SETTLE = (2e-3, 2e-4), 0.5, 10.0
+#: Measurements are averaged for so long [s].
+_MEASURE = 0.25
+#: When stopped on the way, it comes to rest in this time [s].
+_BRAKE = 0.3
+#: Further from where it shall be than this share of its range, a joint does not follow.
+_ASTRAY = 0.1
+#: An approach begins where the controller's proportional effort to the pose is this share of the effort limit: dry
+#: friction of up to half of that is turned round on the way.
+_APPROACH = 0.3
+
+Steps = Generator[None, None, None]
+
+
+@dataclass(frozen=True)
+class CollectionSettings:
+    """How poses are collected.
+
+    Attributes:
+        traverse_time: in which a joint may cross its range [s]: the speed on the way.
+        both_sides: each pose is approached from below and from above in all joints and the means of both
+            measurements are taken, which cancels dry friction; else measured once, as the paper does.
+    """
+
+    traverse_time: float = 5.0
+    both_sides: bool = True
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.traverse_time <= 60.0:
+            raise CollectionError(f"the time to cross a joint's range must be 1..60 s; got {self.traverse_time:g}")
+
+
+class Collector:
+    """What a controller in "hold" mode shall regulate to, from status to status, until all poses are measured.
+
+    Whatever happens it ends with `finished`, and whoever steps it then leaves the arm to its own hold: at the end, when
+    asked to stop (after braking), when the arm takes over, when a joint does not follow, when the disk is full.
+
+    Attributes:
+        finished: there is nothing more to do.
+        problem: why it ended early, if not because it was asked to.
+        unsettled: numbers of the poses that were left out because the arm did not come to rest, from 1.
+        done: (m,) which poses are in the file.
+    """
+
+    def __init__(
+        self,
+        poses: NDArray[np.float64],
+        controller: ArmController,
+        output: CollectionFile,
+        settings: CollectionSettings,
+        *,
+        stopped: Callable[[], bool] = lambda: False,
+        report: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        """Of the controller's arm.
+
+        Args:
+            poses: (m, n), checked before; those in `output` already are skipped.
+            controller: makes the commands.
+            output: takes the measurements.
+            settings: how.
+            stopped: asked once a status.
+            report: hears a line a finished pose.
+        """
+        self.finished = False
+        self.problem: DvrkDrakeError | None = None
+        self.unsettled: list[int] = []
+        self.done = output.finished(poses)
+        self._arm = arm = controller.arm
+        self._poses, self._controller, self._output = poses, controller, output
+        self._settings, self._stopped, self._report = settings, stopped, report
+        span = arm.position_upper - arm.position_lower
+        self._speed, self._astray = span / settings.traverse_time, _ASTRAY * span
+        self._approach = _APPROACH * arm.effort_limits / np.asarray(arm.gains.kp)
+        self._time, self._heard = 0.0, 0.0
+        self._q = self._tau = np.zeros(arm.num_joints)
+        self._desired = np.zeros(2 * arm.num_joints)
+        self._leg_end = 0.0
+        self._stopping = self._led = False
+        self._what = "waiting for the arm"
+        # The disk may take longer than the arm waits for a command.
+        self._writer = ThreadPoolExecutor(max_workers=1)
+        self._steps = self._collect()
+
+    def lead(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:
+        """The desired state (2n) at `time` [s], after that status."""
+        self._time += min(max(time - self._heard, 0.0), _LONGEST_STEP)
+        self._heard = time
+        self._q, self._tau = np.array(status.position), np.array(status.effort_measured)
+        if self.finished:
+            return self._desired
+        try:
+            if self._led:
+                self._check(status)
+            if not self._stopping and self._stopped():
+                self._stopping = True
+                self._steps = self._brake()
+            next(self._steps)
+        except StopIteration:
+            self.finished = True
+        except DvrkDrakeError as error:
+            self.problem, self.finished = error, True
+        return self._desired
+
+    def close(self) -> None:
+        """Ends the file; a row that is being written is written first."""
+        self._writer.shutdown()
+        self._output.close()
+
+    def describe(self) -> str:
+        """How it goes, in a few words."""
+        return f"{np.count_nonzero(self.done)} of {len(self.done)} poses, {self._what}"
+
+    def _check(self, status: lcmt_dvrk_status) -> None:
+        if not self._controller.acting:
+            raise CollectionError(
+                f"{self._arm.name} took over and holds: commands came too late for it (use --realtime)"
+            )
+        n = self._arm.num_joints
+        away = np.abs(self._q - self._desired[:n]) / self._astray
+        if away.max() > 1:
+            j = int(np.argmax(away))
+            raise CollectionError(
+                f"{self._arm.name} does not follow: {self._arm.joint_names[j]} is at {self._q[j]:.3g}, wanted at "
+                f"{self._desired[j]:.3g}. Is something in its way, or the model wrong?"
+            )
+
+    def _collect(self) -> Steps:
+        yield from self._begin()
+        began, before = self._time, np.count_nonzero(self.done)
+        for k in np.flatnonzero(~self.done):
+            yield from self._visit(int(k))
+            if self.done[k]:
+                count = np.count_nonzero(self.done)
+                left = (self._time - began) / (count - before) * np.count_nonzero(~self.done[k:])
+                self._report(f"pose {k + 1} measured, {count} of {len(self.done)}; about {left / 60:.1f} min left")
+
+    def _begin(self) -> Steps:
+        """Until the efforts act in full; the arm is wanted where it was when they began to."""
+        began = self._time
+        while not self._controller.acting:
+            if self._time - began > _START:
+                raise CollectionError(f"{self._arm.name} did not let efforts act within {_START:.0f} s")
+            self._desired = np.concatenate([self._q, np.zeros_like(self._q)])
+            yield
+        self._led = True
+        self._what = "taking over"
+        while not self._controller.ramped:
+            yield
+
+    def _visit(self, k: int) -> Steps:
+        """Measures pose `k` from one side or both."""
+        pose = self._poses[k]
+        measured: list[NDArray[np.float64]] = []
+        for side in (-1, 1) if self._settings.both_sides else (0,):
+            self._what = f"going to pose {k + 1}"
+            if side:
+                yield from self._go(beside(self._arm, pose, side * self._approach))
+            yield from self._go(pose)
+            self._what = f"settling at pose {k + 1}"
+            if not (yield from self._settle()):
+                self.unsettled.append(k + 1)
+                self._report(f"pose {k + 1} left out: not at rest within {_SETTLE:.0f} s")
+                return
+            self._what = f"measuring pose {k + 1}"
+            measured.append((yield from self._measure()))
+        row = np.split(np.mean(measured, axis=0), 2)
+        if self._settings.both_sides:
+            row.append((measured[0] - measured[1])[self._arm.num_joints :] / 2)
+        yield from self._write(k, *row)
+
+    def _go(self, q_end: NDArray[np.float64]) -> Steps:
+        leg = Leg.between(self._desired[: self._arm.num_joints], q_end, self._speed)
+        yield from self._follow(leg)
+
+    def _follow(self, leg: Leg) -> Steps:
+        began, self._leg_end = self._time, self._time + leg.duration
+        while self._time < self._leg_end:
+            self._desired = leg.state(self._time - began)
+            yield
+        self._desired = leg.state(leg.duration)
+
+    def _settle(self) -> Generator[None, None, bool]:
+        """Whether the arm came to rest in time."""
+        detector = RestDetector(self._arm.per_joint(*_REST), _REST_TIME)
+        end = self._time + _SETTLE
+        while not detector.rests(self._time, self._q):
+            if self._time > end:
+                return False
+            yield
+        return True
+
+    def _measure(self) -> Generator[None, None, NDArray[np.float64]]:
+        """Means of q, then tau (2n,)."""
+        end = self._time + _MEASURE
+        samples = []
+        while self._time < end:
+            samples.append(np.concatenate([self._q, self._tau]))
+            yield
+        return np.mean(samples, axis=0)
+
+    def _write(self, k: int, *row: NDArray[np.float64]) -> Steps:
+        self._what = f"writing pose {k + 1}"
+        writing = self._writer.submit(self._store, k, *row)
+        while not writing.done():
+            yield
+        writing.result()
+
+    def _store(self, k: int, *row: NDArray[np.float64]) -> None:
+        self._output.append(self._poses[k], *row)
+        self.done[k] = True
+
+    def _brake(self) -> Steps:
+        """To rest, at the end of the leg if that is near; on the way a shorter stop stays inside the limits."""
+        self._what = "stopping"
+        if self._led:
+            duration = min(_BRAKE, max(self._leg_end - self._time, 1e-3))
+            yield from self._follow(Leg.braking(self._desired, duration))
