@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import closing
 
 from dvrk_drake.cli.support import add_gravity, mounted, quiet_drake
 
@@ -77,7 +78,8 @@ def _run(options: argparse.Namespace) -> None:
     if model.load_arm().name != arm.name:
         raise ModelError(f"{options.model}: is of {model.load_arm().name}, not of {arm.name}")
     url = open_lcm(options.lcm_url).get_lcm_url()
-    status, period = first_status(ArmLink(arm, url))
+    with closing(ArmLink(arm, url)) as link:
+        status, period = first_status(link)
     if status.gravity_compensation:
         _warn(f"{arm.name} adds gravity compensation of its own: switch it off, or it is compensated twice")
     controller = ArmController(arm, model, options.mode, period)

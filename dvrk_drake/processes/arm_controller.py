@@ -46,7 +46,13 @@ class ArmController:
         builder.ConnectInput(status, self._sender.GetInputPort("lcmt_dvrk_status"))
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
-        self._acting = False
+        # Fixed once: FixValue would deep-copy each message, which costs more than all the rest of an answer.
+        port = self._diagram.GetInputPort("lcmt_dvrk_status")
+        self._status = port.FixValue(self._context, AbstractValue.Make(lcmt_dvrk_status()))
+        self._ramp_context = self._ramp.GetMyMutableContextFromRoot(self._context)
+        self._sender_context = self._sender.GetMyContextFromRoot(self._context)
+        self._new_state = self._diagram.AllocateDiscreteVariables()
+        self._act(False)
 
     @property
     def sender_id(self) -> int:
@@ -57,16 +63,18 @@ class ArmController:
         """The command that answers `status` at `time` [s] of the controller's own clock."""
         context = self._context
         context.SetTime(time)
-        self._diagram.GetInputPort("lcmt_dvrk_status").FixValue(context, AbstractValue.Make(status))
+        self._status.GetMutableData().set_value(status)
         acts = status.guard_state == lcmt_dvrk_status.STATE_EFFORT and status.command_sender_id == self.sender_id
-        ramp_context = self._ramp.GetMyMutableContextFromRoot(context)
-        self._ramp.GetInputPort("enabled").FixValue(ramp_context, np.array([float(acts)]))
-        if acts != self._acting:
-            # From "gravity" to "hold" the pose is latched anew and the integrator is empty.
-            controller_context = self._controller.GetMyMutableContextFromRoot(context)
-            self._controller.SetMode(controller_context, self._mode if acts else "gravity")
-            self._acting = acts
-        state = self._diagram.AllocateDiscreteVariables()
-        self._diagram.CalcForcedDiscreteVariableUpdate(context, state)
-        context.SetDiscreteState(state)
-        return self._sender.get_output_port().Eval(self._sender.GetMyContextFromRoot(context))
+        if acts != self._acts:
+            self._act(acts)
+        self._diagram.CalcForcedDiscreteVariableUpdate(context, self._new_state)
+        context.SetDiscreteState(self._new_state)
+        return self._sender.get_output_port().Eval(self._sender_context)
+
+    def _act(self, acts: bool) -> None:
+        """Whether efforts act from now on: then the ramp begins, and the pose to hold is latched anew."""
+        self._acts = acts
+        self._ramp.GetInputPort("enabled").FixValue(self._ramp_context, np.array([float(acts)]))
+        # From "gravity" to "hold" the pose is latched anew and the integrator is empty.
+        controller_context = self._controller.GetMyMutableContextFromRoot(self._context)
+        self._controller.SetMode(controller_context, self._mode if acts else "gravity")
