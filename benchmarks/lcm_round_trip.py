@@ -55,11 +55,13 @@ class TimedArm(SimulatedArm):
         self.back: dict[int, float] = {}
 
     def hear(self, channel: str, data: bytes) -> None:
+        """As the arm does, noting when."""
         now = time.monotonic()
         super().hear(channel, data)
         self.back.setdefault(lcmt_dvrk_command.decode(data).sequence, now)
 
     def step(self) -> None:
+        """As the arm does, noting when its status was out."""
         super().step()
         self.out.append(time.monotonic())
 
