@@ -438,8 +438,7 @@ def test_an_arm_that_is_killed_and_restarted_hears_nothing_from_run_nor_from_a_l
         log.play(speed=4)
         time.sleep(0.1)
     finally:
-        run.end()
-        arm.end()
+        print(run.end(), arm.end())
     heard = [status for _, status in observer.heard[first:]]
     assert {status.guard_state for status in heard} == {Status.STATE_HOLD}
     assert heard[-1].num_accepted == 0
