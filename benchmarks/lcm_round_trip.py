@@ -2,13 +2,13 @@
 
     python benchmarks/lcm_round_trip.py [--seconds 60]
 
-This process is the arm, the simulated one of `dvrk-drake arm`, and takes the time from when a status is out to when the
+This process is the arm, the simulated one of `dvrk-drake arm`, and takes the time from when a status goes out to when the
 command that answers it is heard. Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo that
 decodes a status and encodes a command and does nothing else. Each is measured quiet, with a client of the arm's Meshcat
 page, and with a busy process on every core; without and with real-time scheduling (`--realtime` of both verbs).
 
-A tick without a fresh command is a status whose command was not heard before the next step of the arm began, about
-0.3 ms before the next status is out. It needs a multicast route:
+A tick without a fresh command is a status of which the arm heard no answer, or heard it only after its next status: by
+count of its steps, so that an arm that is late itself does not count. It needs a multicast route:
 
     unshare -rn sh -c 'ip link set lo up; ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo;
                        exec python benchmarks/lcm_round_trip.py'
@@ -24,7 +24,6 @@ import secrets
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from urllib.parse import urlsplit
@@ -43,6 +42,7 @@ from dvrk_drake.systems.dvrk_driver import DvrkDriver
 
 ARM = load_arm("mtml")
 CONDITIONS = ("quiet", "Meshcat client", "cores busy")
+ENCODE = lcmt_dvrk_status.encode
 RUN = ["-m", "dvrk_drake.cli", "run", "--arm", ARM.name.lower(), "--mode", "hold"]
 
 
@@ -50,25 +50,28 @@ class TimedArm(SimulatedArm):
     """The simulated arm, and when each status was out and the first command that answers it was heard [s]."""
 
     def __init__(self, meshcat: Meshcat | None) -> None:
-        super().__init__(ARM, DvrkDriver(), open_lcm(), start_pose(ARM), meshcat)
         self.out: list[float] = []
         self.back: dict[int, float] = {}
+        lcmt_dvrk_status.encode = lambda status: self.encode(status)
+        super().__init__(ARM, DvrkDriver(), open_lcm(), start_pose(ARM), meshcat)
 
     def hear(self, channel: str, data: bytes) -> None:
         """As the arm does, noting when."""
         now = time.monotonic()
         super().hear(channel, data)
-        self.back.setdefault(lcmt_dvrk_command.decode(data).sequence, now)
+        sequence = lcmt_dvrk_command.decode(data).sequence
+        if sequence == len(self.out) - 1:  # the last status; what answers an earlier one came too late
+            self.back[sequence] = now
 
-    def step(self) -> None:
-        """As the arm does, noting when its status was out."""
-        super().step()
+    def encode(self, status: lcmt_dvrk_status) -> bytes:
+        """As every status, noting when: after publishing is too late, a woken peer may come first on this core."""
         self.out.append(time.monotonic())
+        return ENCODE(status)
 
     def trips(self, begin: int) -> np.ndarray:
-        """Round trips [s] of the statuses from `begin` on, NaN where no command came before the next step."""
-        # The first step sends status 1; the last one may still be on its way.
-        return np.array([self.back.get(k + 1, np.nan) - out for k, out in enumerate(self.out)][begin:-1])
+        """Round trips [s] of the statuses from `begin` on, NaN where no command was heard."""
+        # The last one may still be on its way.
+        return np.array([self.back.get(k, np.nan) - out for k, out in enumerate(self.out)][begin:-1])
 
 
 def echo(realtime: bool) -> None:
@@ -133,21 +136,15 @@ def measure(peer: list[str], condition: str, seconds: float, realtime: bool) -> 
             begins.append(len(arm.out) + 2000)
         return bool(begins) and len(arm.out) > begins[0] + 1000 * seconds
 
-    # A thread of its own, as a thread is real-time for good: the next measurement may not be.
-    def play() -> None:
-        if realtime and (warning := make_realtime()):
-            print(f"warning: {warning}")
-        arm.run(stopped, lambda line: None)
-
     with contextlib.ExitStack() as stack:
         for arguments in [*load, [*peer, *(["--realtime"] if realtime else [])]]:
             stack.enter_context(started(*arguments))
-        thread = threading.Thread(target=play)
-        thread.start()
-        if meshcat:
-            time.sleep(10.0)
-            assert meshcat.GetNumActiveConnections() == 1
-        thread.join()
+        if realtime and (warning := make_realtime()):
+            print(f"warning: {warning}")
+        arm.run(stopped, lambda line: None)
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        if meshcat and meshcat.GetNumActiveConnections() != 1:
+            raise SystemExit("the Meshcat client is not connected")
     return arm.trips(begins[0])
 
 
