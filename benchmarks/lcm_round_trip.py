@@ -2,13 +2,13 @@
 
     python benchmarks/lcm_round_trip.py [--seconds 60]
 
-This process is the arm, the simulated one of `dvrk-drake arm`, and takes the time from when a status goes out to when the
-command that answers it is heard. Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo that
+This process is the arm, the simulated one of `dvrk-drake arm`, and takes the time from when a status goes out to when
+the command that answers it is heard. Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo that
 decodes a status and encodes a command and does nothing else. Each is measured quiet, with a client of the arm's Meshcat
 page, and with a busy process on every core; without and with real-time scheduling (`--realtime` of both verbs).
 
-A tick without a fresh command is a status of which the arm heard no answer, or heard it only after its next status: by
-count of its steps, so that an arm that is late itself does not count. It needs a multicast route:
+A tick without a fresh command is a status of which the arm heard no answer, or heard it only after its next status.
+That counts an arm that is late itself and catches up without a pause; the echo's line shows that share. It needs a multicast route:
 
     unshare -rn sh -c 'ip link set lo up; ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo;
                        exec python benchmarks/lcm_round_trip.py'
@@ -52,7 +52,8 @@ class TimedArm(SimulatedArm):
     def __init__(self, meshcat: Meshcat | None) -> None:
         self.out: list[float] = []
         self.back: dict[int, float] = {}
-        lcmt_dvrk_status.encode = lambda status: self.encode(status)
+        # A function, which a status binds; a bound method it would call without itself.
+        lcmt_dvrk_status.encode = lambda status: self.encode(status)  # noqa: PLW0108
         super().__init__(ARM, DvrkDriver(), open_lcm(), start_pose(ARM), meshcat)
 
     def hear(self, channel: str, data: bytes) -> None:
