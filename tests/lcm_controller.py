@@ -1,8 +1,8 @@
 """A small controller process for tests: holds the pose at which it first hears of the arm, by efforts.
 
-    python lcm_controller.py ARM [--echo]
+    python lcm_controller.py ARM [--echo] [--clock-jump SECONDS]
 
-With --echo it only answers with HOLD commands. It needs no Drake while it runs, so it is a peer to measure against.
+With --echo it only answers with HOLD commands. Its clock jumps by those seconds at its 1000th command.
 """
 
 import sys
@@ -17,8 +17,8 @@ from dvrk_drake.systems.dvrk_command_sender import draw_id
 
 
 class Controller:
-    def __init__(self, arm_name: str, echo: bool = False) -> None:
-        self.arm, self.echo = load_arm(arm_name), echo
+    def __init__(self, arm_name: str, echo: bool = False, clock_jump: float = 0.0) -> None:
+        self.arm, self.echo, self.clock_jump = load_arm(arm_name), echo, clock_jump
         self.kp, self.kd = np.array(self.arm.gains.kp), np.array(self.arm.gains.kd)
         self.sender_id, self.sequence = draw_id(), 0
         self.held = None
@@ -34,6 +34,8 @@ class Controller:
         command = lcmt_dvrk_command()
         self.sequence += 1
         command.utime, command.sequence, command.sender_id = time.monotonic_ns() // 1000, self.sequence, self.sender_id
+        if self.sequence >= 1000:
+            command.utime += round(1e6 * self.clock_jump)
         command.session_id, command.status_utime = status.session_id, status.utime
         command.arm_name, command.num_joints = self.arm.name, n
         command.control_mode = lcmt_dvrk_command.HOLD if self.echo else lcmt_dvrk_command.EFFORT
@@ -43,7 +45,12 @@ class Controller:
         self.lcm.publish(f"DVRK_COMMAND_{self.arm.name}", command.encode())
 
 
-if __name__ == "__main__":
-    controller = Controller(sys.argv[1], "--echo" in sys.argv)
+def main(arguments: list[str]) -> None:
+    jump = arguments[arguments.index("--clock-jump") + 1] if "--clock-jump" in arguments else 0.0
+    controller = Controller(arguments[0], "--echo" in arguments, float(jump))
     while True:
         controller.lcm.handle()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -14,6 +14,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -41,6 +42,9 @@ def run_inside(test_file, seconds=400):
     command = [*unshare(), "sh", "-c", f'{NETWORK} && exec "$@"', "sh"]
     pytest_run = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "-rs", "-s"]
     environment = {**os.environ, INSIDE: "1", "OMP_NUM_THREADS": "1"}
+    # Where a process that others are forked from finds what it compiles.
+    paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment["PYTHONPATH"] = os.pathsep.join(paths)
     environment.pop("LCM_DEFAULT_URL", None)
     done = subprocess.run(
         [*command, *pytest_run, test_file],

@@ -1,25 +1,35 @@
 """An arm process and its controllers over real UDP multicast, in a network of their own.
 
 Run by itself, this file starts itself again inside a network namespace; the tests of that run are the real ones.
+Processes are forked from one that has compiled everything; where a test starts them by their command line, it says so.
 """
 
+import multiprocessing
+import os
 import signal
+import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
 
 import lcm
+import lcm_controller
 import numpy as np
 import pytest
-from own_network import end, inside, outside, run_inside, start
+from own_network import INSIDE, inside, outside, run_inside
 
+from dvrk_drake import cli
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.processes.pace import make_realtime
+from dvrk_drake.processes.pace import Pace, make_realtime
 from dvrk_drake.systems.dvrk_command_sender import draw_id
 
+NETWORK_URL, OTHER_URL = (f"udpm://239.255.76.67:{port}?ttl=0" for port in (7667, 7668))
+LCM_TOOLS = Path(lcm.__file__).parent / "../bin"
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
 
 
@@ -31,9 +41,9 @@ def test_in_a_network_of_its_own():
 class Observer:
     """What an arm says, with the time of arrival, gathered by a thread."""
 
-    def __init__(self, name):
+    def __init__(self, name, url=NETWORK_URL):
         self.heard = []
-        self.lcm = lcm.LCM()
+        self.lcm = lcm.LCM(url)
         subscription = self.lcm.subscribe(f"DVRK_STATUS_{name.upper()}", self.hear)
         subscription.set_queue_capacity(0)  # no limit: none may be lost here
         threading.Thread(target=self.listen, daemon=True).start()
@@ -63,13 +73,75 @@ class Observer:
         raise AssertionError(f"{what}: not within {seconds} s; state {last.guard_state}, refusal {last.refusal_code}")
 
 
-def start_arm(name):
-    pose = [str(q) for q in POSES[name]]
-    return start(sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", name, "--realtime", "--pose", *pose)
+if INSIDE in os.environ:
+    FORKSERVER = multiprocessing.get_context("forkserver")
+    FORKSERVER.set_forkserver_preload(["lcm_precompiled"])
+
+
+class Forked:
+    """A process of one of our programs, with what it says in a file."""
+
+    def __init__(self, main, *arguments):
+        descriptor, self.path = tempfile.mkstemp()
+        os.close(descriptor)
+        self.process = FORKSERVER.Process(target=run_forked, args=(main, arguments, self.path), daemon=True)
+        self.process.start()
+
+    def send_signal(self, number):
+        os.kill(self.process.pid, number)
+
+    def wait(self, seconds):
+        """The exit code."""
+        self.process.join(seconds)
+        assert self.process.exitcode is not None, f"runs on after {seconds} s: {self.said()}"
+        return self.process.exitcode
+
+    def said(self):
+        return Path(self.path).read_text()
+
+    def end(self, number=signal.SIGKILL):
+        """Ends it, and returns what it said."""
+        if self.process.exitcode is None:
+            self.send_signal(number)
+        self.wait(20)
+        return self.said()
+
+
+class CommandLine(Forked):
+    """`dvrk-drake run` as a user starts it."""
+
+    def __init__(self, name, *options):
+        descriptor, self.path = tempfile.mkstemp()
+        command = [sys.executable, "-m", "dvrk_drake.cli", "run", "--arm", name, *options]
+        self.process = subprocess.Popen(command, stdout=descriptor, stderr=descriptor)
+        os.close(descriptor)
+
+    def wait(self, seconds):
+        return self.process.wait(seconds)
+
+    def end(self, number=signal.SIGKILL):
+        self.send_signal(number)
+        self.wait(20)
+        return self.said()
+
+
+def run_forked(main, arguments, path):
+    with open(path, "w") as stream:
+        os.dup2(stream.fileno(), 1)
+        os.dup2(stream.fileno(), 2)
+    sys.exit(main(list(arguments)))
+
+
+def start_arm(name, *options):
+    return Forked(cli.main, "arm", "--arm", name, "--realtime", *options, "--pose", *map(str, POSES[name]))
+
+
+def start_run(name, *options):
+    return Forked(cli.main, "run", "--arm", name, *options)
 
 
 def start_controller(name, *options):
-    return start(sys.executable, str(Path(__file__).with_name("lcm_controller.py")), name, *options)
+    return Forked(lcm_controller.main, name, *options)
 
 
 @pytest.fixture(scope="module", params=["mtml", "psm"])
@@ -79,8 +151,8 @@ def arm(request):
     process = start_arm(request.param)
     observer.until(lambda status: True, 90, "first status")
     yield request.param, process, observer
-    said = end(process, signal.SIGINT)
-    assert process.returncode == 0, said
+    said = process.end(signal.SIGINT)
+    assert process.wait(0) == 0, said
     assert "ended" in said
 
 
@@ -88,20 +160,30 @@ def drift(name, status):
     return np.abs(np.array(status.position) - POSES[name]).max()
 
 
+def send(network, status, sequence, sender_id, **fields):
+    """A HOLD command that answers `status`, with other fields as given."""
+    n, command = status.num_joints, Command()
+    command.utime, command.sequence, command.sender_id = time.monotonic_ns() // 1000, sequence, sender_id
+    command.session_id, command.status_utime = status.session_id, status.utime
+    command.arm_name, command.num_joints, command.control_mode = status.arm_name, n, Command.HOLD
+    command.position = command.velocity = command.effort = [0.0] * n
+    for field, value in fields.items():
+        setattr(command, field, value)
+    network.publish(f"DVRK_COMMAND_{status.arm_name.upper()}", command.encode())
+
+
 def reset(name, observer):
-    """Clears a fault: HOLD, HOLD, HOLD with the request."""
-    network, sender_id = lcm.LCM(), draw_id()
-    time.sleep(0.1)  # whoever commanded before is silent by then
-    for k, asks in enumerate((False, False, True)):
-        status, command = observer.last, Command()
-        command.utime, command.sequence, command.sender_id = time.monotonic_ns() // 1000, k, sender_id
-        command.session_id, command.status_utime = status.session_id, status.utime
-        command.arm_name, command.num_joints, command.control_mode = status.arm_name, status.num_joints, Command.HOLD
-        command.position = command.velocity = command.effort = [0.0] * status.num_joints
-        command.reset_fault = asks
-        network.publish(f"DVRK_COMMAND_{name.upper()}", command.encode())
-        time.sleep(0.01)
-    observer.until(lambda status: status.guard_state == Status.STATE_HOLD, 5, "reset")
+    """Clears a fault: HOLD, HOLD, HOLD with the request; again, as a person would, if one of them came too late."""
+    network = lcm.LCM()
+    end = time.monotonic() + 5
+    while observer.last.guard_state != Status.STATE_HOLD and time.monotonic() < end:
+        time.sleep(0.1)  # whoever commanded before is silent by then
+        sender_id = draw_id()
+        for k, asks in enumerate((False, False, True)):
+            send(network, observer.last, k, sender_id, reset_fault=asks)
+            time.sleep(0.01)
+        time.sleep(0.05)
+    assert observer.last.guard_state == Status.STATE_HOLD
 
 
 @inside
@@ -113,7 +195,7 @@ def test_command_and_status_go_round(arm):
         first = len(observer.heard)
         observer.until(lambda status: status.num_accepted > 2000, 60, "2000 commands")
     finally:
-        end(controller)
+        controller.end()
     heard = [status for _, status in observer.heard[first:]]
     sequences = np.array([status.sequence for status in heard])
     assert np.all(np.diff(sequences) == 1)
@@ -136,7 +218,7 @@ def test_a_killed_controller_is_followed_by_a_hold(arm):
         controller.send_signal(signal.SIGKILL)
         killed, first = time.monotonic(), len(observer.heard)
     finally:
-        end(controller)
+        controller.end()
     held = observer.until(lambda status: status.guard_state == Status.STATE_HOLD, 5, "hold")
     last_command = max(
         k for k in range(held) if observer.heard[k][1].num_accepted < observer.heard[held][1].num_accepted
@@ -159,14 +241,15 @@ def test_a_killed_controller_is_followed_by_a_hold(arm):
 def test_run_starts_ramps_in_and_leaves_the_arm_to_its_hold(arm, mode):
     name, _, observer = arm
     expired = observer.last.num_expired
-    process = start(sys.executable, "-m", "dvrk_drake.cli", "run", "--arm", name, "--mode", mode, "--realtime")
+    starts = CommandLine if (name, mode) == ("mtml", "gravity") else start_run
+    process = starts(name, "--mode", mode, "--realtime")
     try:
         begun = observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 90, "run")
         time.sleep(2.0)
         acting = [status for _, status in observer.heard[begun:]]
     finally:
-        said = end(process, signal.SIGINT)
-    assert process.returncode == 0, said
+        said = process.end(signal.SIGINT)
+    assert process.wait(0) == 0, said
     assert {status.guard_state for status in acting} == {Status.STATE_EFFORT}
     efforts = np.array([status.effort_commanded for status in acting])
     assert np.all(np.abs(np.diff(efforts, axis=0)) < 0.01 * load_arm(name).effort_limits)
@@ -181,7 +264,7 @@ def test_run_starts_ramps_in_and_leaves_the_arm_to_its_hold(arm, mode):
 @inside
 def test_run_stops_when_the_arm_faults_and_refuses_one_that_has_a_fault(arm):
     name, _, observer = arm
-    process = start(sys.executable, "-m", "dvrk_drake.cli", "run", "--arm", name)
+    process = start_run(name)
     other = None
     try:
         observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 90, "run")
@@ -189,13 +272,13 @@ def test_run_stops_when_the_arm_faults_and_refuses_one_that_has_a_fault(arm):
         observer.until(lambda status: status.guard_state == Status.STATE_FAULT, 60, "fault")
         assert process.wait(20) == 2
     finally:
-        process.kill()
+        process.end()
         if other is not None:
-            end(other)
-    assert "has a fault: senders" in process.stdout.read()
-    again = start(sys.executable, "-m", "dvrk_drake.cli", "run", "--arm", name)
+            other.end()
+    assert "has a fault: senders" in process.said()
+    again = start_run(name)
     assert again.wait(60) == 2
-    assert "It must be reset first" in again.stdout.read()
+    assert "It must be reset first" in again.said()
     reset(name, observer)
     assert drift(name, observer.last) < 1e-3
 
@@ -220,13 +303,166 @@ def test_garbage_neither_stops_nor_moves_the_arm(arm):
         network.publish(f"DVRK_COMMAND_{name.upper()}", bytes(data))
         if k % 20 == 0:
             time.sleep(1e-3)
+            # No faster than the arm reads on a busy machine: what the system drops says nothing about the arm.
+            late = time.monotonic() + 0.1
+            while k > observer.last.num_refused - refused + 100 and time.monotonic() < late:
+                time.sleep(1e-3)
     time.sleep(0.2)
-    assert process.poll() is None
+    assert process.process.is_alive()
     heard = [status for _, status in observer.heard[first:]]
     assert np.all(np.diff([status.sequence for status in heard]) == 1)
     assert {status.guard_state for status in heard} == {Status.STATE_HOLD}
     assert max(drift(name, status) for status in heard) < 1e-4
     assert heard[-1].num_refused - refused > 9_000  # UDP may lose a few
+
+
+@inside
+def test_a_jump_of_the_controllers_clock_is_followed_by_a_hold_and_a_new_start(arm):
+    name, _, observer = arm
+    first = len(observer.heard)
+    controller = start_controller(name, "--clock-jump", {"mtml": "10", "psm": "-10"}[name])
+    try:
+        observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 60, "start of the controller")
+        jumped = observer.until(lambda status: status.guard_state == Status.STATE_HOLD, 60, "hold")
+        assert observer.heard[jumped][1].refusal_code == Status.REFUSAL_CLOCK_JUMP
+        observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 60, "a new start")
+        time.sleep(0.2)
+    finally:
+        controller.end()
+    assert max(drift(name, status) for _, status in observer.heard[first:]) < 1e-3
+
+
+class Logged:
+    """What lcm-logger writes of the commands while the block runs, for lcm-logplayer."""
+
+    def __init__(self, path, url):
+        self.path, self.url = path, url
+
+    def __enter__(self):
+        self.logger = subprocess.Popen(
+            [LCM_TOOLS / "lcm-logger", "-q", "-f", "-c", "DVRK_COMMAND.*", "-l", self.url, self.path]
+        )
+        network, end = lcm.LCM(self.url), time.monotonic() + 20
+        while not (self.path.exists() and self.path.stat().st_size) and time.monotonic() < end:
+            network.publish("DVRK_COMMAND_NOBODY", b"is the logger there?")
+            time.sleep(0.01)
+        return self
+
+    def __exit__(self, *exception):
+        self.logger.send_signal(signal.SIGINT)
+        self.logger.wait(20)
+
+    def count(self, name):
+        return sum(event.channel == f"DVRK_COMMAND_{name.upper()}" for event in lcm.EventLog(str(self.path), "r"))
+
+    def play(self, speed):
+        command = [LCM_TOOLS / "lcm-logplayer", f"--speed={speed}", "-l", self.url, self.path]
+        subprocess.run(command, check=True, timeout=60, capture_output=True)
+
+
+@inside
+def test_commands_that_are_played_again_from_a_log_are_refused(arm, tmp_path):
+    name, _, observer = arm
+    with Logged(tmp_path / "commands", NETWORK_URL) as log:
+        controller = start_controller(name)
+        try:
+            observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 60, "start of the controller")
+            time.sleep(0.5)
+        finally:
+            controller.end()
+        observer.until(lambda status: status.guard_state == Status.STATE_HOLD, 5, "hold")
+    before, first = observer.last, len(observer.heard)
+    log.play(speed=1)
+    time.sleep(0.1)
+    heard = [status for _, status in observer.heard[first:]]
+    assert {status.guard_state for status in heard} == {Status.STATE_HOLD}
+    assert heard[-1].num_accepted == before.num_accepted
+    assert heard[-1].num_refused - before.num_refused > 0.9 * log.count(name) > 200
+    assert heard[-1].refusal_code == Status.REFUSAL_STALE
+    assert max(drift(name, status) for status in heard) < 1e-3
+
+
+@inside
+def test_an_arm_that_is_killed_and_restarted_hears_nothing_from_run_nor_from_a_log(tmp_path):
+    observer, on_other = Observer("mtml", OTHER_URL), ("--lcm-url", OTHER_URL)
+    arm, run = start_arm("mtml", *on_other), start_run("mtml", "--mode", "hold", "--realtime", *on_other)
+    try:
+        with Logged(tmp_path / "commands", OTHER_URL) as log:
+            observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 60, "run")
+            time.sleep(0.5)
+            arm.end(signal.SIGKILL)
+            killed = observer.last.session_id
+            arm = start_arm("mtml", *on_other)
+            first = observer.until(lambda status: status.session_id != killed, 60, "a new session")
+            assert run.wait(20) == 2
+        # By whichever it notices first: a second of silence, or a session that it did not start with.
+        assert "no status of MTML for 1 s" in run.said() or "MTML was restarted: look at it" in run.said()
+        assert observer.last.num_refused == 0
+        log.play(speed=4)
+        time.sleep(0.1)
+    finally:
+        print(run.end(), arm.end())
+    heard = [status for _, status in observer.heard[first:]]
+    assert {status.guard_state for status in heard} == {Status.STATE_HOLD}
+    assert heard[-1].num_accepted == 0
+    assert heard[-1].num_refused > 0.9 * log.count("mtml") > 200
+    assert heard[-1].refusal_code == Status.REFUSAL_WRONG_SESSION
+    assert max(drift("mtml", status) for status in heard) < 1e-3
+
+
+class ScriptedArm:
+    """An arm that says what the test wants, and hears every command."""
+
+    def __init__(self, url):
+        self.commands, self.lcm, self.pace = [], lcm.LCM(url), Pace(1e-3)
+        self.lcm.subscribe("DVRK_COMMAND_MTML", lambda _, data: self.commands.append(Command.decode(data)))
+        self.held = IdentifiedModel.from_arm(load_arm("mtml")).holding_torque(POSES["mtml"])
+        self.status = status = Status()
+        status.arm_name, status.num_joints, status.session_id, status.utime = "MTML", 7, draw_id(), 10**15
+        status.guard_state, status.accepted_modes = Status.STATE_HOLD, 0b1111
+        status.position = status.position_commanded = POSES["mtml"]
+        status.velocity, status.joint_flags = [0.0] * 7, [0] * 7
+        status.effort_measured = status.effort_commanded = self.held.tolist()
+
+    def say(self, count, utime_jump=0):
+        """So many statuses, a millisecond apart; the clock jumps before the first one [us]."""
+        self.status.utime += utime_jump
+        for _ in range(count):
+            self.pace.wait()
+            self.status.utime, self.status.sequence = self.status.utime + 1000, self.status.sequence + 1
+            self.lcm.publish("DVRK_STATUS_MTML", self.status.encode())
+            while self.lcm.handle_timeout(0):
+                pass
+
+
+@inside
+def test_run_goes_on_when_the_arms_clock_jumps_and_ends_when_its_session_changes():
+    arm, run = ScriptedArm(OTHER_URL), start_run("mtml", "--mode", "hold", "--realtime", "--lcm-url", OTHER_URL)
+    try:
+        end = time.monotonic() + 60
+        while not arm.commands and time.monotonic() < end:
+            arm.say(1)
+        arm.status.guard_state, arm.status.command_sender_id = Status.STATE_EFFORT, arm.commands[0].sender_id
+        arm.say(1500)
+        first = len(arm.commands)
+        for jump in (3_600_000_000, -7_200_000_000):
+            arm.say(300, jump)
+            time.sleep(0.05)
+            arm.say(1)
+            assert abs(arm.commands[-1].status_utime - arm.status.utime) < 500_000
+        answers = arm.commands[first:]
+        assert len(answers) > 300  # run answers the newest status; a busy machine makes it leave some out
+        np.testing.assert_allclose([command.effort for command in answers], len(answers) * [arm.held], atol=1e-9)
+        advance = np.diff([command.utime for command in answers])
+        assert np.all((advance > 0) & (advance < 500_000))  # of its own clock, which did not jump
+        assert {command.session_id for command in arm.commands} == {arm.status.session_id}
+        session, arm.status.session_id = arm.status.session_id, draw_id()
+        arm.say(100)
+        assert run.wait(20) == 2
+    finally:
+        run.end()
+    assert "MTML was restarted: look at it, then start again" in run.said()
+    assert {command.session_id for command in arm.commands} == {session}
 
 
 @inside
@@ -236,8 +472,8 @@ def test_two_controllers_are_noticed_and_a_reset_must_be_meant(arm):
     try:
         observer.until(lambda status: status.fault_code == Status.FAULT_DUPLICATE_SENDER, 60, "fault")
     finally:
-        end(first)
-        end(second)
+        first.end()
+        second.end()
     time.sleep(0.2)
     assert observer.last.guard_state == Status.STATE_FAULT
     reset(name, observer)

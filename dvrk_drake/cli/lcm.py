@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import closing
 from typing import TYPE_CHECKING
 
 from dvrk_drake.cli.support import add_gravity, mounted, quiet_drake
@@ -106,7 +107,8 @@ def ready_controller(options: argparse.Namespace, mode: Mode) -> tuple[ArmContro
     if model.load_arm().name != arm.name:
         raise ModelError(f"{options.model}: is of {model.load_arm().name}, not of {arm.name}")
     url = open_lcm(options.lcm_url).get_lcm_url()
-    status, period = first_status(ArmLink(arm, url))
+    with closing(ArmLink(arm, url)) as link:
+        status, period = first_status(link)
     if status.gravity_compensation:
         _warn(f"{arm.name} adds gravity compensation of its own: switch it off, or it is compensated twice")
     controller = ArmController(arm, model, mode, period)

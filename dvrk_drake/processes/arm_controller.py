@@ -50,7 +50,13 @@ class ArmController:
         builder.ConnectInput(status, self._sender.GetInputPort("lcmt_dvrk_status"))
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
-        self._acting = False
+        # Fixed once: FixValue would deep-copy each message, which costs more than all the rest of an answer.
+        port = self._diagram.GetInputPort("lcmt_dvrk_status")
+        self._status = port.FixValue(self._context, AbstractValue.Make(lcmt_dvrk_status()))
+        self._ramp_context = self._ramp.GetMyMutableContextFromRoot(self._context)
+        self._sender_context = self._sender.GetMyContextFromRoot(self._context)
+        self._new_state = self._diagram.AllocateDiscreteVariables()
+        self._act(False)
 
     @property
     def sender_id(self) -> int:
@@ -65,7 +71,7 @@ class ArmController:
     @property
     def ramped(self) -> bool:
         """Whether they have become the wanted ones in full."""
-        return self._acting and self._ramp.share(self._ramp.GetMyContextFromRoot(self._context)) >= 1
+        return self._acting and self._ramp.share(self._ramp_context) >= 1
 
     def answer(
         self, status: lcmt_dvrk_status, time: float, desired_state: NDArray[np.float64] | None = None
@@ -76,19 +82,21 @@ class ArmController:
         """
         context = self._context
         context.SetTime(time)
-        self._diagram.GetInputPort("lcmt_dvrk_status").FixValue(context, AbstractValue.Make(status))
+        self._status.GetMutableData().set_value(status)
         acts = status.guard_state == lcmt_dvrk_status.STATE_EFFORT and status.command_sender_id == self.sender_id
-        ramp_context = self._ramp.GetMyMutableContextFromRoot(context)
-        self._ramp.GetInputPort("enabled").FixValue(ramp_context, np.array([float(acts)]))
         if acts != self._acting:
-            # From "gravity" to "hold" the pose is latched anew and the integrator is empty.
-            controller_context = self._controller.GetMyMutableContextFromRoot(context)
-            self._controller.SetMode(controller_context, self._mode if acts else "gravity")
-            self._acting = acts
+            self._act(acts)
         if desired_state is not None:
             controller_context = self._controller.GetMyMutableContextFromRoot(context)
             self._controller.GetInputPort("desired_state").FixValue(controller_context, desired_state)
-        state = self._diagram.AllocateDiscreteVariables()
-        self._diagram.CalcForcedDiscreteVariableUpdate(context, state)
-        context.SetDiscreteState(state)
-        return self._sender.get_output_port().Eval(self._sender.GetMyContextFromRoot(context))
+        self._diagram.CalcForcedDiscreteVariableUpdate(context, self._new_state)
+        context.SetDiscreteState(self._new_state)
+        return self._sender.get_output_port().Eval(self._sender_context)
+
+    def _act(self, acting: bool) -> None:
+        """Whether efforts act from now on: then the ramp begins, and the pose to hold is latched anew."""
+        self._acting = acting
+        self._ramp.GetInputPort("enabled").FixValue(self._ramp_context, np.array([float(acting)]))
+        # From "gravity" to "hold" the pose is latched anew and the integrator is empty.
+        controller_context = self._controller.GetMyMutableContextFromRoot(self._context)
+        self._controller.SetMode(controller_context, self._mode if acting else "gravity")

@@ -37,7 +37,13 @@ class ArmLink:
         self._is_of_arm = is_status_of(arm)
         self._last: lcmt_dvrk_status | None = None
         self._is_new = False
-        self._lcm.subscribe(status_channel(arm), self._hear)
+        self._subscription = self._lcm.subscribe(status_channel(arm), self._hear)
+
+    def close(self) -> None:
+        """Hears no more, and ends LCM's reading thread, which would wake for every message for nothing."""
+        self._lcm.unsubscribe(self._subscription)
+        # The subscription holds this link and LCM, unseen by the garbage collector.
+        del self._subscription, self._lcm
 
     def next_status(self, seconds: float) -> lcmt_dvrk_status:
         """The newest status that comes within `seconds`.

@@ -10,8 +10,8 @@ from pydrake.lcm import DrakeLcm
 
 from dvrk_drake.errors import DvrkDrakeError
 
-#: How long a message to oneself may take [ms].
-_OWN_MESSAGE = 500
+#: How long a message to oneself may take, on a busy machine [ms].
+_OWN_MESSAGE = 2000
 
 
 def open_lcm(url: str = "") -> DrakeLcm:

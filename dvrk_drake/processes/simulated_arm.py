@@ -19,6 +19,7 @@ from pydrake.systems.framework import DiagramBuilder
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, describe_state
+from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.processes.pace import Pace
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.command_guard import CommandGuard
@@ -80,10 +81,7 @@ class SimulatedArm:
         self._driver = apply_driver_config(
             driver, station, network, builder, start_utime=time.time_ns() // 1000, subscribe=False
         )
-        # Drake's own subscription would keep one message between two steps; a second sender must not hide there.
-        self._commands = lcm.LCM(network.get_lcm_url())
-        subscription = self._commands.subscribe(command_channel(arm), lambda _, data: self._driver.Receive(data))
-        subscription.set_queue_capacity(_MESSAGES_A_STEP)
+        self._url = network.get_lcm_url()
         self._simulator = Simulator(builder.Build())
         context = self._simulator.get_mutable_context()
         station.set_positions(station.GetMyMutableContextFromRoot(context), q)
@@ -94,11 +92,12 @@ class SimulatedArm:
         """The guard as it is now, to be read only."""
         return self._driver.GetGuard(self._driver.GetMyContextFromRoot(self._simulator.get_context()))
 
+    def hear(self, channel: str, data: bytes) -> None:
+        """Keeps a message of the command channel for the next step."""
+        self._driver.Receive(data)
+
     def step(self) -> None:
-        """Takes what has arrived, moves on by one period of the driver, and tells of it."""
-        for _ in range(_MESSAGES_A_STEP):
-            if self._commands.handle_timeout(0) == 0:
-                break
+        """Takes what was heard, moves on by one period of the driver, and tells of it."""
         self._ticks += 1
         self._simulator.AdvanceTo(self._ticks * self.driver.status_period)
 
@@ -108,10 +107,17 @@ class SimulatedArm:
         Returns:
             The pace, with the count of late ticks.
         """
-        pace = Pace(self.driver.status_period)
+        # Opened here, as LCM's reading thread is scheduled like the thread that opens it. Drake's own subscription
+        # would keep one message between two steps; a second sender must not hide there.
+        commands = lcm.LCM(self._url)
+        commands.subscribe(command_channel(self.arm), self.hear).set_queue_capacity(_MESSAGES_A_STEP)
+        pace = Pace(self.driver.status_period, sleep=lambda seconds: _listen(commands, seconds))
         told = ""
         while not stopped():
             pace.wait()
+            for _ in range(_MESSAGES_A_STEP):
+                if not handle_message(commands, 0.0):
+                    break
             self.step()
             if (state := self._describe()) != told:
                 tell(f"{self._simulator.get_context().get_time():9.3f} s  {state}")
@@ -122,6 +128,13 @@ class SimulatedArm:
         guard = self.guard
         sender = f", sender {guard.sender_id}" if guard.sender_id else ""
         return describe_state(guard.state, guard.fault_text) + sender
+
+
+def _listen(network: lcm.LCM, seconds: float) -> None:
+    """Handles what comes within that time, so that a tick begins with little left to do."""
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        handle_message(network, left)
 
 
 def stop_on_signals() -> Callable[[], bool]:
