@@ -3,12 +3,15 @@
     python benchmarks/lcm_round_trip.py [--seconds 60]
 
 This process is the arm, the simulated one of `dvrk-drake arm`, and takes the time from when a status goes out to when
-the command that answers it is heard. Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo that
-decodes a status and encodes a command and does nothing else. Each is measured quiet, with a client of the arm's Meshcat
-page, and with a busy process on every core; without and with real-time scheduling (`--realtime` of both verbs).
+the command that answers it is heard. Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo
+that decodes a status and encodes a command and does nothing else. Each is measured quiet, with a client of the arm's
+Meshcat page, and with a busy process on every core; without and with real-time scheduling (`--realtime` of both verbs).
 
-A tick without a fresh command is a status of which the arm heard no answer, or heard it only after its next status.
-That counts an arm that is late itself and catches up without a pause; the echo's line shows that share. It needs a multicast route:
+A tick without a fresh command is a status to which the arm had heard no answer when its next step began: it has a
+period less its own step (0.3 ms on a quiet machine) for that, and nothing at all when it is late itself and catches up.
+The echo's lines show how much of it is the arm and the machine.
+
+It needs a multicast route:
 
     unshare -rn sh -c 'ip link set lo up; ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo;
                        exec python benchmarks/lcm_round_trip.py'
