@@ -3,13 +3,19 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint benchmark clean
+.PHONY: demo test test-fast test-udp lint benchmark clean
 
 demo: $(VENV)/.installed
 	$(BIN)/dvrk-drake demo --output demo_output
 
-test: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+test: test-fast test-udp
+
+test-fast: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -n 2 --dist loadfile --ignore-glob='*_udp.py'
+
+# One after the other: each runs several processes at 1 kHz, and wants the cores for itself.
+test-udp: $(VENV)/.installed-test
+	$(BIN)/python -m pytest tests/*_udp.py
 
 lint: $(VENV)/.installed-lint
 	$(BIN)/ruff check .

@@ -35,7 +35,7 @@ def start_record(path, *options, arm="mtml"):
     """A recorder that listens already."""
     process = start(sys.executable, "-m", "dvrk_drake.cli", "record", str(path), "--arm", arm, *options)
     line = process.stdout.readline()
-    assert line.startswith(f"recording {arm.upper()} on LCM udpm://239.255.76.67:7667"), line
+    assert line.startswith(f"recording {arm.upper()} on LCM udpm://239.255.76.67:76"), line
     return process
 
 
@@ -149,6 +149,7 @@ def test_a_killed_record_or_logger_leaves_a_readable_file(tmp_path, played):
 
 @inside
 def test_silence_is_explained(tmp_path, played):
+    alone = start_record(tmp_path / "alone.csv", "--lcm-url", "udpm://239.255.76.67:7668?ttl=0")
     waiting = {arm: start_record(tmp_path / f"{arm}.csv", arm=arm) for arm in ("psm", "mtmr", "mtml")}
     time.sleep(0.5)
     said = end(waiting.pop("mtmr"), signal.SIGINT)
@@ -166,7 +167,6 @@ def test_silence_is_explained(tmp_path, played):
     for arm, process in waiting.items():
         assert process.wait(20) == 2
         assert messages[arm] in process.stdout.read()
-    alone = start_record(tmp_path / "alone.csv")
     assert alone.wait(20) == 2
     assert "does the arm's process or bridge run, on this network?" in alone.stdout.read()
     assert not list(tmp_path.glob("*.csv"))
