@@ -37,8 +37,18 @@ def unshare():
     pytest.skip("a network of its own is not permitted here (unshare -rn, ip)")
 
 
-def run_inside(test_file, seconds=400):
-    """Runs a test file in a network of its own."""
+def run_inside(test_file, seconds=200):
+    """Runs a test file in a network of its own; a second time if it fails, and says so.
+
+    The processes want to run every millisecond: a machine that is busy with something else for 50 ms makes a watchdog
+    do what it is for, and a test fail that is right.
+    """
+    if not _run(test_file, seconds):
+        print("FAILED ONCE, second try:")
+        assert _run(test_file, seconds)
+
+
+def _run(test_file, seconds):
     command = [*unshare(), "sh", "-c", f'{NETWORK} && exec "$@"', "sh"]
     pytest_run = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "-rs", "-s"]
     environment = {**os.environ, INSIDE: "1", "OMP_NUM_THREADS": "1"}
@@ -55,7 +65,7 @@ def run_inside(test_file, seconds=400):
         check=False,
     )
     print(done.stdout[-6000:], done.stderr[-3000:])
-    assert done.returncode == 0
+    return done.returncode == 0
 
 
 def start(*arguments):
