@@ -14,6 +14,7 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -44,7 +45,7 @@ def run_inside(test_file, seconds=200):
     do what it is for, and a test fail that is right.
     """
     if not _run(test_file, seconds):
-        print("FAILED ONCE, second try:")
+        warnings.warn(f"{Path(test_file).name} failed once and is tried again", stacklevel=1)
         assert _run(test_file, seconds)
 
 
