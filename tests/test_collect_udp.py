@@ -113,5 +113,7 @@ def test_collect_kill_go_on_identify_and_release(observer, tmp_path):
     assert process.returncode == 0, said
     drift = np.abs(released - released[0]).max(axis=0)
     print("drift after release in 3 s [mrad]:", np.round(1e3 * drift, 2))
-    # The simulated joints turn freely: 1e-5 N m too much move a wrist by this in the time.
-    assert np.all(drift < 0.05)
+    # A model of eight poses carries it. Seen were 2.4 mrad, and 19 mrad at the wrists: they turn freely in simulation,
+    # and 1e-5 N m too much does that.
+    assert np.all(drift[:3] < 0.01)
+    assert np.all(drift[3:] < 0.05)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.rests import LEAST_ROWS, LONGEST_PERIOD, smooth_velocity, stationary_runs
+from dvrk_drake.analysis.rests import LEAST_ROWS, LONGEST_PERIOD, is_motion, smooth_velocity, stationary_runs
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
@@ -50,16 +50,11 @@ def slow_parts(recording: Recording, arm: Arm) -> SlowParts:
     """
     moving = recording.in_joint_coordinates(arm)
     moving.measured_effort()
-    qd, t = moving.qd, moving.t
     where = recording.source or "recording"
-    if qd is None or t is None or len(t) < LEAST_ROWS or not np.all(np.diff(t) > 0):
+    if moving.qd is None or not is_motion(moving):
         raise IdentificationError(
-            f"{where}: slow parts need a motion: t that increases and qd1..qd{arm.num_joints} over 100 rows or more"
-        )
-    period = float(np.median(np.diff(t)))
-    if not period < LONGEST_PERIOD:
-        raise IdentificationError(
-            f"{where}: samples {period:.3g} s apart are too far for slow parts; below {LONGEST_PERIOD} s"
+            f"{where}: slow parts need a motion: qd1..qd{arm.num_joints}, and t that increases by less than "
+            f"{LONGEST_PERIOD} s, over {LEAST_ROWS} rows or more"
         )
     moving = _thinned(moving)
     tau, t = moving.measured_effort(), np.asarray(moving.t)
