@@ -1,0 +1,74 @@
+"""What was exported, and what an installed file is worth, as tables in a terminal."""
+
+from __future__ import annotations
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from dvrk_drake.analysis.compensation_comparison import CompensationComparison
+from dvrk_drake.dynamics.gravity_compensation import MTM_JOINTS
+from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
+
+
+def print_compensation(console: Console, path: str, file: GravityCompensationFile) -> None:
+    """What a person should read before the controller does."""
+    table = _table("", "clip [N m]", "friction [N m]", "ratio", "dead band [rad/s]", "saturation [rad/s]")
+    friction = (file.positive - file.negative)[10::5] / 2
+    for j, name in enumerate(MTM_JOINTS):
+        table.add_row(
+            name,
+            f"{file.torque_lower[j]:+.4f} .. {file.torque_upper[j]:+.4f}",
+            f"{np.append(friction, 0.0)[j]:.4f}",
+            f"{file.friction_ratio[j]:g}",
+            f"{file.dead_band[j]:g}",
+            f"{file.saturation[j]:g}",
+        )
+    console.print(table)
+    console.print(f'gravity compensation: {path}; "gravity_compensation" of the arm\'s JSON names it', soft_wrap=True)
+
+
+def print_comparison(console: Console, file_name: str, model_name: str, comparison: CompensationComparison) -> None:
+    """One row a joint, then what its columns mean."""
+    console.print(
+        f"{file_name} (file) and {model_name} (model) at {len(comparison.q)} random poses of the joint box, at rest",
+        soft_wrap=True,
+    )
+    table = _table("[N m]", "model", "file, no clip", "clip", "at clip", "runaway", "opposed", "RMS in | out")
+    for j in comparison.joints:
+        table.add_row(
+            j.name,
+            f"{j.model_lower:+.3f}..{j.model_upper:+.3f}",
+            f"{j.file_lower:+.3f}..{j.file_upper:+.3f}",
+            f"{j.clip_lower:+.3f}..{j.clip_upper:+.3f}",
+            *(f"{100 * share:.0f} %" if share else "" for share in (j.clipped, j.runaway, j.opposed)),
+            f"{_number(j.rms_inside)} | {_number(j.rms_outside)}",
+        )
+    console.print(table)
+    console.print(
+        "at clip: share of poses at which the file's torque is its limit, a constant. runaway: where it is, before\n"
+        "the clip, outside the model's range by more than half of it. opposed: where file and model push opposite ways,\n"
+        "both by more than a tenth of the model's largest. RMS: file less model, in and out of the sweep that the file\n"
+        f"says its data are from ({_sweep(comparison)})."
+    )
+    wrong = (comparison.clipped | comparison.runaway | comparison.opposed)[:, : len(MTM_JOINTS) - 1].any(axis=1)
+    console.print(f"At {100 * wrong.mean():.0f} % of the poses at least one joint has one of the three.")
+
+
+def _table(first: str, *headings: str) -> Table:
+    table = Table(box=None, pad_edge=False)
+    table.add_column(escape(first), no_wrap=True)
+    for heading in headings:
+        table.add_column(escape(heading), justify="right", no_wrap=True)
+    return table
+
+
+def _sweep(comparison: CompensationComparison) -> str:
+    if comparison.file.sweep is None:
+        return "it does not say"
+    return f"{100 * comparison.in_sweep.mean():.0f} % of the joint box"
+
+
+def _number(x: float) -> str:
+    return "-" if np.isnan(x) else f"{x:.3f}"

@@ -1,0 +1,110 @@
+"""The verbs that hand a model to other programs, and that judge what the dVRK's controller has installed."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import TYPE_CHECKING
+
+from dvrk_drake.cli.support import check_output
+from dvrk_drake.errors import DvrkDrakeError
+
+if TYPE_CHECKING:
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+
+
+def add_verbs(verbs: argparse._SubParsersAction) -> None:
+    """Adds the verbs and their options."""
+    verb = verbs.add_parser("export", help="write a model as the dVRK controller's file", description=_export_help)
+    verb.add_argument("model", metavar="MODEL", help=_model_help)
+    verb.add_argument("--dvrk-gc", metavar="OUT.json", help="the controller's gravity compensation of an MTM")
+    _add_gc_options(verb.add_argument_group("options of --dvrk-gc"))
+    verb.set_defaults(run=_export)
+
+    verb = verbs.add_parser(
+        "compare-gc",
+        help="compare an installed gravity-compensation file of the dVRK with a model",
+        description="Compares a gc-*.json of the dVRK's controller with a model over the whole joint box, at rest.",
+    )
+    verb.add_argument("file", metavar="GC.json")
+    verb.add_argument("--model", required=True, metavar="MODEL", help=_model_help)
+    verb.add_argument("--plot", metavar="OUT.png", help="draw both over the joint box")
+    verb.add_argument("--json", metavar="FILE", help="write the table as JSON")
+    verb.set_defaults(run=_compare)
+
+
+def _add_gc_options(group: argparse._ArgumentGroup) -> None:
+    seven = {"nargs": 7, "type": float, "metavar": tuple(f"J{i}" for i in range(1, 8))}
+    group.add_argument("--gc-tolerance", type=float, metavar="NM", help=_tolerance_help)
+    group.add_argument("--coulomb", help="dry friction of the joints [N m]; default: none", **seven)
+    group.add_argument("--friction-ratio", help="share 0..1 of it to compensate; default: as in dVRK files", **seven)
+    group.add_argument("--dead-band", help="speeds below which it is not [rad/s]; default: likewise", **seven)
+    group.add_argument("--saturation", help="speeds from which it is in full [rad/s]; default: likewise", **seven)
+
+
+def _export(options: argparse.Namespace) -> None:
+    writers = {"dvrk_gc": _write_gc}
+    outputs = {name: path for name in writers if (path := getattr(options, name)) is not None}
+    if not outputs:
+        raise DvrkDrakeError(f"nothing to write; name {' or '.join('--' + name.replace('_', '-') for name in writers)}")
+    model = _load_model(options.model)
+    for path in outputs.values():
+        check_output(path, options.model)
+    for name, path in outputs.items():
+        writers[name](model, path, options)
+
+
+def _write_gc(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.export_tables import print_compensation
+    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.dynamics.gravity_compensation import CompensationOptions, compensation_from_model
+
+    given = {
+        "tolerance": options.gc_tolerance,
+        "coulomb": options.coulomb,
+        "friction_ratio": options.friction_ratio,
+        "dead_band": options.dead_band,
+        "saturation": options.saturation,
+    }
+    file = compensation_from_model(model, CompensationOptions(**{k: v for k, v in given.items() if v is not None}))
+    file.save(path, model.load_arm().name, f"dvrk-drake export of {options.model}")
+    print_compensation(make_console(), path, file)
+
+
+def _compare(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.compensation_comparison import compare_compensation
+    from dvrk_drake.analysis.compensation_plot import plot_compensation
+    from dvrk_drake.analysis.export_tables import print_comparison
+    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
+
+    for path in (options.plot, options.json):
+        if path is not None:
+            check_output(path, options.file, options.model)
+    file = GravityCompensationFile.load(options.file)
+    comparison = compare_compensation(file, _load_model(options.model))
+    console = make_console()
+    print_comparison(console, options.file, options.model, comparison)
+    if options.plot is not None:
+        plot_compensation(options.plot, comparison, f"{options.file} and {options.model} over the joint box, at rest")
+        console.print(f"plot: {options.plot}", soft_wrap=True)
+    if options.json is not None:
+        with atomic_write(options.json) as stream:
+            json.dump(comparison.as_dict(), stream, indent=2)
+            stream.write("\n")
+
+
+def _load_model(name: str) -> IdentifiedModel:
+    """The model of a file, or what the SDF of a known arm states."""
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.models.arm import known_arms, load_arm
+
+    if name.lower() in known_arms():
+        return IdentifiedModel.from_arm(load_arm(name))
+    return IdentifiedModel.load(name)
+
+
+_export_help = "Writes a model for other programs; several files at once if several are named."
+_model_help = "MODEL.yaml, from identify; or mtml, mtmr, psm: what the SDF of that arm states"
+_tolerance_help = "error [N m] to accept where the file cannot hold what the model says; default: 1e-6"
