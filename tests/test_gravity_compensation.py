@@ -1,7 +1,9 @@
-"""The dVRK controller's gravity-compensation file: ours against its formula, written a second time from its description."""
+"""The dVRK controller's gravity-compensation file: ours against its formula, written here a second time."""
 
+import dataclasses
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
 
 def dvrk_controller(path, q, qd):
     """tau (7) as the dVRK computes it from the file's text: one pose, plain numbers, nothing of ours."""
-    content = json.loads(open(path).read())
+    content = json.loads(Path(path).read_text())
     assert content["version"] == "2.0"
     gc = content["GC_controller"]
     g = 9.81
@@ -77,7 +79,7 @@ def dvrk_controller(path, q, qd):
         both = []
         for key in ("gc_dynamic_params_pos", "gc_dynamic_params_neg"):
             p = gc[key]
-            value = sum(a * b for a, b in zip(rows[i], p))
+            value = sum(a * b for a, b in zip(rows[i], p, strict=False))
             if i < 6:
                 value += sum(p[10 + 5 * i + k] * q[i] ** k for k in range(5))
             both.append(value)
@@ -217,16 +219,19 @@ def test_a_runaway_polynomial_a_tight_clip_and_a_wrong_sign_are_found(tmp_path):
     assert all(j.clipped == j.opposed == j.runaway == 0 for j in clean.joints)
     assert max(j.rms_outside for j in clean.joints) < 1e-12
 
-    spoilt = GravityCompensationFile(**{**file.__dict__})
+    spoilt = dataclasses.replace(file)
     for which in (spoilt.positive, spoilt.negative):
         which[10 + 5 + 4] = 20.0  # 20 q2^4 N m: 33 N m at the upper limit
     spoilt.torque_upper[2] = np.median(clean.model_torque[:, 2])
     found = compare_compensation(spoilt, model)
     assert found.joints[1].runaway > 0.3 and found.joints[1].polynomial == pytest.approx(20 * 1.13446**4, rel=0.01)
     assert found.joints[2].clipped == pytest.approx(0.5, abs=0.01)
-    mirrored = GravityCompensationFile(**{**file.__dict__, "positive": -file.positive, "negative": -file.negative})
-    mirrored = GravityCompensationFile(
-        **{**mirrored.__dict__, "torque_lower": -file.torque_upper, "torque_upper": -file.torque_lower}
+    mirrored = dataclasses.replace(
+        file,
+        positive=-file.positive,
+        negative=-file.negative,
+        torque_lower=-file.torque_upper,
+        torque_upper=-file.torque_lower,
     )
     opposed = compare_compensation(mirrored, model).joints
     assert opposed[1].opposed > 0.8 and opposed[4].opposed > 0.5

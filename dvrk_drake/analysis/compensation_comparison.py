@@ -1,4 +1,4 @@
-"""Where the dVRK's installed gravity compensation of a master arm is no model of its gravity: over the whole joint box."""
+"""Where the dVRK's installed gravity compensation of a master arm is no model of its gravity."""
 
 from __future__ import annotations
 
@@ -114,17 +114,19 @@ def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) 
     error = tau_clipped - tau_model
     joints = [
         JointComparison(
-            name,
-            *(
-                float(x)
-                for x in (tau_model[:, j].min(), tau_model[:, j].max(), tau_raw[:, j].min(), tau_raw[:, j].max())
-            ),
-            float(file.torque_lower[j]),
-            float(file.torque_upper[j]),
-            *(float(flags[:, j].mean()) for flags in (clipped, opposed, runaway)),
-            float(np.abs(polynomial[:, j]).max()),
-            _rms(error[in_sweep, j]),
-            _rms(error[~in_sweep, j]),
+            name=name,
+            model_lower=float(tau_model[:, j].min()),
+            model_upper=float(tau_model[:, j].max()),
+            file_lower=float(tau_raw[:, j].min()),
+            file_upper=float(tau_raw[:, j].max()),
+            clip_lower=float(file.torque_lower[j]),
+            clip_upper=float(file.torque_upper[j]),
+            clipped=float(clipped[:, j].mean()),
+            opposed=float(opposed[:, j].mean()),
+            runaway=float(runaway[:, j].mean()),
+            polynomial=float(np.abs(polynomial[:, j]).max()),
+            rms_inside=_rms(error[in_sweep, j]),
+            rms_outside=_rms(error[~in_sweep, j]),
         )
         for j, name in enumerate(arm.joint_names)
     ]

@@ -34,12 +34,14 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _add_gc_options(group: argparse._ArgumentGroup) -> None:
-    seven = {"nargs": 7, "type": float, "metavar": tuple(f"J{i}" for i in range(1, 8))}
     group.add_argument("--gc-tolerance", type=float, metavar="NM", help=_tolerance_help)
-    group.add_argument("--coulomb", help="dry friction of the joints [N m]; default: none", **seven)
-    group.add_argument("--friction-ratio", help="share 0..1 of it to compensate; default: as in dVRK files", **seven)
-    group.add_argument("--dead-band", help="speeds below which it is not [rad/s]; default: likewise", **seven)
-    group.add_argument("--saturation", help="speeds from which it is in full [rad/s]; default: likewise", **seven)
+    for name, text in (
+        ("--coulomb", "dry friction of the joints [N m]; default: none"),
+        ("--friction-ratio", "share 0..1 of it to compensate; default: as in files in use"),
+        ("--dead-band", "speeds up to which it is not [rad/s]; default: likewise"),
+        ("--saturation", "speeds from which it is in full [rad/s]; default: likewise"),
+    ):
+        group.add_argument(name, nargs=7, type=float, metavar=tuple(f"J{i}" for i in range(1, 8)), help=text)
 
 
 def _export(options: argparse.Namespace) -> None:

@@ -48,7 +48,7 @@ class CompensationOptions:
 
 
 def controller_regressor(q: ArrayLike) -> NDArray[np.float64]:
-    """R (m, 7, 40) of the controller at poses q (m, 7) [rad], dVRK joints: torque [N m] = R parameters, before the clip.
+    """R (m, 7, 40) of the controller at poses q (m, 7) [rad] of the dVRK's joints: R parameters is a torque [N m].
 
     Source: sawIntuitiveResearchKit, robGravityCompensationMTM.
     """

@@ -35,6 +35,8 @@ class SdfFacts:
 def compose_sdf(urls: Sequence[str]) -> ElementTree.Element:
     """The model of the first file with the links, joints and frames of the others added: an arm and its instrument.
 
+    Meshes that a file names relative to itself get their absolute path.
+
     A link that another file names again gets that file's shapes, so that an instrument's housing is drawn on the arm's
     carriage without being a body of its own.
 
@@ -101,6 +103,10 @@ def _read(path: Path) -> ElementTree.Element:
         raise ArmError(f"{path}: not a readable SDF: {error}") from error
     if len(root.findall("model")) != 1:
         raise ArmError(f"{path}: must hold one <model>")
+    for uri in root.iter("uri"):
+        # Composed, a model has no folder of its own that Drake could look in.
+        if uri.text and "://" not in uri.text:
+            uri.text = str(path.resolve().parent / uri.text)
     return root
 
 

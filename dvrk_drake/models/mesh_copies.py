@@ -1,0 +1,76 @@
+"""Meshes beside an exported model, so that the folder can be moved and any reader finds them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
+
+_FILE_URL = "file://"
+
+
+def mesh_folder(model_path: Path) -> str:
+    """Name of the folder beside an exported model that holds its meshes."""
+    return f"{model_path.stem}_meshes"
+
+
+def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, Path]:
+    """Makes every `<uri>` of a composed model relative to `model_path`: meshes in `mesh_folder`.
+
+    Returns:
+        file to copy -> where to; what a glTF file refers to comes along. Packages other than ours stay as they are.
+
+    Raises:
+        ArmError: a mesh does not exist.
+    """
+    copies: dict[Path, Path] = {}
+    for uri in root.iter("uri"):
+        source = _local_path(uri.text or "")
+        if source is None:
+            continue
+        if not source.is_file():
+            raise ArmError(f"{source}: no such mesh")
+        relative = Path(mesh_folder(model_path)) / source.parent.name / source.name
+        target = model_path.parent / relative
+        if copies.setdefault(source, target) != target or list(copies.values()).count(target) > 1:
+            raise ArmError(f"{source}: another mesh of the model has the same name and folder name; rename one")
+        for part in _parts_of(source):
+            copies[source.parent / part] = target.parent / part
+        uri.text = relative.as_posix()
+    return copies
+
+
+def copy_meshes(copies: dict[Path, Path]) -> None:
+    """Copies files, each at once or not at all.
+
+    Raises:
+        DvrkDrakeError: a file cannot be written.
+    """
+    for source, target in copies.items():
+        if source == target.resolve():
+            continue
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with source.open("rb") as stream, atomic_write(target, "wb") as copy:
+            shutil.copyfileobj(stream, copy)
+
+
+def _local_path(uri: str) -> Path | None:
+    if uri.startswith(PACKAGE_URL):
+        return MODELS_FOLDER / uri.removeprefix(PACKAGE_URL)
+    if uri.startswith(_FILE_URL) or "://" not in uri:
+        return Path(uri.removeprefix(_FILE_URL))
+    return None
+
+
+def _parts_of(mesh: Path) -> list[str]:
+    """Buffers and images that a glTF file keeps outside of itself."""
+    if mesh.suffix != ".gltf":
+        return []
+    content = json.loads(mesh.read_text(encoding="utf-8"))
+    uris = [part.get("uri", "data:") for kind in ("buffers", "images") for part in content.get(kind, [])]
+    return [uri for uri in uris if not uri.startswith("data:")]

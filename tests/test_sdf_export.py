@@ -1,0 +1,152 @@
+"""SDF written from inertial parameters: any reader gets the same arm, and the same equations of motion."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation, MultibodyPlant
+from pydrake.multibody.tree import MultibodyForces
+from pydrake.systems.framework import DiagramBuilder
+
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.inertial_parameters import (
+    LinkInertia,
+    link_inertias,
+    parameters_from_pseudo_inertia,
+)
+from dvrk_drake.dynamics.sdf_export import changed_links, sdf_difference, write_sdf
+from dvrk_drake.errors import ModelError
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
+
+
+def perturbed(arm: Arm, seed: int = 0) -> tuple[LinkInertia, ...]:
+    """Other bodies: each pseudo-inertia stretched by a random linear map, which keeps it positive definite."""
+    generator = np.random.default_rng(seed)
+    links = []
+    for link in link_inertias(arm):
+        X = np.eye(4) + 0.1 * generator.normal(size=(4, 4))
+        links.append(LinkInertia(link.link, parameters_from_pseudo_inertia(X @ link.pseudo_inertia() @ X.T)))
+    return tuple(links)
+
+
+def inverse_dynamics(plant: MultibodyPlant, arm: Arm, motion) -> np.ndarray:
+    """tau (m, n) of Drake itself, projected through the linkage."""
+    context = plant.CreateDefaultContext()
+    index = tree_selector(plant, arm)
+    tau = []
+    for q, v, vd in zip(*motion, strict=True):
+        set_arm_positions(plant, context, arm, q)
+        v_tree, vd_tree = np.zeros((2, plant.num_velocities()))
+        v_tree[index], vd_tree[index] = arm.linkage.velocity(v), arm.linkage.velocity(vd)
+        plant.SetVelocities(context, v_tree)
+        forces = plant.CalcGravityGeneralizedForces(context)
+        tau_tree = plant.CalcInverseDynamics(context, vd_tree, MultibodyForces(plant)) - forces
+        tau.append(arm.linkage.pull_back_effort(tau_tree[index]))
+    return np.array(tau)
+
+
+def motion_of(arm: Arm, count: int = 50):
+    generator = np.random.default_rng(1)
+    q = arm.sample_poses(count, generator)
+    return q, generator.normal(size=q.shape), 5 * generator.normal(size=q.shape)
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_the_written_arm_moves_by_the_parameters_it_was_given(name, tmp_path):
+    arm, path = load_arm(name), tmp_path / "identified.sdf"
+    links = perturbed(arm)
+    write_sdf(arm, links, path, "a test")
+    written = dataclasses.replace(arm, sdf=(str(path),))
+    motion = motion_of(arm)
+    actual = inverse_dynamics(make_arm_plant(written), written, motion)
+    # The same from our own regressor, which never saw the file.
+    regressor = DynamicRegressor(arm)
+    parameters = regressor.values.copy()
+    by_name = {link.link: link.parameters for link in links}
+    for i, link in enumerate(regressor.links):
+        parameters[10 * i : 10 * i + 10] = by_name[link.link]
+    expected = regressor.torque(*motion, parameters)
+    scale = np.abs(expected).max(axis=0)
+    assert np.abs((actual - expected) / scale).max() < 1e-12
+    assert np.abs((expected - regressor.torque(*motion, regressor.values)) / scale).max() > 0.05
+    for before, after in zip(links, link_inertias(written), strict=True):
+        assert before.link == after.link
+        np.testing.assert_allclose(after.parameters, before.parameters, rtol=0, atol=1e-14)
+
+
+def parse(path):
+    """A plant and scene graph of one model file, by a parser that knows no packages and lets nothing pass."""
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
+    parser = Parser(plant)
+    parser.SetStrictParsing()
+    (instance,) = parser.AddModels(str(path))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link", instance))
+    plant.Finalize()
+    return plant, scene_graph, instance
+
+
+@pytest.mark.parametrize("name", ["mtmr", "psm"])
+def test_a_bare_parser_loads_it_from_anywhere_with_its_meshes(name, tmp_path):
+    arm = load_arm(name)
+    (tmp_path / "first").mkdir()
+    write_sdf(arm, perturbed(arm), tmp_path / "first" / "arm.sdf", "a test")
+    path = (tmp_path / "first").rename(tmp_path / "moved") / "arm.sdf"
+    plant, scene_graph, instance = parse(path)
+    assert plant.num_positions() == make_arm_plant(arm).num_positions()
+    inspector = scene_graph.model_inspector()
+    shapes = [
+        inspector.GetShape(geometry)
+        for body in plant.GetBodyIndices(instance)
+        for geometry in plant.GetVisualGeometriesForBody(plant.get_body(body))
+    ]
+    meshes = [shape.source().path() for shape in shapes]
+    assert len(meshes) >= 10
+    assert all(mesh.is_relative_to(path.parent) and mesh.is_file() for mesh in meshes)
+
+
+def test_only_what_changed_is_written_anew(tmp_path):
+    arm = load_arm("mtml")
+    links = link_inertias(arm)
+    assert changed_links(arm, links) == [] and sdf_difference(arm, links) == ""
+    heavier = [
+        LinkInertia(link.link, link.parameters * (2.0 if link.link == "forearm_link" else 1.0)) for link in links
+    ]
+    assert [c.link for c in changed_links(arm, heavier)] == ["forearm_link"]
+    lines = sdf_difference(arm, heavier).splitlines()
+    changed = [line for line in lines if line[:1] in "+-" and line[:3] not in ("+++", "---")]
+    before = next(link for link in links if link.link == "forearm_link").parameters[0]
+    assert f"-        <mass>{before:g}</mass>" in changed and f"+        <mass>{2 * before:g}</mass>" in changed
+    assert all("mass" in line or "i" in line for line in changed) and len(changed) <= 18
+
+
+def test_rotor_inertia_is_what_it_adds_to_the_mass_matrix(tmp_path):
+    arm, path = load_arm("mtml"), tmp_path / "arm.sdf"
+    rotors = {"outer_yaw": 0.011, "wrist_platform": 0.003}  # the second has none in the SDF
+    write_sdf(arm, [], path, "a test", rotors)
+    written = dataclasses.replace(arm, sdf=(str(path),))
+    M_before, M_after = (
+        DynamicRegressor(a).mass_matrix(np.zeros((1, 7)), DynamicRegressor(a).values)[0] for a in (arm, written)
+    )
+    expected = np.zeros((7, 7))
+    expected[0, 0], expected[3, 3] = 0.011 - 1e-6 * 63.41**2, 0.003
+    np.testing.assert_allclose(M_after - M_before, expected, rtol=0, atol=1e-12)
+
+
+def test_what_no_body_has_is_refused(tmp_path):
+    arm, path = load_arm("mtml"), tmp_path / "arm.sdf"
+    link = link_inertias(arm)[0]
+    for parameters, message in (
+        (link.parameters * np.r_[-1, np.ones(9)], "no body has this inertia"),
+        (link.parameters * np.r_[1, np.ones(3), 0.01, np.ones(5)], "no body has this inertia"),
+    ):
+        with pytest.raises(ModelError, match=message):
+            write_sdf(arm, [LinkInertia(link.link, parameters)], path, "a test")
+    with pytest.raises(ModelError, match="no moving link tail"):
+        write_sdf(arm, [LinkInertia("tail", link.parameters)], path, "a test")
+    with pytest.raises(ModelError, match="rotor inertia -1 must not be negative"):
+        write_sdf(arm, [], path, "a test", {"outer_yaw": -1.0})
+    assert list(tmp_path.iterdir()) == []
