@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
@@ -9,7 +11,31 @@ from rich.table import Table
 
 from dvrk_drake.analysis.compensation_comparison import CompensationComparison
 from dvrk_drake.dynamics.gravity_compensation import MTM_JOINTS
+from dvrk_drake.dynamics.sdf_export import LinkChange
 from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
+
+
+def print_changed_links(console: Console, changes: Sequence[LinkChange], left_out: Sequence[str]) -> None:
+    """Mass, centre of mass and inertia of every changed link, before and after; then what links cannot say."""
+    if not changes:
+        console.print("All links are as in the arm's own SDF.")
+    else:
+        table = _table("link, its SDF's and now", "mass [kg]", "centre of mass [mm]", "moments of inertia [kg cm^2]")
+        for change in changes:
+            for name, inertia in ((change.link, change.before), ("", change.after)):
+                M = inertia.to_spatial_inertia()
+                about_cm = M.Shift(M.get_com()).CalcRotationalInertia()
+                moments = about_cm.CalcPrincipalMomentsAndAxesOfInertia()[0]
+                table.add_row(
+                    name,
+                    f"{M.get_mass():.4f}",
+                    " ".join(f"{1e3 * x:+8.2f}" for x in M.get_com()),
+                    " ".join(f"{1e4 * x:9.4f}" for x in moments),
+                )
+        console.print(table)
+        console.print("Centre of mass in the link's frame; principal moments about it.")
+    for remark in left_out:
+        console.print(f"Not in the links: {remark}", soft_wrap=True)
 
 
 def print_compensation(console: Console, path: str, file: GravityCompensationFile) -> None:

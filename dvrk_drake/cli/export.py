@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from typing import TYPE_CHECKING
 
 from dvrk_drake.cli.support import check_output
@@ -15,8 +16,12 @@ if TYPE_CHECKING:
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
     """Adds the verbs and their options."""
-    verb = verbs.add_parser("export", help="write a model as the dVRK controller's file", description=_export_help)
+    verb = verbs.add_parser("export", help="write a model for other programs: SDF, dVRK", description=_export_help)
     verb.add_argument("model", metavar="MODEL", help=_model_help)
+    verb.add_argument(
+        "--sdf", metavar="OUT.sdf", help="the arm with the model's inertias, meshes in a folder beside it"
+    )
+    verb.add_argument("--diff", action="store_true", help="print what differs from the arm's own SDF, line by line")
     verb.add_argument("--dvrk-gc", metavar="OUT.json", help="the controller's gravity compensation of an MTM")
     _add_gc_options(verb.add_argument_group("options of --dvrk-gc"))
     verb.set_defaults(run=_export)
@@ -45,15 +50,37 @@ def _add_gc_options(group: argparse._ArgumentGroup) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    writers = {"dvrk_gc": _write_gc}
+    writers = {"sdf": _write_sdf, "dvrk_gc": _write_gc}
     outputs = {name: path for name in writers if (path := getattr(options, name)) is not None}
-    if not outputs:
+    if not outputs and not options.diff:
         raise DvrkDrakeError(f"nothing to write; name {' or '.join('--' + name.replace('_', '-') for name in writers)}")
     model = _load_model(options.model)
     for path in outputs.values():
         check_output(path, options.model)
     for name, path in outputs.items():
         writers[name](model, path, options)
+    if options.diff:
+        _print_difference(model)
+
+
+def _write_sdf(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.export_tables import print_changed_links
+    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.dynamics.model_links import model_links, not_in_links
+    from dvrk_drake.dynamics.sdf_export import changed_links, write_sdf
+
+    arm, links = model.load_arm(), model_links(model)
+    write_sdf(arm, links, path, options.model)
+    console = make_console()
+    print_changed_links(console, changed_links(arm, links), not_in_links(model))
+    console.print(f"SDF: {path}", soft_wrap=True)
+
+
+def _print_difference(model: IdentifiedModel) -> None:
+    from dvrk_drake.dynamics.model_links import model_links
+    from dvrk_drake.dynamics.sdf_export import sdf_difference
+
+    sys.stdout.write(sdf_difference(model.load_arm(), model_links(model)))
 
 
 def _write_gc(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:

@@ -134,13 +134,12 @@ def inertial_element(inertia: LinkInertia) -> ElementTree.Element:
     p_LoLcm_L = M_LLo_L.get_com()
     I_LLcm_L = M_LLo_L.Shift(p_LoLcm_L).CalcRotationalInertia()
     element = ElementTree.Element("inertial")
-    _add(element, "pose", " ".join(map(_number, [*p_LoLcm_L, 0, 0, 0])))
-    _add(element, "mass", _number(M_LLo_L.get_mass()))
+    _add(element, "pose", " ".join([*_numbers(p_LoLcm_L), "0 0 0"]))
+    _add(element, "mass", repr(M_LLo_L.get_mass()))
     inertia_element = ElementTree.SubElement(element, "inertia")
-    moments, products = I_LLcm_L.get_moments(), I_LLcm_L.get_products()
-    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    for name, value in zip(names, [*moments, *products], strict=True):
-        _add(inertia_element, name, _number(value))
+    values = _numbers([*I_LLcm_L.get_moments(), *I_LLcm_L.get_products()])
+    for name, value in zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), values, strict=True):
+        _add(inertia_element, name, value)
     return element
 
 
@@ -155,15 +154,17 @@ def _set_rotor(root: ElementTree.Element, joint: str, inertia: float) -> None:
         child = element.find(f"{DRAKE}{tag}")
         if child is None:
             child = ElementTree.SubElement(element, f"{DRAKE}{tag}")
-        child.text = _number(value)
+        child.text = repr(value)
 
 
 def _add(parent: ElementTree.Element, tag: str, text: str) -> None:
     ElementTree.SubElement(parent, tag).text = text
 
 
-def _number(x: float) -> str:
-    return repr(float(x)) if x else "0"
+def _numbers(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
+    """In full precision; what is rounding beside the largest of them is 0."""
+    least = 1e-15 * max(abs(x) for x in values)
+    return [repr(float(x)) if abs(x) > least else "0" for x in values]
 
 
 def _same(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
