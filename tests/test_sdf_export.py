@@ -16,9 +16,11 @@ from dvrk_drake.dynamics.inertial_parameters import (
     parameters_from_pseudo_inertia,
 )
 from dvrk_drake.dynamics.sdf_export import changed_links, sdf_difference, write_sdf
+from dvrk_drake.dynamics.urdf_export import to_urdf, write_urdf
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
+from dvrk_drake.models.sdf_model import compose_sdf
 
 
 def perturbed(arm: Arm, seed: int = 0) -> tuple[LinkInertia, ...]:
@@ -106,6 +108,58 @@ def test_a_bare_parser_loads_it_from_anywhere_with_its_meshes(name, tmp_path):
     meshes = [shape.source().path() for shape in shapes]
     assert len(meshes) >= 10
     assert all(mesh.is_relative_to(path.parent) and mesh.is_file() for mesh in meshes)
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_urdf_has_the_equations_of_motion_of_the_sdf(name, tmp_path):
+    arm, path = load_arm(name), tmp_path / "arm.urdf"
+    links = perturbed(arm)
+    write_urdf(arm, links, path, "a test")
+    write_sdf(arm, links, tmp_path / "arm.sdf", "a test")
+    written = dataclasses.replace(arm, sdf=(str(tmp_path / "arm.sdf"),))
+    sdf_plant, (urdf_plant, scene_graph, _) = make_arm_plant(written), parse(path)
+    motion = motion_of(arm)
+    expected = inverse_dynamics(sdf_plant, arm, motion)
+    actual = inverse_dynamics(urdf_plant, arm, motion)
+    assert np.abs((actual - expected) / np.abs(expected).max(axis=0)).max() < 1e-12
+    # The linkage is coupled, and limits, motors, frames and shapes are there.
+    assert urdf_plant.num_constraints() == sdf_plant.num_constraints() > 0
+    assert urdf_plant.num_actuators() == sdf_plant.num_actuators() == arm.num_joints
+    contexts = [plant.CreateDefaultContext() for plant in (sdf_plant, urdf_plant)]
+    for plant, context in zip((sdf_plant, urdf_plant), contexts, strict=True):
+        set_arm_positions(plant, context, arm, motion[0][0])
+    for i, joint_name in enumerate(arm.joint_names):
+        joint = urdf_plant.GetJointByName(joint_name)
+        assert (joint.position_lower_limits()[0], joint.position_upper_limits()[0]) == pytest.approx(
+            (arm.position_lower[i], arm.position_upper[i]), abs=1e-15
+        )
+        assert urdf_plant.GetJointActuatorByName(joint_name).effort_limit() == arm.effort_limits[i]
+    root = compose_sdf(arm.sdf)
+    names = [part.get("name") for tag in ("link", "frame") for part in root.iterfind(f"model/{tag}")]
+    assert "dh_1" in names
+    for frame in names:
+        poses = [
+            plant.GetFrameByName(frame).CalcPoseInWorld(context).GetAsMatrix4()
+            for plant, context in zip((sdf_plant, urdf_plant), contexts, strict=True)
+        ]
+        np.testing.assert_allclose(poses[1], poses[0], rtol=0, atol=1e-12)
+    inspector = scene_graph.model_inspector()
+    assert len(inspector.GetCollisionCandidates()) == 0  # the arm's links are filtered as in the SDF
+
+
+def test_what_urdf_cannot_say_is_refused(tmp_path):
+    sdf = tmp_path / "arm.sdf"
+    arm = load_arm("mtml")
+    write_sdf(arm, [], sdf, "a test")
+    text = sdf.read_text()
+    for old, new, message in (
+        ("<axis>", "<pose>0 0 1 0 0 0</pose><axis>", "joint outer_yaw has a <pose>"),
+        ("<cylinder>", "<plane/><cylinder>", "URDF has no shape like plane"),
+        ('type="revolute"', 'type="screw"', "not screw"),
+    ):
+        sdf.write_text(text.replace(old, new, 1))
+        with pytest.raises(ModelError, match=message):
+            to_urdf(compose_sdf([str(sdf)]), arm)
 
 
 def test_only_what_changed_is_written_anew(tmp_path):

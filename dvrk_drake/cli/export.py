@@ -16,11 +16,14 @@ if TYPE_CHECKING:
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
     """Adds the verbs and their options."""
-    verb = verbs.add_parser("export", help="write a model for other programs: SDF, dVRK", description=_export_help)
+    verb = verbs.add_parser(
+        "export", help="write a model for other programs: SDF, URDF, dVRK", description=_export_help
+    )
     verb.add_argument("model", metavar="MODEL", help=_model_help)
     verb.add_argument(
         "--sdf", metavar="OUT.sdf", help="the arm with the model's inertias, meshes in a folder beside it"
     )
+    verb.add_argument("--urdf", metavar="OUT.urdf", help="the same as URDF, the linkage as mimic joints")
     verb.add_argument("--diff", action="store_true", help="print what differs from the arm's own SDF, line by line")
     verb.add_argument("--dvrk-gc", metavar="OUT.json", help="the controller's gravity compensation of an MTM")
     _add_gc_options(verb.add_argument_group("options of --dvrk-gc"))
@@ -50,7 +53,7 @@ def _add_gc_options(group: argparse._ArgumentGroup) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    writers = {"sdf": _write_sdf, "dvrk_gc": _write_gc}
+    writers = {"sdf": _write_sdf, "urdf": _write_urdf, "dvrk_gc": _write_gc}
     outputs = {name: path for name in writers if (path := getattr(options, name)) is not None}
     if not outputs and not options.diff:
         raise DvrkDrakeError(f"nothing to write; name {' or '.join('--' + name.replace('_', '-') for name in writers)}")
@@ -74,6 +77,14 @@ def _write_sdf(model: IdentifiedModel, path: str, options: argparse.Namespace) -
     console = make_console()
     print_changed_links(console, changed_links(arm, links), not_in_links(model))
     console.print(f"SDF: {path}", soft_wrap=True)
+
+
+def _write_urdf(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
+    from dvrk_drake.dynamics.model_links import model_links
+    from dvrk_drake.dynamics.urdf_export import write_urdf
+
+    write_urdf(model.load_arm(), model_links(model), path, options.model)
+    print(f"URDF: {path}")
 
 
 def _print_difference(model: IdentifiedModel) -> None:
