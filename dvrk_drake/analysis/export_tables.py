@@ -11,6 +11,7 @@ from rich.table import Table
 
 from dvrk_drake.analysis.compensation_comparison import CompensationComparison
 from dvrk_drake.dynamics.gravity_compensation import MTM_JOINTS
+from dvrk_drake.dynamics.kinematic_compensation import ARM_JOINTS, NAMES, KinematicCompensation
 from dvrk_drake.dynamics.sdf_export import LinkChange
 from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
 
@@ -53,6 +54,19 @@ def print_compensation(console: Console, path: str, file: GravityCompensationFil
         )
     console.print(table)
     console.print(f'gravity compensation: {path}; "gravity_compensation" of the arm\'s JSON names it', soft_wrap=True)
+
+
+def print_kinematic_compensation(console: Console, path: str, file: KinematicCompensation) -> None:
+    """The chain's links, and what the file leaves out."""
+    table = _table("link of the chain", "mass [kg]", "cx, cy, cz [mm] in its DH frame")
+    for name, mass, center in zip(NAMES, file.mass, file.center, strict=True):
+        table.add_row(name, f"{mass:.4f}", " ".join(f"{1e3 * x:+8.2f}" for x in center))
+    console.print(table)
+    for name, error, wrist, unit in zip(ARM_JOINTS, file.error, file.wrist, ("N m", "N m", "N"), strict=True):
+        console.print(
+            f"{name}: differs from the model by up to {error:.1e} {unit}, and {wrist:.1e} with the wrist bent"
+        )
+    console.print(f"kinematic gravity compensation: {path}", soft_wrap=True)
 
 
 def print_comparison(console: Console, file_name: str, model_name: str, comparison: CompensationComparison) -> None:

@@ -26,7 +26,8 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--urdf", metavar="OUT.urdf", help="the same as URDF, the linkage as mimic joints")
     verb.add_argument("--diff", action="store_true", help="print what differs from the arm's own SDF, line by line")
     verb.add_argument("--dvrk-gc", metavar="OUT.json", help="the controller's gravity compensation of an MTM")
-    _add_gc_options(verb.add_argument_group("options of --dvrk-gc"))
+    verb.add_argument("--dvrk-kinematic-gc", metavar="OUT.json", help="the controller's gravity compensation of a PSM")
+    _add_gc_options(verb.add_argument_group("options of --dvrk-gc (the first also of --dvrk-kinematic-gc)"))
     verb.set_defaults(run=_export)
 
     verb = verbs.add_parser(
@@ -53,7 +54,7 @@ def _add_gc_options(group: argparse._ArgumentGroup) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    writers = {"sdf": _write_sdf, "urdf": _write_urdf, "dvrk_gc": _write_gc}
+    writers = {"sdf": _write_sdf, "urdf": _write_urdf, "dvrk_gc": _write_gc, "dvrk_kinematic_gc": _write_kinematic}
     outputs = {name: path for name in writers if (path := getattr(options, name)) is not None}
     if not outputs and not options.diff:
         raise DvrkDrakeError(f"nothing to write; name {' or '.join('--' + name.replace('_', '-') for name in writers)}")
@@ -109,6 +110,17 @@ def _write_gc(model: IdentifiedModel, path: str, options: argparse.Namespace) ->
     file = compensation_from_model(model, CompensationOptions(**{k: v for k, v in given.items() if v is not None}))
     file.save(path, model.load_arm().name, f"dvrk-drake export of {options.model}")
     print_compensation(make_console(), path, file)
+
+
+def _write_kinematic(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.export_tables import print_kinematic_compensation
+    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.dynamics.kinematic_compensation import kinematic_compensation
+
+    given = {} if options.gc_tolerance is None else {"tolerance": options.gc_tolerance}
+    file = kinematic_compensation(model, **given)
+    file.save(path)
+    print_kinematic_compensation(make_console(), path, file)
 
 
 def _compare(options: argparse.Namespace) -> None:
