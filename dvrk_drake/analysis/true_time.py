@@ -42,13 +42,13 @@ class TrueTime(NamedTuple):
 def true_time(recording: Recording) -> TrueTime:
     """The times of the rows that say something new, made from q and qd where the recorded ones jitter against those.
 
-    The interval dt_i between two rows maximises the posterior of dq_ij = qd_ij dt_i + noise_j over the joints j whose qd
-    agrees with dq/dt (`velocity_agreement`), with the mean interval as the prior:
+    The interval dt_i between two rows maximises the posterior of dq_ij = qd_ij dt_i + noise_j over the joints j whose
+    qd agrees with dq/dt (`velocity_agreement`), with the mean interval as the prior:
 
         dt_i = (sum_j dq_ij qd_ij / s_j^2 + dt_0 / s^2) / (sum_j qd_ij^2 / s_j^2 + 1 / s^2)
 
-    qd_ij is the mean of both rows; the deviations s_j of the noise and s of the intervals are estimated with it. Its sum
-    is scaled to the recorded duration.
+    qd_ij is the mean of both rows; the deviations s_j of the noise and s of the intervals are estimated with it. Their
+    sum is scaled to the recorded duration.
 
     Raises:
         RecordingError: no times, or they do not increase.
@@ -97,8 +97,8 @@ def increasing_times(recording: Recording) -> NDArray[np.float64]:
     if len(back):
         row = int(back[0]) + 1
         raise RecordingError(
-            f"{recording.where(row)}: t = {recording.t[row]:g} s does not increase, as {recording.t[row - 1]:g} s is in "
-            "the row before; rows must follow in time"
+            f"{recording.where(row)}: t = {recording.t[row]:g} s does not increase, after {recording.t[row - 1]:g} s "
+            "in the row before; rows must follow in time"
         )
     return recording.t
 
