@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +72,7 @@ def default_settings(arm: Arm) -> SignalSettings:
     motion = arm.motion
     return SignalSettings(
         acceleration_cut_off=list(motion.acceleration_cut_off),
-        effort_cut_off=motion.effort_cut_off,
+        effort_cut_off=arm.effort_cut_off,
         effort_delay=list(motion.effort_delay),
     )
 
@@ -87,7 +87,7 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings) -> Mot
         RecordingError: it does not fit the arm, has no times, or is too short or too coarse.
     """
     recording.check_fits(arm)
-    recording = in_actuator_coordinates(recording, arm)
+    recording = recording.in_actuator_coordinates(arm)
     clock = true_time(recording)
     duration = float(clock.t[-1] - clock.t[0])
     rate = (len(recording) - 1) / duration
@@ -111,21 +111,4 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings) -> Mot
         vd=to_joint.velocity(central_difference(central_difference(slow, GRID_RATE), GRID_RATE)),
         row_times=clock.t[np.maximum(last, 0)],
         rate=rate,
-    )
-
-
-def in_actuator_coordinates(recording: Recording, arm: Arm) -> Recording:
-    """The same recording with q, qd and tau of the arm's actuators.
-
-    Raises:
-        RecordingError: wrong number of joints.
-    """
-    joints = recording.in_joint_coordinates(arm)
-    J = arm.transmission
-    return replace(
-        joints,
-        q=J.position(joints.q),
-        qd=None if joints.qd is None else J.velocity(joints.qd),
-        tau=None if joints.tau is None else J.inverse().pull_back_effort(joints.tau),
-        coordinates="actuator",
     )

@@ -12,6 +12,7 @@ from dvrk_drake.analysis.true_time import true_time
 from dvrk_drake.analysis.velocity_agreement import velocity_agreement
 from dvrk_drake.models.recording import Recording
 
+
 @dataclass(frozen=True, eq=False)
 class MotionSignals:
     """A motion at a constant rate, in the coordinates of its recording. SI and radians.

@@ -48,9 +48,7 @@ def velocity_agreement(q: NDArray[np.float64], qd: NDArray[np.float64], rate: fl
     fits = np.array([_fit(v[:, j], qd[:, j], slice(ends, len(q) - ends)) for j in range(q.shape[1])])
     gain, samples, mismatch = fits.T
     lag = samples / rate
-    return VelocityAgreement(
-        gain, lag, mismatch, (np.abs(gain - 1) < GAIN_TOLERANCE) & (np.abs(lag) < LAG_TOLERANCE)
-    )
+    return VelocityAgreement(gain, lag, mismatch, (np.abs(gain - 1) < GAIN_TOLERANCE) & (np.abs(lag) < LAG_TOLERANCE))
 
 
 def _fit(v: NDArray[np.float64], qd: NDArray[np.float64], inner: slice) -> tuple[float, float, float]:

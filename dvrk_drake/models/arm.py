@@ -46,6 +46,7 @@ class Arm:
         gains: default gains of the controller.
         friction_coordinates: name -> (n,) coefficients of the joints: where parts rub beside joints and actuators.
         motion: how the signals of a recorded motion are treated, one value a joint.
+        effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].
     """
 
     name: str
@@ -65,6 +66,7 @@ class Arm:
     gains: Gains
     friction_coordinates: dict[str, NDArray[np.float64]]
     motion: MotionSettings
+    effort_cut_off: float
 
     @property
     def num_joints(self) -> int:
@@ -229,6 +231,7 @@ def _build_arm(
             for name, terms in instrument.friction_coordinates.items()
         },
         motion=motion,
+        effort_cut_off=_checked_cut_off(path, mechanism),
     )
 
 
@@ -259,6 +262,14 @@ def _coupled_limits(path: Path, description: ArmDescription, mechanism: Mechanis
             raise ArmError(f"{path}: coupled_limits.{name} must be [lower, upper] with lower < upper")
         limits[name] = dataclasses.replace(limits[name], lower=bounds[0], upper=bounds[1])
     return tuple(limits.values())
+
+
+def _checked_cut_off(path: Path, mechanism: Mechanism) -> float:
+    if not 0.1 <= mechanism.effort_cut_off <= 1000:
+        raise ArmError(
+            f"{path}: effort_cut_off = {mechanism.effort_cut_off:g} Hz of its mechanism; 0.1..1000 Hz is allowed"
+        )
+    return mechanism.effort_cut_off
 
 
 def _checked_gravity(gravity: Sequence[float]) -> NDArray[np.float64]:

@@ -38,19 +38,21 @@ class MotionSettings:
     """How the signals of a recorded motion are treated; per joint, in the order of the joints that the file has.
 
     `acceleration_cut_off` [Hz] of the low-pass for accelerations, `effort_delay` [s] by which the recorded effort is
-    later than the positions (negative: earlier). Of a mechanism also: `effort_cut_off` [Hz] of the low-pass that efforts
-    are compared behind, and `base_may_tilt`, whether the direction of gravity is estimated from a motion.
+    later than the positions (negative: earlier). Of a mechanism also `base_may_tilt`, whether the direction of gravity is
+    estimated from a motion.
     """
 
     acceleration_cut_off: list[float] = field(default_factory=list)
     effort_delay: list[float] = field(default_factory=list)
-    effort_cut_off: float = 10.0
     base_may_tilt: bool = False
 
 
 @dataclass
 class Mechanism:
-    """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common."""
+    """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common.
+
+    `effort_cut_off` [Hz] is that of the low-pass behind which measured and modelled efforts are compared.
+    """
 
     sdf: str = ""
     joints: list[str] = field(default_factory=list)
@@ -59,6 +61,7 @@ class Mechanism:
     coupled_limits: list[CoupledLimit] = field(default_factory=list)
     loop_closures: list[LoopClosure] = field(default_factory=list)
     motion: MotionSettings = field(default_factory=MotionSettings)
+    effort_cut_off: float = 10.0
 
 
 @dataclass
