@@ -12,11 +12,12 @@ from rich.table import Table
 from dvrk_drake.analysis.compensation_comparison import CompensationComparison
 from dvrk_drake.dynamics.gravity_compensation import MTM_JOINTS
 from dvrk_drake.dynamics.kinematic_compensation import ARM_JOINTS, NAMES, KinematicCompensation
+from dvrk_drake.dynamics.model_links import ModelBodies
 from dvrk_drake.dynamics.sdf_export import LinkChange
 from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
 
 
-def print_changed_links(console: Console, changes: Sequence[LinkChange], left_out: Sequence[str]) -> None:
+def print_changed_links(console: Console, changes: Sequence[LinkChange], bodies: ModelBodies) -> None:
     """Mass, centre of mass and inertia of every changed link, before and after; then what links cannot say."""
     if not changes:
         console.print("All links are as in the arm's own SDF.")
@@ -35,8 +36,11 @@ def print_changed_links(console: Console, changes: Sequence[LinkChange], left_ou
                 )
         console.print(table)
         console.print("Centre of mass in the link's frame; principal moments about it.")
-    for remark in left_out:
-        console.print(f"Not in the links: {remark}", soft_wrap=True)
+    if bodies.rotors:
+        rotors = ", ".join(f"{name} {inertia:.3g}" for name, inertia in bodies.rotors.items())
+        console.print(f"Inertia that motors add to joints [kg m^2; kg if prismatic]: {rotors}", soft_wrap=True)
+    for remark in bodies.left_out:
+        console.print(f"Left out: {remark}", soft_wrap=True)
 
 
 def print_compensation(console: Console, path: str, file: GravityCompensationFile) -> None:

@@ -70,29 +70,31 @@ def _export(options: argparse.Namespace) -> None:
 def _write_sdf(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.export_tables import print_changed_links
     from dvrk_drake.analysis.tables import make_console
-    from dvrk_drake.dynamics.model_links import model_links, not_in_links
+    from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.dynamics.sdf_export import changed_links, write_sdf
 
-    arm, links = model.load_arm(), model_links(model)
-    write_sdf(arm, links, path, options.model)
+    arm, bodies = model.load_arm(), model_bodies(model)
+    write_sdf(arm, bodies.links, path, options.model, bodies.rotors)
     console = make_console()
-    print_changed_links(console, changed_links(arm, links), not_in_links(model))
+    print_changed_links(console, changed_links(arm, bodies.links), bodies)
     console.print(f"SDF: {path}", soft_wrap=True)
 
 
 def _write_urdf(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
-    from dvrk_drake.dynamics.model_links import model_links
+    from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.dynamics.urdf_export import write_urdf
 
-    write_urdf(model.load_arm(), model_links(model), path, options.model)
+    bodies = model_bodies(model)
+    write_urdf(model.load_arm(), bodies.links, path, options.model, bodies.rotors)
     print(f"URDF: {path}")
 
 
 def _print_difference(model: IdentifiedModel) -> None:
-    from dvrk_drake.dynamics.model_links import model_links
+    from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.dynamics.sdf_export import sdf_difference
 
-    sys.stdout.write(sdf_difference(model.load_arm(), model_links(model)))
+    bodies = model_bodies(model)
+    sys.stdout.write(sdf_difference(model.load_arm(), bodies.links, bodies.rotors))
 
 
 def _write_gc(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:

@@ -19,7 +19,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
-from dvrk_drake.dynamics.model_links import model_links
+from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.plant import make_arm_plant
@@ -104,7 +104,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
     # (m, 3, 7, 4) torque on yaw, pitch and insertion per mass and first moment of each link of the chain.
     frames = [_frames(alpha, A, theta, D, pose) for pose in straight[:, :3]]
     Y = np.array([_regressor(X, arm.gravity) for X in frames])
-    mass, moment = _prior(model_links(model), plant, _frames(alpha, A, theta, D, np.zeros(3)))
+    mass, moment = _prior(model_bodies(model).links, plant, _frames(alpha, A, theta, D, np.zeros(3)))
     lifted = Y[:, 2, _LAST, 0]
     mass_7 = float(lifted @ tau[:, 2] / (lifted @ lifted))
     if not mass_7 > 0:
