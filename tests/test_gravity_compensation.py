@@ -11,10 +11,12 @@ import pytest
 from dvrk_drake.analysis.compensation_comparison import compare_compensation
 from dvrk_drake.analysis.compensation_plot import plot_compensation
 from dvrk_drake.cli import main
+from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
 from dvrk_drake.dynamics.gravity_compensation import (
     CompensationOptions,
     compensation_from_model,
     controller_torque,
+    dry_friction,
     unclipped_torque,
 )
 from dvrk_drake.dynamics.identified_model import EffectEstimate, IdentifiedModel
@@ -145,6 +147,21 @@ def test_friction_is_half_of_what_separates_the_two_directions(tmp_path):
     up, rest, down = (np.array(dvrk_controller(path, q, [v] * 7)) for v in (1.0, 0.0, -1.0))
     np.testing.assert_allclose(up - rest, coulomb, atol=1e-12)
     np.testing.assert_allclose(rest - down, coulomb, atol=1e-12)
+
+
+def test_friction_of_a_models_dynamics_is_what_a_joint_feels_that_moves_alone():
+    model = balanced()
+    with pytest.raises(ModelError, match="no dynamics"):
+        dry_friction(model)
+    model.dynamics = DynamicSection(
+        effects=[
+            ActuatorEffectEstimate("actuator.outer_yaw", "coulomb", 0.1, 0.05),
+            ActuatorEffectEstimate("actuator.outer_yaw", "presliding", 0.01, 0.02),
+            ActuatorEffectEstimate("actuator.outer_yaw", "viscous", 0.0, 9.0),
+            ActuatorEffectEstimate("actuator.wrist_platform", "coulomb", 0.1, 0.01),  # turned by joints 3 and 4
+        ]
+    )
+    np.testing.assert_allclose(dry_friction(model), [0.07, 0, 0.006697, 0.01, 0, 0, 0], rtol=0, atol=1e-15)
 
 
 def test_limits_hold_what_is_needed_and_what_the_motors_have():

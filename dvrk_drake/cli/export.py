@@ -44,8 +44,9 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 def _add_gc_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--gc-tolerance", type=float, metavar="NM", help=_tolerance_help)
+    group.add_argument("--friction", action="store_true", help="compensate the dry friction of the model's dynamics")
     for name, text in (
-        ("--coulomb", "dry friction of the joints [N m]; default: none"),
+        ("--coulomb", "dry friction of the joints [N m], instead of --friction; default: none"),
         ("--friction-ratio", "share 0..1 of it to compensate; default: as in files in use"),
         ("--dead-band", "speeds up to which it is not [rad/s]; default: likewise"),
         ("--saturation", "speeds from which it is in full [rad/s]; default: likewise"),
@@ -100,11 +101,13 @@ def _print_difference(model: IdentifiedModel) -> None:
 def _write_gc(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.export_tables import print_compensation
     from dvrk_drake.analysis.tables import make_console
-    from dvrk_drake.dynamics.gravity_compensation import CompensationOptions, compensation_from_model
+    from dvrk_drake.dynamics.gravity_compensation import CompensationOptions, compensation_from_model, dry_friction
 
+    if options.friction and options.coulomb is not None:
+        raise DvrkDrakeError("--friction and --coulomb both say how large friction is; give one")
     given = {
         "tolerance": options.gc_tolerance,
-        "coulomb": options.coulomb,
+        "coulomb": dry_friction(model) if options.friction else options.coulomb,
         "friction_ratio": options.friction_ratio,
         "dead_band": options.dead_band,
         "saturation": options.saturation,

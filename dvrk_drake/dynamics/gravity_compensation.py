@@ -8,12 +8,15 @@ import numpy as np
 from numpy.polynomial import Polynomial, chebyshev
 from numpy.typing import ArrayLike, NDArray
 
+from dvrk_drake.dynamics.actuator_effects import effect_coordinates
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.joint_effects import EFFECT_KINDS
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.gravity_compensation_file import NUM_JOINTS, NUM_PARAMETERS, GravityCompensationFile
 
+#: Effects of a drive that stay when it slides slowly.
+DRY_KINDS = ("coulomb", "presliding")
 #: What the controller multiplies its ten columns of gravity with [m/s^2].
 CONTROLLER_GRAVITY = 9.81
 NUM_GRAVITY = 10
@@ -149,6 +152,26 @@ def compensation_from_model(
     )
     file.check()
     return file
+
+
+def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
+    """Coulomb friction [N m] that each joint feels when it alone moves, from the effects of the model's dynamics.
+
+    Smoothed Coulomb terms and presliding elements, which friction is once they slip, add up; along a coordinate of the
+    drive that several joints move, each of them feels its share.
+
+    Raises:
+        ModelError: the model has no dynamics.
+    """
+    if model.dynamics is None:
+        raise ModelError("the model has no dynamics, so it knows no friction; give it with --coulomb")
+    arm = model.load_arm()
+    rows = effect_coordinates(arm)
+    friction = np.zeros(arm.num_joints)
+    for effect in model.dynamics.effects:
+        if effect.kind in DRY_KINDS:
+            friction += effect.value * np.abs(rows[effect.coordinate] @ arm.transmission.matrix)
+    return tuple(float(f) for f in friction)
 
 
 def _gravity_parameters(model: IdentifiedModel) -> NDArray[np.float64]:
