@@ -1,6 +1,7 @@
 """SDF written from inertial parameters: any reader gets the same arm, and the same equations of motion."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from dvrk_drake.dynamics.urdf_export import to_urdf, write_urdf
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
-from dvrk_drake.models.sdf_model import compose_sdf
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 
 
 def perturbed(arm: Arm, seed: int = 0) -> tuple[LinkInertia, ...]:
@@ -175,6 +176,25 @@ def test_only_what_changed_is_written_anew(tmp_path):
     before = next(link for link in links if link.link == "forearm_link").parameters[0]
     assert f"-        <mass>{before:g}</mass>" in changed and f"+        <mass>{2 * before:g}</mass>" in changed
     assert all("mass" in line or "i" in line for line in changed) and len(changed) <= 18
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_an_arm_file_can_name_the_written_sdf(name, tmp_path):
+    """The recipe of docs/export.md."""
+    arm = load_arm(name)
+    write_sdf(arm, perturbed(arm), tmp_path / "identified.sdf", "a test")
+    text = (MODELS_FOLDER / "arms" / f"{name}.yaml").read_text()
+    for kind, part, sdf in (("mechanism", name[:3], "sdf: identified.sdf"), ("instrument", "large_needle_driver", "")):
+        if f"{kind}: {part}" in text:
+            copied = (MODELS_FOLDER / f"{kind}s" / f"{part}.yaml").read_text()
+            (tmp_path / f"{kind}.yaml").write_text(re.sub("^sdf: .*$", sdf, copied, flags=re.MULTILINE))
+            text = text.replace(f"{kind}: {part}", f"{kind}: {kind}.yaml")
+    (tmp_path / "arm.yaml").write_text(text)
+    own = load_arm(str(tmp_path / "arm.yaml"))
+    assert own.joint_names == arm.joint_names and own.sdf == (str(tmp_path / "identified.sdf"),)
+    np.testing.assert_array_equal(own.transmission.matrix, arm.transmission.matrix)
+    for expected, link in zip(perturbed(arm), link_inertias(own), strict=True):
+        np.testing.assert_allclose(link.parameters, expected.parameters, rtol=0, atol=1e-14)
 
 
 def test_rotor_inertia_is_what_it_adds_to_the_mass_matrix(tmp_path):

@@ -36,7 +36,7 @@ class JointComparison:
         opposed: share of poses at which file (clipped) and model push opposite ways, both by more than a tenth of the
             model's largest torque.
         runaway: share of poses at which the file (unclipped) lies outside the model's range widened by half of it on
-            both sides: a torque that gravity has nowhere on this joint.
+            both sides: a torque that the model has nowhere on this joint. Not of the last joint, which no file has.
         polynomial: largest |torque| of the file's polynomial in the joint's own position, constant left out.
         rms_inside, rms_outside: RMS of file (clipped) less model inside and outside of the sweep that the file says
             its data are from; if it does not say, all poses are outside. NaN where there are no such poses.
@@ -104,12 +104,15 @@ def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) 
     clipped = tau_raw != tau_clipped
     opposed = (tau_model * tau_clipped < 0) & (np.abs(tau_model) > least) & (np.abs(tau_clipped) > least)
     runaway = (tau_raw < tau_model.min(axis=0) - half_range) | (tau_raw > tau_model.max(axis=0) + half_range)
-    runaway &= half_range > 1e-9  # a joint without gravity has no range to leave
-    opposed &= half_range > 1e-9
+    # A joint without gravity has no range to leave, and for the last joint the file says nothing.
+    judged = (half_range > 1e-9) & (np.arange(NUM_JOINTS) < NUM_JOINTS - 1)
+    runaway, opposed = runaway & judged, opposed & judged
     in_sweep = np.zeros(len(q), dtype=bool)
     if file.sweep is not None:
         # The last joint does not enter the file's torque.
-        in_sweep = np.all((q >= file.sweep[0]) & (q <= file.sweep[1]), axis=1, where=np.arange(NUM_JOINTS) < 6)
+        in_sweep = np.all(
+            (q >= file.sweep[0]) & (q <= file.sweep[1]), axis=1, where=np.arange(NUM_JOINTS) < NUM_JOINTS - 1
+        )
     polynomial = _polynomial_torque(file, q)
     error = tau_clipped - tau_model
     joints = [

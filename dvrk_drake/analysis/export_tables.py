@@ -83,9 +83,9 @@ def print_comparison(console: Console, file_name: str, model_name: str, comparis
     for j in comparison.joints:
         table.add_row(
             j.name,
-            f"{j.model_lower:+.3f}..{j.model_upper:+.3f}",
-            f"{j.file_lower:+.3f}..{j.file_upper:+.3f}",
-            f"{j.clip_lower:+.3f}..{j.clip_upper:+.3f}",
+            _range(j.model_lower, j.model_upper),
+            _range(j.file_lower, j.file_upper),
+            _range(j.clip_lower, j.clip_upper),
             *(f"{100 * share:.0f} %" if share else "" for share in (j.clipped, j.runaway, j.opposed)),
             f"{_number(j.rms_inside)} | {_number(j.rms_outside)}",
         )
@@ -112,6 +112,10 @@ def _sweep(comparison: CompensationComparison) -> str:
     if comparison.file.sweep is None:
         return "it does not say"
     return f"{100 * comparison.in_sweep.mean():.0f} % of the joint box"
+
+
+def _range(lower: float, upper: float) -> str:
+    return "..".join(f"{round(x, 3) + 0.0:+.3f}" for x in (lower, upper))
 
 
 def _number(x: float) -> str:
