@@ -111,22 +111,19 @@ def _parents_first(links: list[str], inboard: dict[str, Joint]) -> tuple[str, ..
 
 def _axis(joint: Joint) -> NDArray[np.float64]:
     """(3,) unit axis of a joint in its frames F and M alike; zero for a weld."""
-    axis = {
-        "revolute": lambda: joint.revolute_axis(),
-        "prismatic": lambda: joint.translation_axis(),
-        "weld": lambda: np.zeros(3),
-    }.get(joint.type_name())
-    if axis is None:
-        raise ArmError(f"joint {joint.name()} is {joint.type_name()}; allowed: revolute, prismatic, fixed")
-    return axis()
+    match joint.type_name():
+        case "revolute":
+            return joint.revolute_axis()
+        case "prismatic":
+            return joint.translation_axis()
+        case "weld":
+            return np.zeros(3)
+    raise ArmError(f"joint {joint.name()} is {joint.type_name()}; allowed: revolute, prismatic, fixed")
 
 
 def _pose_terms(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
     """(4, 3, 4) T0..T3 of X_PC = X_PF X_FM(x) X_MC; the pose in the base where the parent is anchored to it."""
-    if joint.type_name() == "weld":
-        X_FM = joint.X_FM()
-    else:
-        X_FM = RigidTransform()
+    X_FM = joint.X_FM() if joint.type_name() == "weld" else RigidTransform()
     X_PF, X_MC = _pose_in_parent(plant, joint), joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     x, y, z = _axis(joint)
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -135,7 +135,7 @@ def _add_acceleration(H, joint, V, A):  # pragma: no cover
 
 @_compiled
 def _origin_motion(V, A, motion):  # pragma: no cover
-    """Angular velocity, angular acceleration, and acceleration of the origin less gravity: the spatial one plus w x v."""
+    """Angular velocity and acceleration, and that of the origin less gravity: the spatial one plus w x v."""
     for s in range(BLOCK):
         wx, wy, wz = V[s], V[BLOCK + s], V[2 * BLOCK + s]
         ux, uy, uz = V[3 * BLOCK + s], V[4 * BLOCK + s], V[5 * BLOCK + s]
