@@ -19,8 +19,8 @@ from dvrk_drake.models.plant import make_arm_plant
 
 def of_points(p, masses):
     """The parameters from their definition, sums over point masses p (k, 3)."""
-    I = sum(m * ((x @ x) * np.eye(3) - np.outer(x, x)) for m, x in zip(masses, p, strict=True))
-    return np.array([masses.sum(), *(masses @ p), *np.diag(I), I[0, 1], I[0, 2], I[1, 2]])
+    inertia = sum(m * ((x @ x) * np.eye(3) - np.outer(x, x)) for m, x in zip(masses, p, strict=True))
+    return np.array([masses.sum(), *(masses @ p), *np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]])
 
 
 @pytest.fixture

@@ -113,7 +113,7 @@ class DynamicRegressor:
 
         def fill(start: int, stop: int) -> None:
             # A part at a time, where the caches hold it: Y itself goes to memory once and in order.
-            part = np.empty((min(_CHUNK, stop - start), *Y.shape[1:]))
+            part = np.zeros((min(_CHUNK, stop - start), *Y.shape[1:]))
             for first in range(start, stop, _CHUNK):
                 chunk = slice(first, min(first + _CHUNK, stop))
                 q, v, vd = (x[chunk] for x in motion)

@@ -31,7 +31,7 @@ def fill_regressor(coordinates, vd, gravity, parents, pose_terms, hinges, G, aff
         gravity: (3,) in the base frame.
         parents, pose_terms, hinges, G, affects: as in `KinematicTree`.
         rotors: (r, 2, n) rows a, b: the torque is a (b . vd) + b (a . vd) per unit of the parameter.
-        out: written to.
+        out: zeros, or what an earlier call for the same arm left: where a joint moves no link or rotor, 0 stays.
     """
     num_links, n = G.shape
     V, A = np.empty((num_links, 6 * BLOCK)), np.empty((num_links, 6 * BLOCK))
@@ -56,15 +56,13 @@ def fill_regressor(coordinates, vd, gravity, parents, pose_terms, hinges, G, aff
             _add_acceleration(hinges[i], joint, V[i], A[i])
             _origin_motion(V[i], A[i], motion)
             for j in range(n):
-                if not affects[i, j]:
-                    rows[:] = 0.0
-                else:
+                if affects[i, j]:
                     _to_child(X, J[parent, j] if parent >= 0 and affects[parent, j] else at_rest, J[i, j])
                     _add_column(hinges[i], G[i, j], J[i, j])
                     _torque_per_parameter(J[i, j], motion, rows)
-                for s in range(count):
-                    for k in range(10):
-                        out[start + s, j, 10 * i + k] = rows[k * BLOCK + s]
+                    for s in range(count):
+                        for k in range(10):
+                            out[start + s, j, 10 * i + k] = rows[k * BLOCK + s]
     _fill_rotors(rotors, vd, 10 * num_links, out)
 
 
@@ -172,11 +170,17 @@ def _torque_per_parameter(J, motion, rows):  # pragma: no cover
 @_compiled
 def _fill_rotors(rotors, vd, first_column, out):  # pragma: no cover
     m, n = vd.shape
-    for s in range(m):
-        for k in range(len(rotors)):
-            a_vd, b_vd = 0.0, 0.0
-            for j in range(n):
-                a_vd += rotors[k, 0, j] * vd[s, j]
-                b_vd += rotors[k, 1, j] * vd[s, j]
-            for j in range(n):
-                out[s, j, first_column + k] = rotors[k, 0, j] * b_vd + rotors[k, 1, j] * a_vd
+    a_vd, b_vd = np.empty(m), np.empty(m)
+    for k in range(len(rotors)):
+        a, b = rotors[k]
+        a_vd[:] = 0.0
+        b_vd[:] = 0.0
+        for j in range(n):
+            if a[j] != 0.0 or b[j] != 0.0:
+                for s in range(m):
+                    a_vd[s] += a[j] * vd[s, j]
+                    b_vd[s] += b[j] * vd[s, j]
+        for j in range(n):
+            if a[j] != 0.0 or b[j] != 0.0:
+                for s in range(m):
+                    out[s, j, first_column + k] = a[j] * b_vd[s] + b[j] * a_vd[s]
