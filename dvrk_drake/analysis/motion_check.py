@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.effort_lag import EffortLag, effort_lag
+from dvrk_drake.analysis.effort_lag import LAG_STEP, LONGEST_LAG, EffortLag, effort_lag
 from dvrk_drake.analysis.low_pass import resample
 from dvrk_drake.analysis.motion_signals import MotionSignals, motion_signals
 from dvrk_drake.analysis.noise import cut_offs, narrow_band, spectra
@@ -25,8 +25,8 @@ LEAST_REPEATED = 0.005
 GAP, LEAST_GAP = 5.0, LONGEST_PERIOD
 #: A clock that is off by more than this share of an interval is worth a line.
 LEAST_JITTER = 0.05
-#: Friction takes work: less than minus this share is a wrong sign. Judged over so many passes of a joint's range.
-OPPOSITE, LEAST_PASSES = 0.05, 5.0
+#: Friction takes work: less than minus this share is odd. Its size must be so many standard errors from 0.
+OPPOSITE, LEAST_ERRORS = 0.05, 3.0
 #: Joints whose speeds correlate more can hardly be told apart.
 TOGETHER = 0.95
 #: Shorter motions are too short to judge lags and noise [s].
@@ -54,7 +54,7 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
     names = arm.joint_names
     work = _work(signals)
     findings += _velocities(agreement, names) + _lags(lags, names) + _together(signals, moving, names)
-    findings += _signs(work, signals, moving, names)
+    findings += _signs(work, lags, names)
     even = t[0] + np.arange(len(t)) * (duration / (len(t) - 1))
     rows = actuators if np.ptp(np.diff(t)) < 1e-3 / rate else _resampled(actuators, even)
     period = find_period(rows.q, rate)
@@ -140,9 +140,12 @@ def _velocities(agreement: VelocityAgreement | None, names: tuple[str, ...]) -> 
 def _lags(lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
     findings = []
     for j in np.flatnonzero(lags.determined):
-        lag, error = 1e3 * lags.lag[j], 1e3 * lags.standard_error[j]
-        what = f"tau{j + 1} is {lag:.1f} ms (standard error {error:.1f}) {'late' if lag > 0 else 'early'}"
-        advice = "shift it before a fit"
+        lag, error = 1e3 * float(lags.lag[j]), 1e3 * float(lags.standard_error[j])
+        size = f"{abs(lag):.1f} ms (standard error {error:.1f})"
+        if abs(lags.lag[j]) > LONGEST_LAG - LAG_STEP:
+            size = f"{1e3 * LONGEST_LAG:.0f} ms or more"
+        what = f"tau{j + 1} looks {size} {'late' if lag > 0 else 'early'}"
+        advice = "a delay, or friction that builds up over some way: fit hysteresis before you shift it"
         findings.append(Finding("note", "effort lag", names[j], what, advice, (int(j),), float(lags.lag[j])))
     return findings
 
@@ -169,14 +172,14 @@ def _work(signals: MotionSignals) -> NDArray[np.float64]:
         return np.asarray(np.mean(signals.tau * signals.v, axis=0) / size)
 
 
-def _signs(
-    work: NDArray[np.float64], signals: MotionSignals, moving: NDArray[np.bool_], names: tuple[str, ...]
-) -> list[Finding]:
-    # Over few passes, the energy that gravity gives and takes need not cancel.
-    passes = np.sum(np.abs(np.diff(signals.q, axis=0)), axis=0) / np.maximum(np.ptp(signals.q, axis=0), 1e-9)
+def _signs(work: NDArray[np.float64], lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
+    # Work alone does not tell: through the other joints gravity and inertia may give it too. Nor does friction alone.
     findings = []
-    for j in np.flatnonzero(moving & (passes > LEAST_PASSES) & (work < -OPPOSITE)):
-        what = f"the motor takes work out of the motion ({work[j]:.2f} of rms(tau) rms(v)), which friction never gives"
+    for j in np.flatnonzero((work < -OPPOSITE) & (lags.coulomb < -LEAST_ERRORS * lags.coulomb_error)):
+        what = (
+            f"its motor takes work out of the motion ({work[j]:.2f} of rms(tau) rms(v)) and its friction pushes "
+            f"({lags.coulomb[j]:.3g} N m or N)"
+        )
         advice = f"tau{j + 1} or the direction of q{j + 1} has the wrong sign: efforts are positive towards +q"
         findings.append(Finding("refusal", "effort sign", names[j], what, advice, (int(j),), float(work[j])))
     return findings
@@ -206,7 +209,7 @@ def _noise(
         return replace(report, joints=tuple(joints)), [Finding("note", "no repetition", "motion", what, advice)]
     floor = repeatability_floor(tau, rate, period, arm.effort_cut_off)
     joints = [replace(joint, floor=float(value)) for joint, value in zip(joints, floor, strict=True)]
-    what = f"repeats every {period:.4f} s ({1 / period:.4f} Hz), {report.duration / period if report.duration else 0:.1f} times"
+    what = f"repeats every {period:.4f} s ({1 / period:.4f} Hz), {len(tau) / rate / period:.1f} times"
     advice = "compare that with the frequency that was asked for; the floor is the least error of any model"
     findings = [Finding("note", "repetition", "motion", what, advice, size=period)]
     for j, name in enumerate(arm.joint_names):
