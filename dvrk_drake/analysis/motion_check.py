@@ -25,8 +25,9 @@ LEAST_REPEATED = 0.005
 GAP, LEAST_GAP = 5.0, LONGEST_PERIOD
 #: A clock that is off by more than this share of an interval is worth a line.
 LEAST_JITTER = 0.05
-#: Friction takes work: less than minus this share is odd. Its size must be so many standard errors from 0.
-OPPOSITE, LEAST_ERRORS = 0.05, 3.0
+#: A sign is wrong if Coulomb friction is so many standard errors below 0; or if the motor's work is below minus this
+#: share, and Coulomb friction not so many above 0.
+SURE, OPPOSITE, DOUBTFUL = 5.0, 0.05, 2.0
 #: Joints whose speeds correlate more can hardly be told apart.
 TOGETHER = 0.95
 #: Shorter motions are too short to judge lags and noise [s].
@@ -173,15 +174,18 @@ def _work(signals: MotionSignals) -> NDArray[np.float64]:
 
 
 def _signs(work: NDArray[np.float64], lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
-    # Work alone does not tell: through the other joints gravity and inertia may give it too. Nor does friction alone.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        errors = lags.coulomb / lags.coulomb_error
+    # Work alone does not tell: gravity and inertia may give it through the other joints.
+    wrong = (errors < -SURE) | ((work < -OPPOSITE) & (errors < DOUBTFUL))
     findings = []
-    for j in np.flatnonzero((work < -OPPOSITE) & (lags.coulomb < -LEAST_ERRORS * lags.coulomb_error)):
+    for j in np.flatnonzero(wrong):
         what = (
-            f"its motor takes work out of the motion ({work[j]:.2f} of rms(tau) rms(v)) and its friction pushes "
-            f"({lags.coulomb[j]:.3g} N m or N)"
+            f"friction pushes instead of braking: Coulomb {lags.coulomb[j]:.2g} ({errors[j]:.1f} standard errors), "
+            f"work {work[j]:.2f}"
         )
         advice = f"tau{j + 1} or the direction of q{j + 1} has the wrong sign: efforts are positive towards +q"
-        findings.append(Finding("refusal", "effort sign", names[j], what, advice, (int(j),), float(work[j])))
+        findings.append(Finding("refusal", "effort sign", names[j], what, advice, (int(j),), float(lags.coulomb[j])))
     return findings
 
 
