@@ -12,9 +12,12 @@ from dvrk_drake.analysis.low_pass import low_pass
 from dvrk_drake.analysis.recording_check import check_recording
 from dvrk_drake.analysis.true_time import true_time
 from dvrk_drake.cli import main
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.lcm_log import LcmEvent, event_bytes
+from dvrk_drake.models.lcm_messages import status_channel
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
-from dvrk_drake.models.recording import Recording, write_recording
+from dvrk_drake.models.recording import Recording, read_recording, write_recording
 
 ARMS = "psm", "mtmr"
 
@@ -127,6 +130,7 @@ def test_gap_in_time():
     gap = found(cut)["gaps"][0]
     assert gap.size == pytest.approx(101 / RATE, abs=1e-9)
     assert "row 1001" in gap.what
+    assert set(found(cut)) == {"gaps", "repetition"}
 
 
 def test_times_that_go_back_are_refused():
@@ -160,6 +164,11 @@ def test_velocities_that_disagree(gain, lag):
     report = check_recording(late, load_arm("mtmr"))
     assert report.joints[5].velocity_gain == pytest.approx(gain, rel=5e-3)
     assert report.joints[5].velocity_lag == pytest.approx(lag, abs=3e-4)
+
+
+def test_velocities_that_are_always_zero():
+    whole = clean_motion()
+    assert len(found(replace(whole, qd=0 * whole.qd))["velocity disagrees"]) == 7
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -196,8 +205,8 @@ def test_narrow_band_noise():
     assert bands[0].size == pytest.approx(0.15, rel=0.15)
 
 
-def test_cut_off_is_where_a_known_signal_falls_under_a_known_noise():
-    """The fifth harmonic of 1/6 Hz is the last of the motion: smooth efforts have nothing above; friction has."""
+def test_louder_noise_lowers_the_cut_off_to_what_moves():
+    """The motion ends at its fifth harmonic, 0.83 Hz; only friction's reversals are above."""
     report = check_recording(clean_motion(), load_arm("psm"))
     louder = changed(
         clean_motion(), "tau", 0, lambda x: x + np.random.default_rng(8).normal(size=len(x)) * 0.5 * np.std(x)
@@ -315,6 +324,40 @@ def test_no_efforts():
 def test_a_motion_without_velocities():
     kinds = found(replace(clean_motion(), qd=None))
     assert set(kinds) == {"no velocities", "repetition"}
+
+
+@pytest.mark.parametrize("rows", [1, 2, 99, 100, 150, 600, 1010, 1500, 2100])
+def test_short_recordings_are_not_refused(rows):
+    whole = clean_motion()
+    short = replace(whole, q=whole.q[:rows], qd=whole.qd[:rows], tau=whole.tau[:rows], t=whole.t[:rows])
+    assert check_recording(short, load_arm("psm")).refusals == ()
+
+
+def test_nothing_moves_and_nothing_pulls():
+    whole = clean_motion()
+    still = replace(whole, q=whole.q * 0 + whole.q[0], qd=0 * whole.qd, tau=0 * whole.tau)
+    assert set(found(still)) == {"never moves", "no effort", "no repetition"}
+
+
+def test_lcm_log(tmp_path):
+    arm, whole = load_arm("psm"), clean_motion()
+    events = []
+    for row in range(len(whole)):
+        status = Status()
+        status.utime, status.sequence, status.session_id = 1 + round(1e6 * whole.t[row]), row, 1
+        status.arm_name, status.num_joints, status.guard_state = arm.name, arm.num_joints, Status.STATE_HOLD
+        status.position, status.velocity = whole.q[row].tolist(), whole.qd[row].tolist()
+        status.effort_measured, status.joint_flags = whole.tau[row].tolist(), [0] * arm.num_joints
+        status.position_commanded, status.effort_commanded = status.position, status.effort_measured
+        events.append(event_bytes(LcmEvent(row, status.utime, status_channel(arm), status.encode())))
+    (tmp_path / "arm.log").write_bytes(b"".join(events))
+    report = check_recording(read_recording(tmp_path / "arm.log", arm), arm)
+    assert report.kind == "motion"
+    assert [finding.kind for finding in report.findings] == ["repetition"]
+    assert report.period == pytest.approx(PERIOD, abs=1e-3)
+    (tmp_path / "cut.log").write_bytes(b"".join(events)[:-10])
+    report = check_recording(read_recording(tmp_path / "cut.log", arm), arm)
+    assert {finding.kind for finding in report.findings} == {"reading", "repetition"}
 
 
 # The command.

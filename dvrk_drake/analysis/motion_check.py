@@ -21,6 +21,8 @@ from dvrk_drake.models.recording import REST_SPEED, Recording
 
 #: Below this share, repeated rows are chance.
 LEAST_REPEATED = 0.005
+#: A block of channels that repeats itself in so much more rows comes from a slower topic.
+LEAST_EXTRA = 0.05
 #: A gap: an interval of so many median ones, and at least this long [s].
 GAP, LEAST_GAP = 5.0, LONGEST_PERIOD
 #: A clock that is off by more than this share of an interval is worth a line.
@@ -30,17 +32,19 @@ LEAST_JITTER = 0.05
 SURE, OPPOSITE, DOUBTFUL = 5.0, 0.05, 2.0
 #: Joints whose speeds correlate more can hardly be told apart.
 TOGETHER = 0.95
-#: Shorter motions are too short to judge lags and noise [s].
-LEAST_DURATION = 5.0
+#: Shorter motions are too short to judge lags, signs and noise [s].
+LEAST_DURATION = 10.0
 
 
 def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tuple[RecordingReport, list[Finding]]:
     """The report with the motion's numbers, and what was found. t increases, and q, qd and t are in one system."""
-    actuators = recording.in_actuator_coordinates(arm)
+    interval = float(np.median(np.diff(np.asarray(recording.t))))
+    gaps = _gaps(np.asarray(recording.t), interval)
+    actuators = _longest_piece(recording.in_actuator_coordinates(arm), gaps)
     clock = true_time(actuators)
-    t = np.asarray(recording.t)
-    duration, rate = float(t[-1] - t[0]), 1 / float(np.median(np.diff(t)))
-    findings = [*_rows(actuators, clock), *_gaps(recording, 1 / rate)]
+    t = np.asarray(actuators.t)
+    duration, rate = float(t[-1] - t[0]), 1 / interval
+    findings = [*_rows(actuators, clock), *_gap_findings(recording, gaps)]
     report = replace(
         report, rate=rate, duration=duration, jitter=clock.jitter, repeated=float(np.mean(repeated_rows(actuators)))
     )
@@ -91,7 +95,8 @@ def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
         advice = "a slower topic was polled: they are left out, and true times are made; record each message once"
         findings.append(Finding("warning", "repeated rows", "rows", what, advice, size=whole))
     for name, share in blocks.items():
-        if share > whole + max(0.05, LEAST_REPEATED):
+        # What never changes is said elsewhere.
+        if whole + LEAST_EXTRA < share < 1 - 2 / len(actuators):
             what = f"{share:.1%} of the rows repeat {name} but not the rest"
             advice = "it comes from a slower topic than the rest, and is up to one of its intervals late"
             findings.append(Finding("warning", "repeated channel", name, what, advice, size=share))
@@ -102,14 +107,32 @@ def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
     return findings
 
 
-def _gaps(recording: Recording, interval: float) -> list[Finding]:
-    intervals = np.diff(np.asarray(recording.t))
-    gaps = np.flatnonzero(intervals > max(GAP * interval, LEAST_GAP))
+def _gaps(t: NDArray[np.float64], interval: float) -> NDArray[np.int_]:
+    """Rows before a gap."""
+    return np.flatnonzero(np.diff(t) > max(GAP * interval, LEAST_GAP))
+
+
+def _longest_piece(recording: Recording, gaps: NDArray[np.int_]) -> Recording:
+    edges = np.concatenate([[0], gaps + 1, [len(recording)]])
+    longest = int(np.argmax(np.diff(edges)))
+    rows = slice(edges[longest], edges[longest + 1])
+    return replace(
+        recording,
+        q=recording.q[rows],
+        qd=None if recording.qd is None else recording.qd[rows],
+        tau=recording.measured_effort()[rows],
+        t=np.asarray(recording.t)[rows],
+        lines=None if recording.lines is None else recording.lines[rows],
+    )
+
+
+def _gap_findings(recording: Recording, gaps: NDArray[np.int_]) -> list[Finding]:
     if not len(gaps):
         return []
+    intervals = np.diff(np.asarray(recording.t))
     largest = int(gaps[np.argmax(intervals[gaps])])
     what = f"{len(gaps)} gaps, the largest {intervals[largest]:.3g} s before {recording.where(largest + 1)}"
-    advice = "nobody knows what the arm did meanwhile: split the recording there"
+    advice = "nobody knows what the arm did meanwhile: split it there; signals are checked in the longest piece"
     return [Finding("warning", "gaps", "t", what, advice, size=float(intervals[largest]))]
 
 
