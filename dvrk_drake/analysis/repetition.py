@@ -60,7 +60,7 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
 def repeatability_floor(
     tau: NDArray[np.float64], rate: float, period: float, cut_off: ArrayLike
 ) -> NDArray[np.float64]:
-    """How badly the arm repeats its efforts: no model that knows only q, v and vd has a smaller error [1].
+    """How badly the arm repeats its efforts [1]: about the least relative error of a model that knows q, v and vd.
 
         floor_j = rms(tau_j(t) - tau_j(t + T)) / sqrt(2) / rms(tau_j)
 
