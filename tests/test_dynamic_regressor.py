@@ -78,15 +78,20 @@ def test_equals_the_plant_with_other_parameters(arm, seed):
         parameters.append(np.array(ten))
         changed = LinkInertia(link.link, parameters[-1]).to_spatial_inertia()
         plant.GetBodyByName(link.link).SetSpatialInertiaInBodyFrame(context, changed)
-    D_joint = np.zeros(arm.num_joints)
+    D_joint = np.zeros((arm.num_joints,) * 2)
     for actuator in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
+        if actuator.default_rotor_inertia() == 0:
+            continue  # the MTM's motors 3 and 4 are links, not rotors of one joint
         inertia = generator.uniform(1e-6, 1e-5)
         actuator.SetRotorInertia(context, inertia)
-        D_joint[arm.joint_names.index(actuator.joint().name())] = inertia * actuator.default_gear_ratio() ** 2
+        joint = arm.joint_names.index(actuator.joint().name())
+        D_joint[joint, joint] = inertia * actuator.default_gear_ratio() ** 2
+    J_inverse = np.linalg.inv(arm.transmission.matrix)
+    D = J_inverse.T @ D_joint @ J_inverse
+    rotors = [D[tuple(arm.joint_names.index(name) for name in rotor.actuators)] for rotor in model.rotors]
     motion = random_motion(arm, 50, seed)
-    expected = drake_torque(plant, context, arm, *motion) - D_joint * motion[2]
-    no_rotors = np.zeros(len(model.rotors))
-    assert_equal_torque(model.torque(*motion, np.concatenate([*parameters, no_rotors])), expected)
+    ours = model.torque(*motion, np.concatenate([*parameters, rotors]))
+    assert_equal_torque(ours, drake_torque(plant, context, arm, *motion))
 
 
 def test_rotors_act_in_actuator_coordinates(arm):
@@ -127,6 +132,18 @@ def test_many_samples_equal_single_ones(arm):
         np.testing.assert_array_equal(Y[i], model.regressor(*(x[i : i + 1] for x in motion))[0])
     np.testing.assert_allclose(model.torque(*motion, model.values), Y @ model.values, rtol=0, atol=1e-12)
     assert model.regressor(*(x[:0] for x in motion)).shape == (0, arm.num_joints, len(model.names))
+
+
+def test_writes_to_memory_that_is_given(arm):
+    model = DynamicRegressor(arm)
+    motion = random_motion(arm, 700)
+    out = np.full((700, arm.num_joints, len(model.names)), np.nan)
+    assert model.regressor(*motion, out=out) is out
+    np.testing.assert_array_equal(out, model.regressor(*motion))
+    with pytest.raises(ModelError, match="C-contiguous"):
+        model.regressor(*motion, out=out[:-1])
+    with pytest.raises(ModelError, match="C-contiguous"):
+        model.regressor(*motion, out=np.asfortranarray(out))
 
 
 def test_bad_input_is_refused(arm):

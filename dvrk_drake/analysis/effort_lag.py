@@ -1,4 +1,4 @@
-"""Whether efforts are late behind the motion that they cause: the delay that explains them best."""
+"""How late efforts look behind the motion, and whether their friction opposes it."""
 
 from __future__ import annotations
 
@@ -15,38 +15,40 @@ CUT_OFF = 20.0
 #: Delays that are tried [s], and their step.
 LONGEST_LAG, LAG_STEP = 0.04, 0.0025
 #: Left out at each end, where filters swing in [s].
-ENDS = 0.5
+ENDS = 1.0
 #: Coulomb friction is smoothed over this share of the RMS speed.
 SMOOTHING = 0.1
-#: Presliding: friction builds up over these shares of the standard deviation of q.
-PRESLIDING = 0.003, 0.01, 0.03, 0.08, 0.2
-#: Parts of the motion whose delays give the standard error.
+#: Parts of the motion whose estimates give the standard errors.
 PARTS = 5
 #: A delay is told only if it takes the variance that is left down by this factor, and exceeds so many standard errors.
 LEAST_GAIN, LEAST_ERRORS = 1.12, 5.0
 
 
 class EffortLag(NamedTuple):
-    """How late tau is behind the motion; (n,) each.
+    """How late tau is behind the motion, and its step where the speed changes its sign; (n,) each.
 
     Attributes:
-        lag: that leaves least of tau unexplained [s]; nan where the joint or its effort rests.
+        lag: that leaves least of tau unexplained [s], at most `LONGEST_LAG`; nan where the joint or its effort rests.
         standard_error: of it, from `PARTS` parts of the motion [s].
         gain: variance left without a delay over that with it [1].
-        determined: whether the lag is one: large gain, many standard errors, and not at the end of what is tried.
+        determined: whether the lag is one: large gain, and many standard errors.
+        coulomb: Coulomb friction [N m, N]; negative where the effort has the wrong sign.
+        coulomb_error: its standard error, from `PARTS` parts of the motion.
     """
 
     lag: NDArray[np.float64]
     standard_error: NDArray[np.float64]
     gain: NDArray[np.float64]
     determined: NDArray[np.bool_]
+    coulomb: NDArray[np.float64]
+    coulomb_error: NDArray[np.float64]
 
 
 def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
     """Fits each effort, delayed by up to 40 ms either way, by what its joint does; the least residual tells the delay.
 
-    Explained by: all accelerations, own speed, own Coulomb friction, own presliding friction, sine and cosine of all
-    positions. Friction that builds up over some way looks late; without its terms it would be taken for a delay.
+    Explained by: own Coulomb and viscous friction, all accelerations, sine and cosine of all positions. Friction that
+    builds up over some way after a reversal (presliding) looks like a delay, and no fit of one motion tells them apart.
 
     Args:
         signals: of the actuators: friction is theirs.
@@ -56,32 +58,27 @@ def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
     start = max(int(ENDS * rate), int(LONGEST_LAG * rate))
     inner = slice(start, len(signals.t) - start)
     tau = low_pass(signals.tau, rate, CUT_OFF)
-    friction = _presliding(signals.q)
     angles = signals.q[:, moving]
     shared = np.hstack([signals.vd[:, moving], np.sin(angles), np.cos(angles), np.ones((len(angles), 1))])
-    result = np.full((tau.shape[1], 3), np.nan)
+    result = np.full((tau.shape[1], 5), np.nan)
     for j in np.flatnonzero(moving & np.any(tau != 0, axis=0)):
         v = signals.v[:, j]
         coulomb = np.tanh(v / (SMOOTHING * np.sqrt(np.mean(v**2))))
-        columns = low_pass(np.column_stack([shared, v, coulomb, friction[:, j]]), rate, CUT_OFF)[inner]
+        columns = low_pass(np.column_stack([coulomb, v, shared]), rate, CUT_OFF)[inner]
         Q, _ = np.linalg.qr(columns / (np.sqrt(np.mean(columns**2, axis=0)) + np.finfo(float).tiny))
-        result[j] = _fit(tau[:, j], Q, inner, rate)
-    lag, error, gain = result.T
+        result[j] = *_fit(tau[:, j], Q, inner, rate), *_coulomb(columns, tau[inner, j])
+    lag, error, gain, size, size_error = result.T
     with np.errstate(invalid="ignore"):
         determined = (gain > LEAST_GAIN) & (np.abs(lag) > LEAST_ERRORS * error)
-        determined &= np.abs(lag) < LONGEST_LAG - LAG_STEP
-    return EffortLag(lag, error, gain, determined)
+    return EffortLag(lag, error, gain, determined, size, size_error)
 
 
-def _presliding(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m, n, widths) states of elasto-plastic elements, -1..1: z follows q and slips at its width."""
-    width = np.std(q, axis=0)[:, None] * np.array(PRESLIDING) + np.finfo(float).tiny
-    states = np.empty((*q.shape, len(PRESLIDING)))
-    z = np.zeros_like(width)
-    for row, step in enumerate(np.diff(q, axis=0, prepend=q[:1])):
-        z = np.minimum(np.maximum(z + step[:, None], -width), width)
-        states[row] = z
-    return np.asarray(states / width)
+def _coulomb(columns: NDArray[np.float64], tau: NDArray[np.float64]) -> tuple[float, float]:
+    """The first column's coefficient and its standard error."""
+    parts = zip(np.array_split(columns, PARTS), np.array_split(tau, PARTS), strict=True)
+    estimates = [np.linalg.lstsq(A, b, rcond=None)[0][0] for A, b in parts]
+    whole = np.linalg.lstsq(columns, tau, rcond=None)[0][0]
+    return float(whole), float(np.std(estimates, ddof=1) / np.sqrt(PARTS))
 
 
 def _fit(tau: NDArray[np.float64], Q: NDArray[np.float64], inner: slice, rate: float) -> tuple[float, float, float]:

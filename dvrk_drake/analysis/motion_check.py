@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.effort_lag import EffortLag, effort_lag
+from dvrk_drake.analysis.effort_lag import LAG_STEP, LONGEST_LAG, EffortLag, effort_lag
 from dvrk_drake.analysis.low_pass import resample
 from dvrk_drake.analysis.motion_signals import MotionSignals, motion_signals
 from dvrk_drake.analysis.noise import cut_offs, narrow_band, spectra
@@ -21,25 +21,30 @@ from dvrk_drake.models.recording import REST_SPEED, Recording
 
 #: Below this share, repeated rows are chance.
 LEAST_REPEATED = 0.005
+#: A block of channels that repeats itself in so much more rows comes from a slower topic.
+LEAST_EXTRA = 0.05
 #: A gap: an interval of so many median ones, and at least this long [s].
 GAP, LEAST_GAP = 5.0, LONGEST_PERIOD
 #: A clock that is off by more than this share of an interval is worth a line.
 LEAST_JITTER = 0.05
-#: Friction takes work: less than minus this share is a wrong sign. Judged over so many passes of a joint's range.
-OPPOSITE, LEAST_PASSES = 0.05, 5.0
+#: A sign is wrong if Coulomb friction is so many standard errors below 0; or if the motor's work is below minus this
+#: share, and Coulomb friction not so many above 0.
+SURE, OPPOSITE, DOUBTFUL = 5.0, 0.05, 2.0
 #: Joints whose speeds correlate more can hardly be told apart.
 TOGETHER = 0.95
-#: Shorter motions are too short to judge lags and noise [s].
-LEAST_DURATION = 5.0
+#: Shorter motions are too short to judge lags, signs and noise [s].
+LEAST_DURATION = 10.0
 
 
 def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tuple[RecordingReport, list[Finding]]:
     """The report with the motion's numbers, and what was found. t increases, and q, qd and t are in one system."""
-    actuators = recording.in_actuator_coordinates(arm)
+    interval = float(np.median(np.diff(np.asarray(recording.t))))
+    gaps = _gaps(np.asarray(recording.t), interval)
+    actuators = _longest_piece(recording.in_actuator_coordinates(arm), gaps)
     clock = true_time(actuators)
-    t = np.asarray(recording.t)
-    duration, rate = float(t[-1] - t[0]), 1 / float(np.median(np.diff(t)))
-    findings = [*_rows(actuators, clock), *_gaps(recording, 1 / rate)]
+    t = np.asarray(actuators.t)
+    duration, rate = float(t[-1] - t[0]), 1 / interval
+    findings = [*_rows(actuators, clock), *_gap_findings(recording, gaps)]
     report = replace(
         report, rate=rate, duration=duration, jitter=clock.jitter, repeated=float(np.mean(repeated_rows(actuators)))
     )
@@ -54,7 +59,7 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
     names = arm.joint_names
     work = _work(signals)
     findings += _velocities(agreement, names) + _lags(lags, names) + _together(signals, moving, names)
-    findings += _signs(work, signals, moving, names)
+    findings += _signs(work, lags, names)
     even = t[0] + np.arange(len(t)) * (duration / (len(t) - 1))
     rows = actuators if np.ptp(np.diff(t)) < 1e-3 / rate else _resampled(actuators, even)
     period = find_period(rows.q, rate)
@@ -90,7 +95,8 @@ def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
         advice = "a slower topic was polled: they are left out, and true times are made; record each message once"
         findings.append(Finding("warning", "repeated rows", "rows", what, advice, size=whole))
     for name, share in blocks.items():
-        if share > whole + max(0.05, LEAST_REPEATED):
+        # What never changes is said elsewhere.
+        if whole + LEAST_EXTRA < share < 1 - 2 / len(actuators):
             what = f"{share:.1%} of the rows repeat {name} but not the rest"
             advice = "it comes from a slower topic than the rest, and is up to one of its intervals late"
             findings.append(Finding("warning", "repeated channel", name, what, advice, size=share))
@@ -101,14 +107,32 @@ def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
     return findings
 
 
-def _gaps(recording: Recording, interval: float) -> list[Finding]:
-    intervals = np.diff(np.asarray(recording.t))
-    gaps = np.flatnonzero(intervals > max(GAP * interval, LEAST_GAP))
+def _gaps(t: NDArray[np.float64], interval: float) -> NDArray[np.int_]:
+    """Rows before a gap."""
+    return np.flatnonzero(np.diff(t) > max(GAP * interval, LEAST_GAP))
+
+
+def _longest_piece(recording: Recording, gaps: NDArray[np.int_]) -> Recording:
+    edges = np.concatenate([[0], gaps + 1, [len(recording)]])
+    longest = int(np.argmax(np.diff(edges)))
+    rows = slice(edges[longest], edges[longest + 1])
+    return replace(
+        recording,
+        q=recording.q[rows],
+        qd=None if recording.qd is None else recording.qd[rows],
+        tau=recording.measured_effort()[rows],
+        t=np.asarray(recording.t)[rows],
+        lines=None if recording.lines is None else recording.lines[rows],
+    )
+
+
+def _gap_findings(recording: Recording, gaps: NDArray[np.int_]) -> list[Finding]:
     if not len(gaps):
         return []
+    intervals = np.diff(np.asarray(recording.t))
     largest = int(gaps[np.argmax(intervals[gaps])])
     what = f"{len(gaps)} gaps, the largest {intervals[largest]:.3g} s before {recording.where(largest + 1)}"
-    advice = "nobody knows what the arm did meanwhile: split the recording there"
+    advice = "nobody knows what the arm did meanwhile: split it there; signals are checked in the longest piece"
     return [Finding("warning", "gaps", "t", what, advice, size=float(intervals[largest]))]
 
 
@@ -140,9 +164,12 @@ def _velocities(agreement: VelocityAgreement | None, names: tuple[str, ...]) -> 
 def _lags(lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
     findings = []
     for j in np.flatnonzero(lags.determined):
-        lag, error = 1e3 * lags.lag[j], 1e3 * lags.standard_error[j]
-        what = f"tau{j + 1} is {lag:.1f} ms (standard error {error:.1f}) {'late' if lag > 0 else 'early'}"
-        advice = "shift it before a fit"
+        lag, error = 1e3 * float(lags.lag[j]), 1e3 * float(lags.standard_error[j])
+        size = f"{abs(lag):.1f} ms (standard error {error:.1f})"
+        if abs(lags.lag[j]) > LONGEST_LAG - LAG_STEP:
+            size = f"{1e3 * LONGEST_LAG:.0f} ms or more"
+        what = f"tau{j + 1} looks {size} {'late' if lag > 0 else 'early'}"
+        advice = "a delay, or friction that builds up over some way: fit hysteresis before you shift it"
         findings.append(Finding("note", "effort lag", names[j], what, advice, (int(j),), float(lags.lag[j])))
     return findings
 
@@ -169,16 +196,19 @@ def _work(signals: MotionSignals) -> NDArray[np.float64]:
         return np.asarray(np.mean(signals.tau * signals.v, axis=0) / size)
 
 
-def _signs(
-    work: NDArray[np.float64], signals: MotionSignals, moving: NDArray[np.bool_], names: tuple[str, ...]
-) -> list[Finding]:
-    # Over few passes, the energy that gravity gives and takes need not cancel.
-    passes = np.sum(np.abs(np.diff(signals.q, axis=0)), axis=0) / np.maximum(np.ptp(signals.q, axis=0), 1e-9)
+def _signs(work: NDArray[np.float64], lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        errors = lags.coulomb / lags.coulomb_error
+    # Work alone does not tell: gravity and inertia may give it through the other joints.
+    wrong = (errors < -SURE) | ((work < -OPPOSITE) & (errors < DOUBTFUL))
     findings = []
-    for j in np.flatnonzero(moving & (passes > LEAST_PASSES) & (work < -OPPOSITE)):
-        what = f"the motor takes work out of the motion ({work[j]:.2f} of rms(tau) rms(v)), which friction never gives"
+    for j in np.flatnonzero(wrong):
+        what = (
+            f"friction pushes instead of braking: Coulomb {lags.coulomb[j]:.2g} ({errors[j]:.1f} standard errors), "
+            f"work {work[j]:.2f}"
+        )
         advice = f"tau{j + 1} or the direction of q{j + 1} has the wrong sign: efforts are positive towards +q"
-        findings.append(Finding("refusal", "effort sign", names[j], what, advice, (int(j),), float(work[j])))
+        findings.append(Finding("refusal", "effort sign", names[j], what, advice, (int(j),), float(lags.coulomb[j])))
     return findings
 
 
@@ -206,8 +236,10 @@ def _noise(
         return replace(report, joints=tuple(joints)), [Finding("note", "no repetition", "motion", what, advice)]
     floor = repeatability_floor(tau, rate, period, arm.effort_cut_off)
     joints = [replace(joint, floor=float(value)) for joint, value in zip(joints, floor, strict=True)]
-    what = f"repeats every {period:.4f} s ({1 / period:.4f} Hz), {report.duration / period if report.duration else 0:.1f} times"
-    advice = "compare that with the frequency that was asked for; the floor is the least error of any model"
+    what = f"repeats every {period:.4f} s ({1 / period:.4f} Hz), {len(tau) / rate / period:.1f} times"
+    advice = (
+        "compare that with the frequency that was asked for; the floor is about the least error that a model can have"
+    )
     findings = [Finding("note", "repetition", "motion", what, advice, size=period)]
     for j, name in enumerate(arm.joint_names):
         if band := narrow_band(of_tau, j):

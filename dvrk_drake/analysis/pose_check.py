@@ -13,8 +13,9 @@ from dvrk_drake.models.recording import Recording
 
 #: Poses at which the SDF's gravity is compared.
 MOST_COMPARED = 500
-#: A sign is doubted if gravity is above this share of the effort, and their correlation below minus the other [1].
-GRAVITY_SHARE, OPPOSITE = 0.3, 0.5
+#: A sign is doubted if the joint covers a quarter of its limits, gravity is above this share of the effort, and their
+#: correlation below minus the other [1].
+GRAVITY_SHARE, OPPOSITE = 0.5, 0.7
 
 
 def check_poses(joints: Recording, arm: Arm) -> list[Finding]:
@@ -45,8 +46,9 @@ def _wrong_sign(joints: Recording, arm: Arm) -> list[Finding]:
     tau = joints.measured_effort()[rows]
     sizes = np.sqrt(np.sum(gravity**2, axis=0)), np.sqrt(np.sum(tau**2, axis=0))
     cosine = np.sum(gravity * tau, axis=0) / np.maximum(sizes[0] * sizes[1], np.finfo(float).tiny)
+    covers = np.ptp(joints.q, axis=0) > 0.25 * (arm.position_upper - arm.position_lower)
     findings = []
-    for j in np.flatnonzero((sizes[0] > GRAVITY_SHARE * sizes[1]) & (cosine < -OPPOSITE)):
+    for j in np.flatnonzero(covers & (sizes[0] > GRAVITY_SHARE * sizes[1]) & (cosine < -OPPOSITE)):
         what = f"efforts are opposite to the gravity torque of the model file (correlation {cosine[j]:.2f})"
         advice = "efforts must be positive towards +q, and --gravity must be that of the mounting"
         findings.append(

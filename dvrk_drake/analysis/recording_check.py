@@ -122,12 +122,10 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm) -> list[F
             advice = "its motor was off or is not recorded; nothing of it can be identified"
             findings.append(Finding("warning", "no effort", name, f"tau{j + 1} is always 0", advice, (j,)))
             continue
-        exceeds = float(np.mean(np.abs(tau[:, j]) > arm.effort_limits[j]))
+        exceeds = int(np.sum(np.abs(tau[:, j]) > arm.effort_limits[j]))
         if exceeds:
             most = float(np.max(np.abs(tau[:, j])) / arm.effort_limits[j])
-            what = (
-                f"effort above its limit of {arm.effort_limits[j]:.3g} in {exceeds:.1%} of the rows, up to {most:.0%}"
-            )
+            what = f"effort above its limit of {arm.effort_limits[j]:.3g} in {exceeds} rows, up to {most:.0%}"
             advice = "such peaks may be clipped or spikes of the current's measurement"
             findings.append(Finding("note", "above effort limit", name, what, advice, (j,), most))
         measured = actuators.measured_effort()[:, j]

@@ -48,8 +48,8 @@ def print_report(console: Console, report: RecordingReport) -> None:
     if report.period is not None:
         floors = [joint.floor for joint in report.joints if joint.floor is not None]
         console.print(
-            f"floor: rms(tau(t) - tau(t + {report.period:.4f} s)) / sqrt(2) / rms(tau) below {report.floor_cut_off:g} Hz; "
-            f"mean {sum(floors) / len(floors):.1%}",
+            f"floor: rms(tau(t) - tau(t + {report.period:.4f} s)) / sqrt(2) / rms(tau), below "
+            f"{report.floor_cut_off:g} Hz; mean {sum(floors) / len(floors):.1%}",
             style="dim",
             soft_wrap=True,
         )

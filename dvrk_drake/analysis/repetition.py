@@ -8,8 +8,8 @@ from scipy.signal import correlate
 
 from dvrk_drake.analysis.low_pass import low_pass
 
-#: A motion repeats if, a period later, its positions differ by less than this share of their standard deviation (RMS
-#: over the joints that move).
+#: A motion repeats if, a period later, its positions differ by less than this share of their standard deviation
+#: (RMS over the joints that move).
 SAME_MOTION = 0.1
 #: The second pass must cover at least this share of the period.
 LEAST_OVERLAP = 0.25
@@ -24,8 +24,8 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
 
         D(T)^2 = mean_j mean_t (q_j(t) - q_j(t + T))^2 / (2 var(q_j))
 
-    over the joints j that move, refined by a parabola. D is 0 for what repeats exactly, and 1 for what has nothing to do
-    with itself T later.
+    over the joints j that move, refined by a parabola. D is 0 for what repeats exactly, and 1 for what is unrelated
+    to itself T later.
 
     Args:
         q: (m, n) positions at a constant rate.
@@ -60,7 +60,7 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
 def repeatability_floor(
     tau: NDArray[np.float64], rate: float, period: float, cut_off: ArrayLike
 ) -> NDArray[np.float64]:
-    """How badly the arm repeats its efforts: no model that knows only q, v and vd has a smaller error [1].
+    """How badly the arm repeats its efforts [1]: about the least relative error of a model that knows q, v and vd.
 
         floor_j = rms(tau_j(t) - tau_j(t + T)) / sqrt(2) / rms(tau_j)
 

@@ -54,8 +54,10 @@ def velocity_agreement(q: NDArray[np.float64], qd: NDArray[np.float64], rate: fl
 def _fit(v: NDArray[np.float64], qd: NDArray[np.float64], inner: slice) -> tuple[float, float, float]:
     """Gain, lag [samples] and mismatch: Gauss-Newton from no lag."""
     size = float(np.sqrt(np.mean(qd[inner] ** 2)))
-    if size < LEAST_SPEED or float(np.sqrt(np.mean(v[inner] ** 2))) < LEAST_SPEED:
+    if float(np.sqrt(np.mean(v[inner] ** 2))) < LEAST_SPEED:
         return np.nan, np.nan, np.nan
+    if size < LEAST_SPEED:
+        return 0.0, 0.0, 1.0
     index = np.arange(len(v), dtype=float)
     gain, lag = 1.0, 0.0
     for _ in range(_ITERATIONS):

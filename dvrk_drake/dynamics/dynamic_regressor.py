@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.multibody.plant import MultibodyPlant
 
 from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES, LinkInertia, link_inertias
 from dvrk_drake.dynamics.kinematic_tree import KinematicTree
@@ -18,8 +17,8 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant
 
-#: Samples that one thread takes at a time, and that `torque` keeps a regressor of.
-_CHUNK = 512
+#: Samples that a thread takes at a time, and that `torque` keeps a regressor of.
+_CHUNK = 256
 
 
 class DynamicRegressor:
@@ -60,17 +59,24 @@ class DynamicRegressor:
         """(p,) what the SDF states."""
         return np.concatenate([*(link.parameters for link in self.links), [rotor.value for rotor in self.rotors]])
 
-    def regressor(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
+    def regressor(
+        self, q: ArrayLike, v: ArrayLike, vd: ArrayLike, out: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
         """Y (m, n, p).
 
         Args:
             q, v, vd: (m, n) positions [rad, m], velocities and accelerations of the independent joints.
+            out: array to write to and return. The memory of a new one takes as long to get as Y takes to compute, so
+                who goes through many samples in parts keeps one.
 
         Raises:
-            ModelError: the three are not arrays of that shape.
+            ModelError: the arrays are not of these shapes, or `out` is not C-contiguous float64.
         """
         motion = self._checked_motion(q, v, vd)
-        Y = np.empty((*motion[0].shape, len(self.names)))
+        shape = (*motion[0].shape, len(self.names))
+        Y = np.empty(shape) if out is None else out
+        if Y.shape != shape or Y.dtype != np.float64 or not Y.flags.c_contiguous:
+            raise ModelError(f"out is {Y.dtype} {Y.shape}; allowed: float64 {shape}, C-contiguous")
         self._fill(motion, self.arm.gravity, Y)
         return Y
 
@@ -105,21 +111,35 @@ class DynamicRegressor:
     def _fill(self, motion: tuple[NDArray, ...], gravity: NDArray, Y: NDArray) -> None:
         tree = self._tree
 
-        def fill(start: int) -> None:
-            chunk = slice(start, start + _CHUNK)
-            q, v, vd = (x[chunk] for x in motion)
-            fill_regressor(
-                q, v, vd, gravity, tree.parents, tree.pose_terms, tree.hinges, tree.G, tree.c, tree.affects,
-                self._rotor_rows, Y[chunk],
-            )  # fmt: skip
+        chunks = iter(range(0, len(Y), _CHUNK))  # shared: a thread that was kept waiting takes fewer
 
-        starts = range(0, len(Y), _CHUNK)
-        if len(starts) <= 1:
-            for start in starts:
-                fill(start)
+        def work() -> None:
+            # A part at a time, where the caches hold it: Y itself goes to memory once and in order.
+            part = np.zeros((min(_CHUNK, len(Y)), *Y.shape[1:]))
+            for first in chunks:
+                chunk = slice(first, first + _CHUNK)
+                q, v, vd = (x[chunk] for x in motion)
+                fill_regressor(
+                    tree.joint_motion(q, v, vd),
+                    vd,
+                    gravity,
+                    tree.parents,
+                    tree.pose_terms,
+                    tree.hinges,
+                    tree.G,
+                    tree.affects,
+                    self._rotor_rows,
+                    part[: len(q)],
+                )
+                Y[chunk] = part[: len(q)]
+
+        threads = min(os.cpu_count() or 1, len(Y) // (2 * _CHUNK))
+        if threads <= 1:
+            work()
             return
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(fill, starts))
+        with ThreadPoolExecutor(threads) as pool:
+            for result in [pool.submit(work) for _ in range(threads)]:
+                result.result()
 
     @cached_property
     def _rotor_rows(self) -> NDArray[np.float64]:

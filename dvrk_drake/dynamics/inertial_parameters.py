@@ -78,6 +78,11 @@ def moving_bodies(plant: MultibodyPlant) -> Iterator[RigidBody]:
     return (body for body in bodies if not plant.IsAnchored(body))
 
 
+def parameter_axis(name: str) -> str:
+    """The axes in a name of `PARAMETER_NAMES`: "" of m, "x" of mcx, "xy" of Ixy."""
+    return name.removeprefix("mc").removeprefix("m").removeprefix("I")
+
+
 def pseudo_inertia(parameters: ArrayLike) -> NDArray[np.float64]:
     """(4, 4) pseudo-inertia of ten inertial parameters (10,), linear in them."""
     m, hx, hy, hz, Ixx, Iyy, Izz, Ixy, Ixz, Iyz = np.asarray(parameters, float)

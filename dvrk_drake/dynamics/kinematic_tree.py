@@ -70,6 +70,24 @@ class KinematicTree:
             affects=affects,
         )
 
+    def joint_motion(
+        self, q: NDArray[np.float64], v: NDArray[np.float64], vd: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(5, l, m) x, sin(x), 1 - cos(x), dx/dt, d2x/dt2 of the joints, for m samples (m, n) of the independent ones.
+
+        Sine and cosine are written by the tangent of half the angle, which numpy computes eight at a time.
+        """
+        motion = np.empty((5, len(self.c), len(q)))
+        x, sine, versine, rate, rate_of_rate = motion
+        np.matmul(self.G, q.T, out=x)
+        x += self.c[:, None]
+        t = np.tan(x / 2)
+        np.divide(2 * t, 1 + t * t, out=sine)
+        np.multiply(t, sine, out=versine)
+        np.matmul(self.G, v.T, out=rate)
+        np.matmul(self.G, vd.T, out=rate_of_rate)
+        return motion
+
 
 def _joints(plant: MultibodyPlant) -> list[Joint]:
     return [plant.get_joint(index) for index in plant.GetJointIndices()]
@@ -93,22 +111,19 @@ def _parents_first(links: list[str], inboard: dict[str, Joint]) -> tuple[str, ..
 
 def _axis(joint: Joint) -> NDArray[np.float64]:
     """(3,) unit axis of a joint in its frames F and M alike; zero for a weld."""
-    axis = {
-        "revolute": lambda: joint.revolute_axis(),
-        "prismatic": lambda: joint.translation_axis(),
-        "weld": lambda: np.zeros(3),
-    }.get(joint.type_name())
-    if axis is None:
-        raise ArmError(f"joint {joint.name()} is {joint.type_name()}; allowed: revolute, prismatic, fixed")
-    return axis()
+    match joint.type_name():
+        case "revolute":
+            return joint.revolute_axis()
+        case "prismatic":
+            return joint.translation_axis()
+        case "weld":
+            return np.zeros(3)
+    raise ArmError(f"joint {joint.name()} is {joint.type_name()}; allowed: revolute, prismatic, fixed")
 
 
 def _pose_terms(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
     """(4, 3, 4) T0..T3 of X_PC = X_PF X_FM(x) X_MC; the pose in the base where the parent is anchored to it."""
-    if joint.type_name() == "weld":
-        X_FM = joint.X_FM()
-    else:
-        X_FM = RigidTransform()
+    X_FM = joint.X_FM() if joint.type_name() == "weld" else RigidTransform()
     X_PF, X_MC = _pose_in_parent(plant, joint), joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     x, y, z = _axis(joint)
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
