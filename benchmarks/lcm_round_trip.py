@@ -41,7 +41,7 @@ from dvrk_drake.processes.lcm_network import open_lcm
 from dvrk_drake.processes.pace import make_realtime, settle_memory
 from dvrk_drake.processes.simulated_arm import SimulatedArm, start_pose
 from dvrk_drake.systems.arm_view import start_meshcat
-from dvrk_drake.systems.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 ARM = load_arm("mtml")
 CONDITIONS = ("quiet", "Meshcat client", "cores busy")

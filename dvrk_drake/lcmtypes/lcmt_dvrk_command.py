@@ -8,7 +8,7 @@ What a controller asks of one arm of a da Vinci Research Kit. Channel: DVRK_COMM
 
 One command answers one status: read a DVRK_STATUS_<ARM> message, compute, echo its session_id and utime, send.
 The arm applies a command for 50 ms at most and then holds its pose by itself; what it refuses and why is in
-lcmt_dvrk_status. The rules are those of dvrk_drake/systems/command_guard.py.
+lcmt_dvrk_status. The rules are those of dvrk_drake/systems/guard/command_guard.py.
 
 Units are SI: rad, rad/s, N m; m, m/s, N on a prismatic joint. Joints are in the dVRK's order; the jaw of a patient
 side manipulator is its last joint, also where ROS gives it a topic of its own.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dvrk_drake.systems.guard_limits import Flags, Vector
+from dvrk_drake.systems.guard.limits import Flags, Vector
 
 
 @dataclass

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
-from dvrk_drake.systems.guard_settings import GuardSettings
+from dvrk_drake.systems.guard.settings import GuardSettings
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm

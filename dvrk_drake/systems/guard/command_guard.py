@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
-from dvrk_drake.systems.command_check import is_finite, refusal_by_itself
-from dvrk_drake.systems.command_stream import CommandStream
-from dvrk_drake.systems.guard_limits import GuardLimits, Vector
-from dvrk_drake.systems.guard_output import GuardCounts, GuardOutput
-from dvrk_drake.systems.guard_settings import GuardSettings
+from dvrk_drake.systems.guard.command_stream import CommandStream, is_finite, refusal_by_itself
+from dvrk_drake.systems.guard.limits import GuardLimits, Vector
+from dvrk_drake.systems.guard.output import GuardCounts, GuardOutput
+from dvrk_drake.systems.guard.settings import GuardSettings
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm

@@ -11,7 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import decode
-from dvrk_drake.systems.command_guard import CommandGuard
+from dvrk_drake.systems.guard.command_guard import CommandGuard
 
 #: Messages kept from one update to the next; more is a flood, of which the newest are looked at.
 _INBOX = 256

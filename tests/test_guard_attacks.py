@@ -4,15 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_command_guard import ARM, LIMIT, MS, SESSION, Bench, N, Q
+from guard_bench import ARM, LIMIT, MS, SESSION, Bench, N, Q
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.systems.command_guard import CommandGuard
-from dvrk_drake.systems.dvrk_status_sender import fill_in_guard
-from dvrk_drake.systems.guard_settings import GuardSettings
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.guard.settings import GuardSettings
+from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
 
 A, LOWER, UPPER = ARM.limit_matrix()
 LOOK_AHEAD = np.array(ARM.gains.kd) / np.array(ARM.gains.kp)
