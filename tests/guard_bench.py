@@ -15,6 +15,11 @@ Q = np.array([0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5])  # inside all limits
 MS = 1000
 
 
+def modes(*allowed):
+    """`accepted_modes` with these."""
+    return sum(1 << mode for mode in allowed)
+
+
 class Bench:
     """A guard at rest with a clock; the measured state is set by the test."""
 
@@ -25,7 +30,12 @@ class Bench:
         self.q = Q.copy() if arm is ARM else 0.5 * (arm.position_lower + arm.position_upper)
         self.v, self.effort = np.zeros(arm.num_joints), 0.05 * arm.effort_limits
         self.sequence = 0
-        self.output = self.guard.step(self.utime, self.q, self.v, self.effort)
+        self.age = 0  # of the measurement [us]
+        self.follows = False  # positions, at once
+        self.output = self.step()
+
+    def step(self):
+        return self.guard.step(self.utime, self.utime - self.age, self.q, self.v, self.effort)
 
     def command(self, mode=Command.EFFORT, *, sender=5, **fields):
         self.sequence += 1
@@ -48,7 +58,9 @@ class Bench:
     def tick(self, milliseconds=1):
         for _ in range(milliseconds):
             self.utime += MS
-            self.output = self.guard.step(self.utime, self.q, self.v, self.effort)
+            self.output = self.step()
+            if self.follows:
+                self.q = self.output.position.copy()
         return self.output
 
     def run(self, mode, milliseconds, **fields):

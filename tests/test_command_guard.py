@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from guard_bench import LIMIT, Bench, N, Q
+from guard_bench import LIMIT, MS, Bench, N, Q, modes
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -15,7 +15,7 @@ def test_holds_the_first_pose_without_any_command():
     assert (output.control_mode, bench.guard.state) == (Command.HOLD, Status.STATE_HOLD)
     np.testing.assert_array_equal(output.position, Q)
     assert not np.any(output.effort)
-    assert bench.guard.accepted_modes == 0b1111
+    assert bench.guard.accepted_modes == modes(Command.OFF, Command.HOLD, Command.POSITION, Command.EFFORT)
 
 
 @pytest.mark.parametrize("mode", [Command.EFFORT, Command.POSITION])
@@ -97,13 +97,57 @@ def test_hold_command_holds_at_once_and_does_not_creep():
         np.testing.assert_array_equal(output.position, Q + 0.01)
 
 
+def test_a_command_is_obeyed_until_50_ms_after_the_measurement_that_it_answers_whenever_it_came():
+    bench = Bench().started()
+    answered = bench.utime
+    bench.tick(39)
+    # Late, and then again and again: no time is gained by that.
+    for _ in range(11):
+        assert bench.send(status_utime=answered) == Status.REFUSAL_NONE
+        assert bench.tick().control_mode == Command.EFFORT
+    assert bench.utime == answered + 50 * MS
+    assert bench.send(status_utime=answered) == Status.REFUSAL_NONE
+    assert bench.tick().control_mode == Command.HOLD
+    assert bench.send(status_utime=answered) == Status.REFUSAL_STALE
+    assert (bench.guard.counts.expired, bench.guard.fault_code) == (1, Status.FAULT_NONE)
+
+
+def test_a_sender_that_answers_one_measurement_for_ever_never_starts():
+    bench = Bench()
+    answered = bench.utime
+    for _ in range(50):
+        assert bench.send(status_utime=answered) == Status.REFUSAL_NONE
+        bench.tick()
+    for _ in range(300):
+        bench.send(status_utime=answered)
+        bench.tick()
+        assert bench.guard.state == Status.STATE_HOLD or bench.utime <= answered + 51 * MS
+
+
+@pytest.mark.parametrize("mode", [Command.EFFORT, Command.POSITION])
+def test_no_single_message_drops_the_arm(mode):
+    bench = Bench().started(mode)
+    allowed = bench.guard.accepted_modes
+    assert not allowed >> Command.OFF & 1
+    for _ in range(200):  # also not after the expiry, when the arm holds
+        assert bench.send(Command.OFF) == Status.REFUSAL_SUDDEN_OFF
+        bench.tick()
+    assert bench.guard.state == Status.STATE_HOLD
+    # Nor the first one of whoever comes, also when somebody else asked for a hold before.
+    bench.run(Command.HOLD, 1)
+    bench.tick(60)
+    assert bench.send(Command.OFF, sender=6) == Status.REFUSAL_SUDDEN_OFF
+    assert bench.tick().control_mode == Command.HOLD
+
+
 def test_off_and_back():
     bench = Bench().started()
-    assert bench.run(Command.OFF, 1).control_mode == Command.OFF
+    bench.run(Command.HOLD, 1)
+    assert bench.run(Command.OFF, 20).control_mode == Command.OFF
     bench.q = Q - 0.05  # it fell
     assert bench.tick(200).control_mode == Command.OFF
     assert bench.send(Command.EFFORT) == Status.REFUSAL_BAD_MODE
-    assert bench.guard.accepted_modes == 0b0011
+    assert bench.guard.accepted_modes == modes(Command.OFF, Command.HOLD)
     output = bench.run(Command.HOLD, 1)
     assert output.control_mode == Command.HOLD
     np.testing.assert_array_equal(output.position, Q - 0.05)
@@ -112,5 +156,5 @@ def test_off_and_back():
 def test_modes_can_be_restricted():
     bench = Bench(modes=(Command.POSITION,))
     assert bench.send(Command.EFFORT) == Status.REFUSAL_BAD_MODE
-    assert bench.guard.accepted_modes == 0b0111
+    assert bench.guard.accepted_modes == modes(Command.OFF, Command.HOLD, Command.POSITION)
     bench.started(Command.POSITION)

@@ -63,6 +63,7 @@ def test_a_soft_wall_turns_outward_effort_inward_before_each_limit(row, side):
 
 def test_positions_move_at_their_rate_and_stop_at_the_limits():
     bench = Bench().started(Command.POSITION)
+    bench.follows = True
     limits = bench.guard.limits
     A, lower, upper = ARM.limit_matrix()
     last = bench.output.position

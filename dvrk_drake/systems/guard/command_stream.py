@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.systems.guard.limits import Vector
 
 #: No joint is there, that fast or that strong [rad, m, rad/s, m/s, N m, N].
 ABSURD = 1e6
@@ -49,6 +50,44 @@ def refusal_by_itself(command: lcmt_dvrk_command | None, arm_name: str, num_join
 
 
 @dataclass
+class GuardCounts:
+    """Commands since the guard was made: taken, missing, refused; and how often one in force expired."""
+
+    accepted: int = 0
+    lost: int = 0
+    refused: int = 0
+    expired: int = 0
+
+
+@dataclass
+class CommandInForce:
+    """The command in force or being watched.
+
+    The numbers that act are copies, which whoever made the command cannot change any more.
+
+    Attributes:
+        command: itself.
+        position: (n,) and so on, its numbers.
+        status_utime: of the measurement that it answers [us].
+        good_since: since when its stream has been good [us].
+    """
+
+    command: lcmt_dvrk_command = field(default_factory=lcmt_dvrk_command)
+    position: Vector = field(default_factory=lambda: np.zeros(0))
+    velocity: Vector = field(default_factory=lambda: np.zeros(0))
+    effort: Vector = field(default_factory=lambda: np.zeros(0))
+    status_utime: int = 0
+    good_since: int = 0
+
+    def take(self, command: lcmt_dvrk_command) -> None:
+        """Goes on to this command of the same stream."""
+        self.command, self.status_utime = command, command.status_utime
+        self.position, self.velocity, self.effort = (
+            np.array(numbers, float) for numbers in (command.position, command.velocity, command.effort)
+        )
+
+
+@dataclass
 class CommandStream:
     """The commands of whoever was heard last. All times in us, arrivals on the arm's clock.
 
@@ -70,23 +109,24 @@ class CommandStream:
     _last: lcmt_dvrk_command | None = None
     _arrival: int = 0
     _can_reset: bool = False
+    _can_turn_off: bool = False
 
     def refusal(self, command: lcmt_dvrk_command, utime: int) -> int:
-        """REFUSAL_OTHER_SENDER, _OUT_OF_ORDER or _CLOCK_JUMP of a command that is good by itself, or REFUSAL_NONE."""
+        """Of a command good by itself: REFUSAL_OTHER_SENDER, _OUT_OF_ORDER, _CLOCK_JUMP, _SUDDEN_OFF or _NONE."""
         if command.sender_id != self.sender_id:
             if self.sender_id != 0 and utime - self._heard <= self.expiry:
                 return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
-            self.sender_id, self._last, self._can_reset = command.sender_id, None, False
+            self.forget()
+            self.sender_id = command.sender_id
         self._heard = utime
-        if self._last is None:
-            return lcmt_dvrk_status.REFUSAL_NONE
-        if command.sequence <= self._last.sequence:
+        if self._last is not None and command.sequence <= self._last.sequence:
             return lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER
-        advance = command.utime - self._last.utime
-        if advance <= 0 or abs(advance - (utime - self._arrival)) > self.clock_tolerance:
+        if self._last is not None and self._jumped(command.utime - self._last.utime, utime - self._arrival):
             # What follows is compared with the clock as it is now.
             self._last, self._arrival = command, utime
             return lcmt_dvrk_status.REFUSAL_CLOCK_JUMP
+        if command.control_mode == lcmt_dvrk_command.OFF and not self._can_turn_off:
+            return lcmt_dvrk_status.REFUSAL_SUDDEN_OFF
         return lcmt_dvrk_status.REFUSAL_NONE
 
     def accept(self, command: lcmt_dvrk_command, utime: int) -> bool:
@@ -96,8 +136,13 @@ class CommandStream:
         self._last, self._arrival = command, utime
         resets = command.reset_fault and self._can_reset
         self._can_reset = not command.reset_fault
+        self._can_turn_off = command.control_mode in (lcmt_dvrk_command.HOLD, lcmt_dvrk_command.OFF)
         return resets
 
     def forget(self) -> None:
         """Forgets who was heard, for when the arm's own clock cannot be trusted."""
-        self.sender_id, self._last, self._can_reset = 0, None, False
+        self.sender_id, self._last = 0, None
+        self._can_reset = self._can_turn_off = False
+
+    def _jumped(self, advance: int, waited: int) -> bool:
+        return advance <= 0 or abs(advance - waited) > self.clock_tolerance

@@ -120,7 +120,7 @@ class DvrkCommandReceiver(LeafSystem):
         effort = self._effort.Eval(context)
         if self._gravity.HasValue(context):
             effort = effort - self._gravity.Eval(context)
-        guard.step(utime, q_v[: self._num_joints], q_v[self._num_joints :], effort)
+        guard.step(utime, utime, q_v[: self._num_joints], q_v[self._num_joints :], effort)
 
     def _calc_control_mode(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self.GetGuard(context).output.control_mode)
