@@ -24,6 +24,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import sys
 import tempfile
 import time
 import xml.etree.ElementTree as ElementTree
@@ -174,7 +175,7 @@ def measure(row: StationRow | CenicRow, q: np.ndarray, seconds: float) -> tuple[
     return duration / seconds, round(steps / seconds)
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", metavar="FILE", help="write the numbers there too")
     parser.add_argument("--repetitions", type=int, default=11)
@@ -230,7 +231,8 @@ def main() -> None:
             }
             json.dump(result, stream, indent=2)
             stream.write("\n")
+    return int(factor["ball"] < LEAST_FACTOR)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -279,7 +279,9 @@ def test_a_limp_arm_falls_into_the_soft_wall(name):
 def test_off_lets_the_arm_fall():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm)
-    sender = Sending(lcm, control_mode=[float(Command.OFF)])
+    sender = Sending(lcm, control_mode=[float(Command.HOLD)])
+    run(lcm, 10, arm, sender)
+    sender.fix("control_mode", [float(Command.OFF)])
     run(lcm, 200, arm, sender)
     assert arm.statuses[-1].guard_state == Status.STATE_OFF
     assert not np.any(arm.statuses[-1].effort_measured)
@@ -327,7 +329,8 @@ def test_the_sender_asks_for_a_hold_unless_it_is_given_finite_numbers():
         ({"effort": effort, "desired_state": q_v, "control_mode": [2.0]}, Command.POSITION),
         ({"effort": effort, "control_mode": [2.0]}, Command.HOLD),
         ({"effort": effort, "control_mode": [np.nan]}, Command.HOLD),
-        ({"effort": effort, "control_mode": [0.0]}, Command.OFF),
+        ({"effort": effort, "control_mode": [0.0]}, Command.HOLD),
+        ({"effort": effort, "control_mode": [4.0]}, Command.OFF),
         ({"effort": effort * np.nan}, Command.HOLD),
         ({"effort": effort + 1e7}, Command.HOLD),
         ({"effort": effort, "reset_fault": [1.0]}, Command.HOLD),

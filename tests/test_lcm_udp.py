@@ -419,7 +419,7 @@ class ScriptedArm:
         self.held = IdentifiedModel.from_arm(load_arm("mtml")).holding_torque(POSES["mtml"])
         self.status = status = Status()
         status.arm_name, status.num_joints, status.session_id, status.utime = "MTML", 7, draw_id(), 10**15
-        status.guard_state, status.accepted_modes = Status.STATE_HOLD, 0b1111
+        status.guard_state, status.accepted_modes = Status.STATE_HOLD, 0b11110
         status.position = status.position_commanded = POSES["mtml"]
         status.velocity, status.joint_flags = [0.0] * 7, [0] * 7
         status.effort_measured = status.effort_commanded = self.held.tolist()
