@@ -134,9 +134,11 @@ def test_a_measurement_that_stops_ends_efforts():
         scene.crtk.age = max(0, k - 300) * 1e-3
 
     scene = Scene(script, 400).run()
-    assert scene.topics(260, 350) == {"servo_jf"}
-    assert scene.topics(351, 400) == {"servo_jp"}
-    assert scene.statuses[-1].fault_text == "measured_js is 0.051 s old"
+    assert scene.topics(260, 320) == {"servo_jf"}
+    assert scene.topics(321, 400) == {"hold"}
+    assert scene.statuses[-1].fault_text == "the measurement is 0.021 s old; allowed is 0 to 0.02 s"
+    # Statuses carry the time of the measurement, which stands still: nothing is recorded twice.
+    assert len({status.utime for status in scene.statuses[300:]}) == 1
 
 
 def test_an_arm_that_is_switched_off_is_sent_no_pose_and_held_where_it_fell():
