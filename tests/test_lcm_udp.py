@@ -279,7 +279,13 @@ def test_run_stops_when_the_arm_faults_and_refuses_one_that_has_a_fault(arm):
     again = start_run(name)
     assert again.wait(60) == 2
     assert "It must be reset first" in again.said()
-    reset(name, observer)
+    meant = start_run(name, "--reset")
+    try:
+        observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 90, "run after the reset")
+    finally:
+        said = meant.end(signal.SIGINT)
+    assert meant.wait(0) == 0, said
+    assert f"{name.upper()} has a fault, which is reset now: senders" in said
     assert drift(name, observer.last) < 1e-3
 
 

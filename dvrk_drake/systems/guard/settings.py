@@ -57,8 +57,8 @@ class GuardSettings:
     effort_fraction: float = 1.0
     effort_rise_time: float = 0.02
     traverse_time: float = 0.5
-    following_error: float = 0.1
-    following_time: float = 0.15
+    following_error: float = 0.15
+    following_time: float = 0.2
 
     def __post_init__(self) -> None:
         self.check()
