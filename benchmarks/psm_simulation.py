@@ -16,7 +16,8 @@ Rows:
     cenic_ball   samples bound its steps, so that none is longer than 1 ms. The second has its loops pinned.
     free_mimic   CENIC with couplings and no controller: the arm falls, and CENIC chooses its steps. For its steps only.
 
-Rows that this version of drake cannot run are left out, with its reason: CENIC knows pins from 1.56 on.
+Rows that this version of drake cannot run are left out, with its reason: CENIC knows pins from 1.56 on. Ends with exit
+code 1 if `ball` is slower than it must be.
 """
 
 from __future__ import annotations

@@ -32,18 +32,8 @@ def test_a_collection_of_a_psm_from_both_sides_completes(tmp_path):
     process = dvrk_drake("arm", "--arm", "psm", "--realtime")
     try:
         observer.until(lambda status: True, 90, "first status")
-        command = [
-            "collect",
-            "--arm",
-            "psm",
-            "--poses",
-            poses,
-            "--output",
-            output,
-            "--realtime",
-            "--traverse-time",
-            "2",
-        ]
+        command = ["collect", "--arm", "psm", "--poses", poses, "--output", output]
+        command += ["--realtime", "--traverse-time", "2"]
 
         def finished():
             return output.exists() and output.read_bytes().count(b"\n") == 1 + POSES

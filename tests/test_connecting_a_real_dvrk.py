@@ -115,6 +115,12 @@ class Scene:
         return {topic for topic, _ in self.crtk.told[begin:end]}
 
 
+@pytest.mark.parametrize("message", [Command, Status])
+def test_every_field_is_on_the_page(message):
+    text = DOCUMENT.read_text(encoding="utf-8")
+    assert not [name for name in message.__slots__ if f"`{name}`" not in text]
+
+
 def test_efforts_act_after_the_start_guard_and_a_dead_controller_is_followed_by_a_hold():
     scene = Scene(lambda scene, k: k < 400 and scene.send(Command.EFFORT), 500).run()
     assert scene.topics(0, 250) == {"servo_jp"}

@@ -258,7 +258,7 @@ def test_run_starts_ramps_in_and_leaves_the_arm_to_its_hold(arm, mode):
     assert drift(name, observer.last) < 1e-3
     assert "holds by itself" in said
     assert "effort; " in said and " Hz, round trip " in said
-    print(f"{name} {mode}: {said.splitlines()[-3].strip()}")
+    print(f"{name} {mode}: {said.splitlines()[-2].strip()}")
 
 
 @inside
