@@ -44,15 +44,16 @@ def _arm(options: argparse.Namespace) -> None:
     arm = mounted(load_arm(options.arm), options.gravity)
     driver = DvrkDriver() if options.driver is None else load_driver(options.driver)
     pose = start_pose(arm, options.pose)
-    network = open_lcm(options.lcm_url or driver.lcm_url)
+    url = open_lcm(options.lcm_url or driver.lcm_url).get_lcm_url()
     meshcat = start_meshcat() if options.meshcat else None
-    simulated = SimulatedArm(arm, driver, network, pose, meshcat)
+    simulated = SimulatedArm(arm, driver, url, pose, meshcat)
     stopped = stop_on_signals()
-    if options.realtime and (warning := make_realtime()):
-        _warn(warning)
+    if options.realtime:
+        for warning in make_realtime():
+            _warn(warning)
     settle_memory()
     where = f"; {meshcat.web_url()}" if meshcat else ""
-    print(f"simulated {arm.name} on LCM {network.get_lcm_url()}{where}; end with Ctrl-C", flush=True)
+    print(f"simulated {arm.name} on LCM {url}{where}; end with Ctrl-C", flush=True)
     pace = simulated.run(stopped, lambda line: print(line, flush=True))
     print(f"ended; {pace.late} ticks began more than a period late", flush=True)
 
@@ -112,8 +113,9 @@ def ready_controller(options: argparse.Namespace, mode: Mode) -> tuple[ArmContro
     if status.gravity_compensation:
         _warn(f"{arm.name} adds gravity compensation of its own: switch it off, or it is compensated twice")
     controller = ArmController(arm, model, mode, period)
-    if options.realtime and (warning := make_realtime()):
-        _warn(warning)
+    if options.realtime:
+        for warning in make_realtime():
+            _warn(warning)
     settle_memory()
     return controller, url, period
 
