@@ -2,14 +2,17 @@
 
     python benchmarks/lcm_round_trip.py [--seconds 60]
 
-This process is the arm, the simulated one of `dvrk-drake arm`, and takes the time from when a status goes out to when
-the command that answers it is heard. Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo
-that decodes a status and encodes a command and does nothing else. Each is measured quiet, with a client of the arm's
-Meshcat page, and with a busy process on every core; without and with real-time scheduling (`--realtime` of both verbs).
+The time is taken from when a status goes out to when the command that answers it is heard, in the process of the arm.
+That is one of two: "standing", a bridge that sends the messages of a driver at 1 kHz and has no physics in its loop: it
+shows what the controller needs; and "simulated", `dvrk-drake arm`, which hears an answer when it has computed its next
+state, in which the answer then acts.
 
-A tick without a fresh command is a status to which the arm had heard no answer when its next step began: it has a
-period less its own step (0.3 ms on a quiet machine) for that, and nothing at all when it is late itself and catches up.
-The echo's lines show how much of it is the arm and the machine.
+Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo that decodes a status and encodes a
+command and does nothing else. Each is measured quiet, with `dvrk-drake view --live` and a client of its page, and with
+a busy process on every core; without and with real-time scheduling (`--realtime` of both verbs, a core each).
+
+A tick without a fresh command is a status that was not answered when the next one went out. The echo's lines show how
+many of them are the machine's.
 
 It needs a multicast route:
 
@@ -22,7 +25,7 @@ As root, `unshare -n`: the root of `unshare -r` has no right to real-time schedu
 import argparse
 import base64
 import contextlib
-import logging
+import itertools
 import multiprocessing
 import os
 import secrets
@@ -32,11 +35,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from urllib.parse import urlsplit
 
 import lcm
 import numpy as np
-from pydrake.geometry import Meshcat
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
@@ -44,11 +45,11 @@ from dvrk_drake.models.lcm_messages import command_channel, status_channel
 from dvrk_drake.processes.lcm_network import handle_message, listen, open_lcm
 from dvrk_drake.processes.pace import Pace, make_realtime, settle_memory
 from dvrk_drake.processes.simulated_arm import SimulatedArm, start_pose
-from dvrk_drake.systems.arm_view import start_meshcat
 from dvrk_drake.systems.dvrk_driver import DvrkDriver
 
 ARM = load_arm("mtml")
-CONDITIONS = {"standing": ("quiet", "cores busy"), "simulated": ("quiet", "Meshcat client", "cores busy")}
+ARMS = ("standing", "simulated")
+CONDITIONS = ("quiet", "Meshcat client", "cores busy")
 RUN = ["-m", "dvrk_drake.cli", "run", "--arm", ARM.name.lower(), "--mode", "hold"]
 
 
@@ -123,9 +124,9 @@ class StandingArm:
 class TimedSimulatedArm(SimulatedArm):
     """The simulated arm of `dvrk-drake arm`."""
 
-    def __init__(self, meshcat: Meshcat | None) -> None:
+    def __init__(self) -> None:
         self.times = Times()
-        super().__init__(ARM, DvrkDriver(), open_lcm().get_lcm_url(), start_pose(ARM), meshcat)
+        super().__init__(ARM, DvrkDriver(), open_lcm().get_lcm_url(), start_pose(ARM))
 
     @property
     def acts(self) -> bool:
@@ -163,25 +164,36 @@ def echo(realtime: bool) -> None:
         network.handle()
 
 
-def watch(url: str) -> None:
+def watch(port: int) -> None:
     """A Meshcat client: a WebSocket that reads everything, as a browser does that has a GPU of its own to draw."""
-    address = urlsplit(url)
-    with socket.create_connection((address.hostname, address.port)) as connection:
-        key = base64.b64encode(secrets.token_bytes(16)).decode()
-        connection.sendall(
-            f"GET / HTTP/1.1\r\nHost: {address.netloc}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-            f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
-        )
-        while connection.recv(1 << 16):
-            pass
+    while True:
+        with contextlib.suppress(ConnectionRefusedError), socket.create_connection(("localhost", port)) as connection:
+            key = base64.b64encode(secrets.token_bytes(16)).decode()
+            connection.sendall(
+                f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+            )
+            for received in itertools.count(1):
+                for _ in range(10):
+                    if not connection.recv(1 << 10, socket.MSG_WAITALL):
+                        return
+                print(10 * received, "KB", flush=True)
+        time.sleep(0.1)
+
+
+def free_port() -> int:
+    """A port that nobody listens to now."""
+    with socket.socket() as listener:
+        listener.bind(("localhost", 0))
+        return listener.getsockname()[1]
 
 
 @contextlib.contextmanager
-def started(*arguments: str) -> Iterator[None]:
+def started(*arguments: str, stdout: int = subprocess.DEVNULL) -> Iterator[subprocess.Popen]:
     """A Python process of these arguments that ends with the block."""
-    process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen([sys.executable, *arguments], stdout=stdout)
     try:
-        yield
+        yield process
     finally:
         process.kill()
         process.wait()
@@ -195,15 +207,14 @@ def measure(peer: list[str], simulated: bool, condition: str, seconds: float, re
 
 def be_the_arm(peer: list[str], simulated: bool, condition: str, seconds: float, realtime: bool) -> np.ndarray:
     """Round trips [s] of `peer` for so long, from 2 s after its commands act, NaN where none was heard in time."""
-    logging.disable()
-    meshcat = start_meshcat() if condition == "Meshcat client" else None
-    arm = TimedSimulatedArm(meshcat) if simulated else StandingArm()
+    arm = TimedSimulatedArm() if simulated else StandingArm()
     settle_memory()
     load: list[list[str]] = []
     if condition == "cores busy":
         load = [["-c", "while True: pass"]] * (os.cpu_count() or 1)
-    elif meshcat:
-        load = [[__file__, "--watch", meshcat.ws_url()]]
+    port = str(free_port())
+    if condition == "Meshcat client":
+        load = [["-m", "dvrk_drake.cli", "view", ARM.name.lower(), "--live", "--port", port]]
     begins: list[int] = []
     times = arm.times
 
@@ -216,6 +227,9 @@ def be_the_arm(peer: list[str], simulated: bool, condition: str, seconds: float,
     with contextlib.ExitStack() as stack:
         for arguments in load:
             stack.enter_context(started(*arguments))
+        client = None
+        if condition == "Meshcat client":
+            client = stack.enter_context(started(__file__, "--watch", port, stdout=subprocess.PIPE))
         if realtime:
             # The peer inherits its core.
             os.sched_setaffinity(0, {max(cores)})
@@ -225,8 +239,10 @@ def be_the_arm(peer: list[str], simulated: bool, condition: str, seconds: float,
             for warning in make_realtime():
                 print(f"warning: {warning}")
         arm.run(stopped)
-        if meshcat and meshcat.GetNumActiveConnections() != 1:
-            raise SystemExit("the Meshcat client is not connected")
+        if client:
+            client.kill()
+            if not client.communicate()[0]:
+                raise SystemExit("the Meshcat client was sent nothing")
     return times.trips(begins[0])
 
 
@@ -242,11 +258,11 @@ def main() -> None:
     """One table; the ratio is that of the medians."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--seconds", type=float, default=60.0, help="for each line of the table")
-    parser.add_argument("--arm", choices=CONDITIONS, help="only with this arm")
-    parser.add_argument("--condition", help="only this one")
+    parser.add_argument("--arm", choices=ARMS, help="only with this arm")
+    parser.add_argument("--condition", choices=CONDITIONS, help="only this one")
     parser.add_argument("--echo", action="store_true", help="be the echo")
     parser.add_argument("--realtime", action="store_true", help="of the echo")
-    parser.add_argument("--watch", metavar="URL", help="be the Meshcat client")
+    parser.add_argument("--watch", type=int, metavar="PORT", help="be the Meshcat client")
     options = parser.parse_args()
     if options.watch:
         watch(options.watch)
@@ -261,10 +277,8 @@ def table(options: argparse.Namespace) -> None:
     print(f"load average at the start: {os.getloadavg()[0]:.2f} on {os.cpu_count()} cores")
     print(f"| {'round trip [us]':58} |    p50 |    p99 |  p99.9 | without a fresh command | ratio |")
     print("|---|---|---|---|---|---|")
-    for arm, conditions in CONDITIONS.items():
-        for condition in conditions:
-            if options.arm not in (None, arm) or options.condition not in (None, condition):
-                continue
+    for arm in ARMS if options.arm is None else [options.arm]:
+        for condition in CONDITIONS if options.condition is None else [options.condition]:
             for realtime in (False, True):
                 name = f"{arm} arm, {condition}{', real-time' if realtime else ''}"
                 simulated = arm == "simulated"

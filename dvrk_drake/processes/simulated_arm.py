@@ -11,7 +11,6 @@ import lcm
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.common.yaml import yaml_load_typed
-from pydrake.geometry import Meshcat
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -71,7 +70,6 @@ class SimulatedArm:
         driver: DvrkDriver,
         url: str,
         q: ArrayLike,
-        meshcat: Meshcat | None = None,
     ) -> None:
         """On the LCM network `url`, at rest at the pose q (n,); the arm's clock starts at the time of day."""
         self.arm, self.driver, self._url = arm, driver, url
@@ -80,7 +78,7 @@ class SimulatedArm:
         self._memory = DrakeLcm("memq://")
         self._memory.Subscribe(status_channel(arm), self._keep_status)
         builder = DiagramBuilder()
-        station = builder.AddSystem(ArmStation(arm, meshcat=meshcat))
+        station = builder.AddSystem(ArmStation(arm))
         self._driver = apply_driver_config(
             driver, station, self._memory, builder, start_utime=time.time_ns() // 1000, subscribe=False
         )
