@@ -10,7 +10,7 @@ import pytest
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.systems.guard_settings import GuardSettings
+from dvrk_drake.systems.guard.settings import GuardSettings
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "connecting_a_real_dvrk.md"
 ARM = load_arm("mtml")

@@ -16,12 +16,12 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.lcm_messages import is_status_of
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.dvrk_command_sender import DvrkCommandSender
-from dvrk_drake.systems.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.dvrk_status_receiver import DvrkStatusReceiver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.lcm_serializer import TolerantSerializer
-from dvrk_drake.systems.sim_dvrk_driver import apply_driver_config
+from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
+from dvrk_drake.systems.lcm.serializer import TolerantSerializer
+from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
 ARM = load_arm("mtml")
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}

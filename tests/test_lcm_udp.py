@@ -26,7 +26,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes.pace import Pace, make_realtime
-from dvrk_drake.systems.dvrk_command_sender import draw_id
+from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
 
 NETWORK_URL, OTHER_URL = (f"udpm://239.255.76.67:{port}?ttl=0" for port in (7667, 7668))
 LCM_TOOLS = Path(lcm.__file__).parent / "../bin"

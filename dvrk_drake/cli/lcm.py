@@ -38,7 +38,7 @@ def _arm(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.live_view import live_view
     from dvrk_drake.processes.pace import make_realtime, settle_memory
     from dvrk_drake.processes.simulated_arm import SimulatedArm, load_driver, start_pose, stop_on_signals
-    from dvrk_drake.systems.dvrk_driver import DvrkDriver
+    from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
     quiet_drake()
     arm = mounted(load_arm(options.arm), options.gravity)

@@ -21,9 +21,9 @@ from dvrk_drake.models.lcm_messages import command_channel, describe_state, stat
 from dvrk_drake.processes.lcm_network import handle_message, listen
 from dvrk_drake.processes.pace import Pace
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.command_guard import CommandGuard
-from dvrk_drake.systems.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.sim_dvrk_driver import apply_driver_config
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
 #: More commands in one step are a flood: the rest waits, and is stale when it is looked at.
 _MESSAGES_A_STEP = 200

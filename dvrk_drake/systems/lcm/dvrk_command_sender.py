@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.command_check import is_finite
+from dvrk_drake.systems.guard.command_stream import is_finite
 
 _MODES = (lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD, lcmt_dvrk_command.POSITION, lcmt_dvrk_command.EFFORT)
 

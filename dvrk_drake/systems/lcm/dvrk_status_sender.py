@@ -7,7 +7,7 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.command_guard import CommandGuard
+from dvrk_drake.systems.guard.command_guard import CommandGuard
 
 
 class DvrkStatusSender(LeafSystem):

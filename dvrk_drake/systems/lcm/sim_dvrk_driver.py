@@ -11,13 +11,13 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.command_guard import CommandGuard
-from dvrk_drake.systems.dvrk_command_receiver import DvrkCommandReceiver
-from dvrk_drake.systems.dvrk_command_sender import draw_id
-from dvrk_drake.systems.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.dvrk_status_sender import DvrkStatusSender
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.lcm_serializer import TolerantSerializer
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.lcm.dvrk_command_receiver import DvrkCommandReceiver
+from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.dvrk_status_sender import DvrkStatusSender
+from dvrk_drake.systems.lcm.serializer import TolerantSerializer
 
 
 class SimDvrkDriver(Diagram):

@@ -11,7 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import decode
-from dvrk_drake.systems.command_guard import CommandGuard
+from dvrk_drake.systems.guard.command_guard import CommandGuard
 
 #: Messages kept from one update to the next; more is a flood, of which the newest are looked at.
 _INBOX = 256
@@ -120,7 +120,7 @@ class DvrkCommandReceiver(LeafSystem):
         effort = self._effort.Eval(context)
         if self._gravity.HasValue(context):
             effort = effort - self._gravity.Eval(context)
-        guard.step(utime, q_v[: self._num_joints], q_v[self._num_joints :], effort)
+        guard.step(utime, utime, q_v[: self._num_joints], q_v[self._num_joints :], effort)
 
     def _calc_control_mode(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self.GetGuard(context).output.control_mode)
