@@ -209,7 +209,7 @@ def test_command_and_status_go_round(arm):
 @inside
 def test_a_killed_controller_is_followed_by_a_hold(arm):
     name, _, observer = arm
-    realtime = make_realtime() == ""
+    realtime = not make_realtime()
     controller = start_controller(name)
     try:
         observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 60, "start of the controller")

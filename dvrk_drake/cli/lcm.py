@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from contextlib import closing
+from contextlib import closing, nullcontext
 from typing import TYPE_CHECKING
 
 from dvrk_drake.cli.support import add_gravity, mounted, quiet_drake
@@ -35,25 +35,25 @@ def _add_arm(verbs: argparse._SubParsersAction) -> None:
 def _arm(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
+    from dvrk_drake.processes.live_view import live_view
     from dvrk_drake.processes.pace import make_realtime, settle_memory
     from dvrk_drake.processes.simulated_arm import SimulatedArm, load_driver, start_pose, stop_on_signals
-    from dvrk_drake.systems.arm_view import start_meshcat
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
     quiet_drake()
     arm = mounted(load_arm(options.arm), options.gravity)
     driver = DvrkDriver() if options.driver is None else load_driver(options.driver)
     pose = start_pose(arm, options.pose)
-    network = open_lcm(options.lcm_url or driver.lcm_url)
-    meshcat = start_meshcat() if options.meshcat else None
-    simulated = SimulatedArm(arm, driver, network, pose, meshcat)
+    url = open_lcm(options.lcm_url or driver.lcm_url).get_lcm_url()
+    simulated = SimulatedArm(arm, driver, url, pose)
     stopped = stop_on_signals()
-    if options.realtime and (warning := make_realtime()):
-        _warn(warning)
-    settle_memory()
-    where = f"; {meshcat.web_url()}" if meshcat else ""
-    print(f"simulated {arm.name} on LCM {network.get_lcm_url()}{where}; end with Ctrl-C", flush=True)
-    pace = simulated.run(stopped, lambda line: print(line, flush=True))
+    with live_view(options.arm, url) if options.meshcat else nullcontext():
+        if options.realtime:
+            for warning in make_realtime():
+                _warn(warning)
+        settle_memory()
+        print(f"simulated {arm.name} on LCM {url}; end with Ctrl-C", flush=True)
+        pace = simulated.run(stopped, lambda line: print(line, flush=True))
     print(f"ended; {pace.late} ticks began more than a period late", flush=True)
 
 
@@ -135,8 +135,9 @@ def ready_controller(
     if status.gravity_compensation:
         _warn(f"{arm.name} adds gravity compensation of its own: switch it off, or it is compensated twice")
     controller = ArmController(arm, model, mode, period)
-    if options.realtime and (warning := make_realtime()):
-        _warn(warning)
+    if options.realtime:
+        for warning in make_realtime():
+            _warn(warning)
     settle_memory()
     return controller, url, period
 
