@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from guard_bench import ARM, LIMIT, SESSION, N, Q
 
+from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
@@ -13,7 +14,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import describe_refusal
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.control import control, first_status, reset_fault
-from dvrk_drake.processes.live_status import LiveStatusMaker
+from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
 
@@ -134,10 +135,29 @@ def test_what_was_refused_since_the_last_report_is_in_words():
     maker = LiveStatusMaker(7, first)
     live = maker.make(status, 0.2, 0)
     assert live.problem == (
-        "2 refused: starting too far from the present efforts or pose, commands came too late 1 times"
+        "refused: starting too far from the present efforts or pose, no command for so long that the arm took over"
     )
     assert str(live).endswith(live.problem)
     assert not maker.make(status, 0.4, 0).problem
+
+
+def test_run_prints_what_is_new_and_nothing_twice(controller, monkeypatch, capsys):
+    def control(link, controller, stopped, tell):
+        for state, pace, problem in [
+            ("hold", "1 Hz", ""),
+            ("hold", "2 Hz", ""),
+            ("hold", "3 Hz", "refused: stale"),
+        ] * 2:
+            tell(LiveStatus(state, pace, problem))
+
+    monkeypatch.setattr("dvrk_drake.cli.lcm.ready_controller", lambda options, mode, reset: (controller, "", 1e-3))
+    monkeypatch.setattr("dvrk_drake.processes.control.control", control)
+    monkeypatch.setattr("dvrk_drake.processes.control.ArmLink", lambda arm, url: None)
+    monkeypatch.setattr("dvrk_drake.processes.simulated_arm.stop_on_signals", lambda: None)
+    assert main(["run", "--arm", "mtml", "--reset"]) == 0
+    said = capsys.readouterr()
+    assert said.out.splitlines()[1:-1] == ["hold; 1 Hz", "hold; 3 Hz; refused: stale"] * 2
+    assert not said.err
 
 
 def test_rate_and_round_trip_of_the_report():

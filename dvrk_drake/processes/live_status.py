@@ -18,7 +18,7 @@ class LiveStatus:
     Attributes:
         state: the guard's.
         pace: rate, round trip and losses.
-        problem: what was refused or expired since the last one, and why; or "".
+        problem: whether commands were refused or expired since the last one, and why; or "".
     """
 
     state: str
@@ -49,10 +49,10 @@ class LiveStatusMaker:
         rate = self._answered / (time - self._told_at)
         trip = 1e3 * float(np.median(self._trips)) if self._trips else float("nan")
         problem = []
-        if refused := status.num_refused - self._before.num_refused:
-            problem.append(f"{refused} refused: {describe_refusal(status.refusal_code)}")
-        if expired := status.num_expired - self._before.num_expired:
-            problem.append(f"commands came too late {expired} times")
+        if status.num_refused > self._before.num_refused:
+            problem.append(f"refused: {describe_refusal(status.refusal_code)}")
+        if status.num_expired > self._before.num_expired:
+            problem.append("no command for so long that the arm took over")
         self._before, self._told_at, self._answered = status, time, 0
         pace = f"{rate:.0f} Hz, round trip {trip:.2f} ms, {lost} statuses lost"
         return LiveStatus(describe_state(status.guard_state), pace, ", ".join(problem))
