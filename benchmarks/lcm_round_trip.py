@@ -2,14 +2,17 @@
 
     python benchmarks/lcm_round_trip.py [--seconds 60]
 
-This process is the arm, the simulated one of `dvrk-drake arm`, and takes the time from when a status goes out to when
-the command that answers it is heard. Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo
-that decodes a status and encodes a command and does nothing else. Each is measured quiet, with a client of the arm's
-Meshcat page, and with a busy process on every core; without and with real-time scheduling (`--realtime` of both verbs).
+The time is taken from when a status goes out to when the command that answers it is heard, in the process of the arm.
+That is one of two: "standing", a bridge that sends the messages of a driver at 1 kHz and has no physics in its loop: it
+shows what the controller needs; and "simulated", `dvrk-drake arm`, which hears an answer when it has computed its next
+state, in which the answer then acts.
 
-A tick without a fresh command is a status to which the arm had heard no answer when its next step began: it has a
-period less its own step (0.3 ms on a quiet machine) for that, and nothing at all when it is late itself and catches up.
-The echo's lines show how much of it is the arm and the machine.
+Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo that decodes a status and encodes a
+command and does nothing else. Each is measured quiet, with `dvrk-drake view --live` and a client of its page, and with
+a busy process on every core; without and with real-time scheduling (`--realtime` of both verbs, a core each).
+
+A tick without a fresh command is a status that was not answered when the next one went out. The echo's lines show how
+many of them are the machine's.
 
 It needs a multicast route:
 
@@ -22,60 +25,123 @@ As root, `unshare -n`: the root of `unshare -r` has no right to real-time schedu
 import argparse
 import base64
 import contextlib
+import itertools
+import multiprocessing
 import os
 import secrets
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from urllib.parse import urlsplit
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 
 import lcm
 import numpy as np
-from pydrake.geometry import Meshcat
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.processes.lcm_network import open_lcm
-from dvrk_drake.processes.pace import make_realtime, settle_memory
+from dvrk_drake.models.lcm_messages import command_channel, status_channel
+from dvrk_drake.processes.lcm_network import handle_message, listen, open_lcm
+from dvrk_drake.processes.pace import Pace, make_realtime, settle_memory
 from dvrk_drake.processes.simulated_arm import SimulatedArm, start_pose
-from dvrk_drake.systems.arm_view import start_meshcat
-from dvrk_drake.systems.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 ARM = load_arm("mtml")
+ARMS = ("standing", "simulated")
 CONDITIONS = ("quiet", "Meshcat client", "cores busy")
-ENCODE = lcmt_dvrk_status.encode
 RUN = ["-m", "dvrk_drake.cli", "run", "--arm", ARM.name.lower(), "--mode", "hold"]
 
 
-class TimedArm(SimulatedArm):
-    """The simulated arm, and when each status was out and the first command that answers it was heard [s]."""
+class Times:
+    """When each status went out and the first command that answers it was heard [s]."""
 
-    def __init__(self, meshcat: Meshcat | None) -> None:
+    def __init__(self) -> None:
         self.out: list[float] = []
         self.back: dict[int, float] = {}
-        # A function, which a status binds; a bound method it would call without itself.
-        lcmt_dvrk_status.encode = lambda status: self.encode(status)  # noqa: PLW0108
-        super().__init__(ARM, DvrkDriver(), open_lcm(), start_pose(ARM), meshcat)
 
-    def hear(self, channel: str, data: bytes) -> None:
-        """As the arm does, noting when."""
-        now = time.monotonic()
-        super().hear(channel, data)
-        sequence = lcmt_dvrk_command.decode(data).sequence
-        if sequence == len(self.out) - 1:  # the last status; what answers an earlier one came too late
-            self.back[sequence] = now
-
-    def encode(self, status: lcmt_dvrk_status) -> bytes:
-        """As every status, noting when: after publishing is too late, a woken peer may come first on this core."""
+    def went_out(self) -> None:
+        """To be called before publishing: after it is too late, a woken peer may come first on this core."""
         self.out.append(time.monotonic())
-        return ENCODE(status)
+
+    def heard(self, data: bytes, first: int) -> lcmt_dvrk_command:
+        """A command, which counts if it answers the last status; `first` is the sequence number of the first one."""
+        now, command = time.monotonic(), lcmt_dvrk_command.decode(data)
+        if command.sequence == first + len(self.out) - 1:
+            self.back.setdefault(len(self.out) - 1, now)
+        return command
 
     def trips(self, begin: int) -> np.ndarray:
         """Round trips [s] of the statuses from `begin` on, NaN where no command was heard."""
         # The last one may still be on its way.
         return np.array([self.back.get(k, np.nan) - out for k, out in enumerate(self.out)][begin:-1])
+
+
+class StandingArm:
+    """The bridge of an arm that stands still: the messages of a driver at 1 kHz, and no physics in its loop."""
+
+    def __init__(self) -> None:
+        self.times = Times()
+        self.sender_id = 0
+        q = start_pose(ARM).tolist()
+        none = [0.0] * ARM.num_joints
+        self.status = lcmt_dvrk_status()
+        self.status.session_id, self.status.arm_name, self.status.num_joints = secrets.randbits(62), ARM.name, len(q)
+        self.status.position, self.status.velocity, self.status.position_commanded = q, none, q
+        self.status.effort_measured, self.status.effort_commanded = none, none
+        self.status.joint_flags = [0] * len(q)
+        self.status.guard_state = lcmt_dvrk_status.STATE_HOLD
+        self.status.accepted_modes = 1 << lcmt_dvrk_command.EFFORT | 1 << lcmt_dvrk_command.HOLD
+
+    @property
+    def acts(self) -> bool:
+        """Whether commands act."""
+        return self.sender_id != 0
+
+    def run(self, stopped: Callable[[], bool]) -> None:
+        """A status each millisecond by the wall clock until `stopped`; a command that asks for efforts gets them."""
+        network = lcm.LCM()
+        network.subscribe(command_channel(ARM), self.hear)
+        pace = Pace(1e-3, sleep=lambda seconds: listen(network, seconds))
+        begin = time.time_ns() // 1000
+        while not stopped():
+            pace.wait()
+            while handle_message(network, 0.0):
+                pass
+            self.status.sequence = len(self.times.out)
+            self.status.utime = begin + 1000 * self.status.sequence
+            self.times.went_out()
+            network.publish(status_channel(ARM), self.status.encode())
+
+    def hear(self, channel: str, data: bytes) -> None:
+        """Takes a command, and makes its sender the one that acts."""
+        command = self.times.heard(data, first=0)
+        self.sender_id = command.sender_id
+        self.status.command_sender_id, self.status.command_sequence = command.sender_id, command.sequence
+        self.status.command_utime, self.status.guard_state = command.utime, lcmt_dvrk_status.STATE_EFFORT
+
+
+class TimedSimulatedArm(SimulatedArm):
+    """The simulated arm of `dvrk-drake arm`."""
+
+    def __init__(self) -> None:
+        self.times = Times()
+        super().__init__(ARM, DvrkDriver(), open_lcm().get_lcm_url(), start_pose(ARM))
+
+    @property
+    def acts(self) -> bool:
+        """Whether commands act; an echo asks for none."""
+        return self.guard.state == lcmt_dvrk_status.STATE_EFFORT or bool(self.times.back)
+
+    def hear(self, channel: str, data: bytes) -> None:
+        """As the arm does, noting when."""
+        self.times.heard(data, first=1)
+        super().hear(channel, data)
+
+    def send(self, network: lcm.LCM) -> None:
+        """As the arm does, noting when."""
+        self.times.went_out()
+        super().send(network)
 
 
 def echo(realtime: bool) -> None:
@@ -98,65 +164,93 @@ def echo(realtime: bool) -> None:
         network.handle()
 
 
-def watch(url: str) -> None:
+def watch(port: int) -> None:
     """A Meshcat client: a WebSocket that reads everything, as a browser does that has a GPU of its own to draw."""
-    address = urlsplit(url)
-    with socket.create_connection((address.hostname, address.port)) as connection:
-        key = base64.b64encode(secrets.token_bytes(16)).decode()
-        connection.sendall(
-            f"GET / HTTP/1.1\r\nHost: {address.netloc}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-            f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
-        )
-        while connection.recv(1 << 16):
-            pass
+    while True:
+        with contextlib.suppress(ConnectionRefusedError), socket.create_connection(("localhost", port)) as connection:
+            key = base64.b64encode(secrets.token_bytes(16)).decode()
+            connection.sendall(
+                f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+            )
+            for received in itertools.count(1):
+                for _ in range(10):
+                    if not connection.recv(1 << 10, socket.MSG_WAITALL):
+                        return
+                print(10 * received, "KB", flush=True)
+        time.sleep(0.1)
+
+
+def free_port() -> int:
+    """A port that nobody listens to now."""
+    with socket.socket() as listener:
+        listener.bind(("localhost", 0))
+        return listener.getsockname()[1]
 
 
 @contextlib.contextmanager
-def started(*arguments: str) -> Iterator[None]:
+def started(*arguments: str, stdout: int = subprocess.DEVNULL) -> Iterator[subprocess.Popen]:
     """A Python process of these arguments that ends with the block."""
-    process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen([sys.executable, *arguments], stdout=stdout)
     try:
-        yield
+        yield process
     finally:
         process.kill()
         process.wait()
 
 
-def measure(peer: list[str], condition: str, seconds: float, realtime: bool) -> np.ndarray:
+def measure(peer: list[str], simulated: bool, condition: str, seconds: float, realtime: bool) -> np.ndarray:
+    """As `be_the_arm`, in a process of its own: real-time scheduling is not given back."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
+        return process.submit(be_the_arm, peer, simulated, condition, seconds, realtime).result()
+
+
+def be_the_arm(peer: list[str], simulated: bool, condition: str, seconds: float, realtime: bool) -> np.ndarray:
     """Round trips [s] of `peer` for so long, from 2 s after its commands act, NaN where none was heard in time."""
-    meshcat = start_meshcat() if condition == "Meshcat client" else None
-    arm = TimedArm(meshcat)
+    arm = TimedSimulatedArm() if simulated else StandingArm()
     settle_memory()
     load: list[list[str]] = []
     if condition == "cores busy":
         load = [["-c", "while True: pass"]] * (os.cpu_count() or 1)
-    elif meshcat:
-        load = [[__file__, "--watch", meshcat.ws_url()]]
+    port = str(free_port())
+    if condition == "Meshcat client":
+        load = [["-m", "dvrk_drake.cli", "view", ARM.name.lower(), "--live", "--port", port]]
     begins: list[int] = []
+    times = arm.times
 
     def stopped() -> bool:
-        acts = arm.guard.state == lcmt_dvrk_status.STATE_EFFORT or (peer != RUN and arm.back)
-        if acts and not begins:
-            begins.append(len(arm.out) + 2000)
-        return bool(begins) and len(arm.out) > begins[0] + 1000 * seconds
+        if not begins and arm.acts:
+            begins.append(len(times.out) + 2000)
+        return bool(begins) and len(times.out) > begins[0] + 1000 * seconds
 
+    cores = os.sched_getaffinity(0)
     with contextlib.ExitStack() as stack:
-        for arguments in [*load, [*peer, *(["--realtime"] if realtime else [])]]:
+        for arguments in load:
             stack.enter_context(started(*arguments))
-        if realtime and (warning := make_realtime()):
-            print(f"warning: {warning}")
-        arm.run(stopped, lambda line: None)
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        if meshcat and meshcat.GetNumActiveConnections() != 1:
-            raise SystemExit("the Meshcat client is not connected")
-    return arm.trips(begins[0])
+        client = None
+        if condition == "Meshcat client":
+            client = stack.enter_context(started(__file__, "--watch", port, stdout=subprocess.PIPE))
+        if realtime:
+            # The peer inherits its core.
+            os.sched_setaffinity(0, {max(cores)})
+        stack.enter_context(started(*peer, *(["--realtime"] if realtime else [])))
+        if realtime:
+            os.sched_setaffinity(0, {min(cores)})
+            for warning in make_realtime():
+                print(f"warning: {warning}")
+        arm.run(stopped)
+        if client:
+            client.kill()
+            if not client.communicate()[0]:
+                raise SystemExit("the Meshcat client was sent nothing")
+    return times.trips(begins[0])
 
 
 def report(name: str, trips: np.ndarray) -> float:
     """Prints the percentiles [us]; returns the median. A command that never came counts as one that came late."""
     p50, p99, p999 = 1e6 * np.percentile(np.nan_to_num(trips, nan=np.inf), [50, 99, 99.9], method="higher")
     missed = np.count_nonzero(np.isnan(trips))
-    print(f"| {name:42} | {p50:6.0f} | {p99:6.0f} | {p999:6.0f} | {missed:4} of {len(trips)} |", end="", flush=True)
+    print(f"| {name:58} | {p50:6.0f} | {p99:6.0f} | {p999:6.0f} | {missed:4} of {len(trips)} |", end="", flush=True)
     return float(p50)
 
 
@@ -164,31 +258,36 @@ def main() -> None:
     """One table; the ratio is that of the medians."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--seconds", type=float, default=60.0, help="for each line of the table")
+    parser.add_argument("--arm", choices=ARMS, help="only with this arm")
     parser.add_argument("--condition", choices=CONDITIONS, help="only this one")
     parser.add_argument("--echo", action="store_true", help="be the echo")
     parser.add_argument("--realtime", action="store_true", help="of the echo")
-    parser.add_argument("--watch", metavar="URL", help="be the Meshcat client")
+    parser.add_argument("--watch", type=int, metavar="PORT", help="be the Meshcat client")
     options = parser.parse_args()
     if options.watch:
         watch(options.watch)
     elif options.echo:
         echo(options.realtime)
     else:
-        table(options.seconds, [options.condition] if options.condition else CONDITIONS)
+        table(options)
 
 
-def table(seconds: float, conditions: list[str]) -> None:
+def table(options: argparse.Namespace) -> None:
     """Measures and prints all lines."""
     print(f"load average at the start: {os.getloadavg()[0]:.2f} on {os.cpu_count()} cores")
-    print(f"| {'round trip [us]':42} |    p50 |    p99 |  p99.9 | without a fresh command | ratio |")
+    print(f"| {'round trip [us]':58} |    p50 |    p99 |  p99.9 | without a fresh command | ratio |")
     print("|---|---|---|---|---|---|")
-    for condition in conditions:
-        for realtime in (False, True):
-            name = f"{condition}, real-time" if realtime else condition
-            raw = report(f"echo, {name}", measure([__file__, "--echo"], condition, seconds, realtime))
-            print("  1.00 |")
-            ours = report(f"dvrk-drake run, {name}", measure(RUN, condition, seconds, realtime))
-            print(f" {ours / raw:5.2f} |")
+    for arm in ARMS if options.arm is None else [options.arm]:
+        for condition in CONDITIONS if options.condition is None else [options.condition]:
+            for realtime in (False, True):
+                name = f"{arm} arm, {condition}{', real-time' if realtime else ''}"
+                simulated = arm == "simulated"
+                raw = report(
+                    f"{name}: echo", measure([__file__, "--echo"], simulated, condition, options.seconds, realtime)
+                )
+                print("  1.00 |")
+                ours = report(f"{name}: dvrk-drake run", measure(RUN, simulated, condition, options.seconds, realtime))
+                print(f" {ours / raw:5.2f} |")
 
 
 if __name__ == "__main__":

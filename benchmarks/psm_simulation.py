@@ -16,7 +16,8 @@ Rows:
     cenic_ball   samples bound its steps, so that none is longer than 1 ms. The second has its loops pinned.
     free_mimic   CENIC with couplings and no controller: the arm falls, and CENIC chooses its steps. For its steps only.
 
-Rows that this version of drake cannot run are left out, with its reason: CENIC knows pins from 1.56 on.
+Rows that this version of drake cannot run are left out, with its reason: CENIC knows pins from 1.56 on. Ends with exit
+code 1 if `ball` is slower than it must be.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import sys
 import tempfile
 import time
 import xml.etree.ElementTree as ElementTree
@@ -174,7 +176,7 @@ def measure(row: StationRow | CenicRow, q: np.ndarray, seconds: float) -> tuple[
     return duration / seconds, round(steps / seconds)
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", metavar="FILE", help="write the numbers there too")
     parser.add_argument("--repetitions", type=int, default=11)
@@ -230,7 +232,8 @@ def main() -> None:
             }
             json.dump(result, stream, indent=2)
             stream.write("\n")
+    return int(factor["ball"] < LEAST_FACTOR)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

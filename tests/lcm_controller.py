@@ -13,7 +13,7 @@ import numpy as np
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.systems.dvrk_command_sender import draw_id
+from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
 
 
 class Controller:

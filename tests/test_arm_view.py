@@ -1,9 +1,14 @@
 """The Meshcat view: the linkage follows, sliders cannot leave the coupled limit, and the camera sees the whole arm."""
 
+import math
+
 import numpy as np
 import pytest
 
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.processes.live_view import show_status
 from dvrk_drake.systems.arm_view import ArmView, start_meshcat
 from dvrk_drake.systems.camera import ASPECT, HALF_HEIGHT, framing, geometry_corners
 
@@ -78,3 +83,27 @@ def test_camera_sees_the_whole_arm_and_wastes_no_room(name):
     share = np.maximum(np.abs(seen @ right) / ASPECT, np.abs(seen @ np.cross(right, forward))) / half_height
     assert (half_height > 0).all()
     assert 0.8 < share.max() < 1.0
+
+
+class Link:
+    """Statuses as an ArmLink gives them, one after the other; None is silence."""
+
+    def __init__(self, *positions):
+        self.positions = list(positions)
+
+    def next_status(self, seconds):
+        position = self.positions.pop(0)
+        if position is None:
+            raise ControllerError("no status")
+        status = lcmt_dvrk_status()
+        status.position = position
+        return status
+
+
+def test_a_live_view_draws_what_the_status_tells_and_keeps_it_in_silence():
+    arm = load_arm("mtml")
+    view, pose = ArmView(arm, start_meshcat()), [0.1, 0.2, 0.0, 0.0, 0.5, 0.0, 0.0]
+    link = Link(pose, None, [math.nan] * 7)
+    for _ in range(3):
+        show_status(view, link)
+        np.testing.assert_array_equal(view._q, pose)  # what was drawn last

@@ -49,7 +49,7 @@ def until(condition, seconds, process):
     while not condition():
         if process.poll() is not None:
             said = process.stdout.read()
-            assert process.returncode == 2 and "error: MTML took over and holds" in said, said
+            assert process.returncode == 2 and " took over and holds" in said, said
             return False
         assert time.monotonic() < deadline
         time.sleep(0.01)

@@ -10,7 +10,7 @@ import pytest
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.systems.guard_settings import GuardSettings
+from dvrk_drake.systems.guard.settings import GuardSettings
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "connecting_a_real_dvrk.md"
 ARM = load_arm("mtml")
@@ -115,6 +115,12 @@ class Scene:
         return {topic for topic, _ in self.crtk.told[begin:end]}
 
 
+@pytest.mark.parametrize("message", [Command, Status])
+def test_every_field_is_on_the_page(message):
+    text = DOCUMENT.read_text(encoding="utf-8")
+    assert not [name for name in message.__slots__ if f"`{name}`" not in text]
+
+
 def test_efforts_act_after_the_start_guard_and_a_dead_controller_is_followed_by_a_hold():
     scene = Scene(lambda scene, k: k < 400 and scene.send(Command.EFFORT), 500).run()
     assert scene.topics(0, 250) == {"servo_jp"}
@@ -134,9 +140,11 @@ def test_a_measurement_that_stops_ends_efforts():
         scene.crtk.age = max(0, k - 300) * 1e-3
 
     scene = Scene(script, 400).run()
-    assert scene.topics(260, 350) == {"servo_jf"}
-    assert scene.topics(351, 400) == {"servo_jp"}
-    assert scene.statuses[-1].fault_text == "measured_js is 0.051 s old"
+    assert scene.topics(260, 320) == {"servo_jf"}
+    assert scene.topics(321, 400) == {"hold"}
+    assert scene.statuses[-1].fault_text == "the measurement is 0.021 s old; allowed is 0 to 0.02 s"
+    # Statuses carry the time of the measurement, which stands still: nothing is recorded twice.
+    assert len({status.utime for status in scene.statuses[300:]}) == 1
 
 
 def test_an_arm_that_is_switched_off_is_sent_no_pose_and_held_where_it_fell():

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 import scipy.io
 
-from dvrk_drake.analysis.convert import convert, detect_format, read_team_mat, read_wpi_csv
+from dvrk_drake.analysis.convert import convert, detect_format
+from dvrk_drake.analysis.team_mat import read_team_mat
+from dvrk_drake.analysis.wpi_csv import read_wpi_csv
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.recording import read_recording
 
@@ -156,7 +158,8 @@ def test_team_mat_refuses_invalid_poses_or_skips_and_counts_them(tmp_path, value
     pattern = rf"poses\.mat:3: tau5 is {value}; only finite.*; 2 of 6 poses are invalid \(--skip-invalid"
     assert_refused(pattern, read_team_mat, path)
     assert not (tmp_path / "out.csv").exists()
-    recording, notes = convert(path, tmp_path / "out.csv", skip_invalid=True)
+    recording = convert(path, tmp_path / "out.csv", skip_invalid=True)
+    notes = recording.notes
     np.testing.assert_array_equal(recording.lines, [1, 2, 4, 5])
     np.testing.assert_array_equal(recording.q, array[:7, 0][:, [0, 1, 3, 4]].T)
     assert "2 of 6 poses skipped (NaN, infinite or all zeros): 3, 6" in notes
@@ -167,7 +170,8 @@ def test_team_mat_refuses_poses_that_were_never_recorded(tmp_path):
     array[:, :, 12:] = 0
     path = write_mat(tmp_path, a=array)
     assert_refused(r"poses\.mat:13: pose has only zeros.*18 of 30 poses", read_team_mat, path)
-    recording, notes = convert(path, tmp_path / "out.csv", skip_invalid=True)
+    recording = convert(path, tmp_path / "out.csv", skip_invalid=True)
+    notes = recording.notes
     assert len(recording) == 12
     assert notes[-1].endswith("13, 14, 15, 16, 17, 18, 19, 20, 21, 22, ...")
     nothing = write_mat(tmp_path, a=np.zeros((8, 2, 3)))
@@ -260,7 +264,8 @@ def test_wpi_csv_skips_invalid_rows_and_keeps_the_time_of_the_others(tmp_path):
     rows[1, 3] = np.nan
     rows[3, 20] = np.inf
     path = write_wpi(tmp_path, rows)
-    recording, notes = convert(path, tmp_path / "out.csv", skip_invalid=True)
+    recording = convert(path, tmp_path / "out.csv", skip_invalid=True)
+    notes = recording.notes
     np.testing.assert_array_equal(recording.t, [0, 0.01, 0.02])
     np.testing.assert_array_equal(recording.lines, [1, 3, 5])
     assert "2 of 5 rows skipped (NaN or infinite): lines 2, 4" in notes
@@ -276,13 +281,14 @@ def test_wpi_csv_skips_invalid_rows_and_keeps_the_time_of_the_others(tmp_path):
 def test_convert_team_mat_round_trip_is_exact(tmp_path):
     array = np.random.default_rng(2).normal(size=(8, 2, 72))
     path = write_mat(tmp_path, saved=array)
-    recording, notes = convert(path, tmp_path / "out.csv")
+    recording = convert(path, tmp_path / "out.csv")
+    notes = recording.notes
     again = read_recording(tmp_path / "out.csv")
     np.testing.assert_array_equal(again.q, array[:7, 0].T)
     np.testing.assert_array_equal(again.tau, recording.tau)
     assert again.t is None
     assert again.qd is None
-    assert notes == [
+    assert list(notes) == [
         "72 static poses from variable saved, in joint coordinates",
         "the eighth row (gripper, not actuated) is dropped",
     ]
@@ -292,7 +298,8 @@ def test_convert_wpi_csv_round_trip_is_exact(tmp_path):
     rows = np.random.default_rng(3).normal(size=(50, 21))
     rows[[10, 11]] = rows[9]
     path = write_wpi(tmp_path, rows)
-    recording, notes = convert(path, tmp_path / "out.csv", rate=100)
+    recording = convert(path, tmp_path / "out.csv", rate=100)
+    notes = recording.notes
     again = read_recording(tmp_path / "out.csv", coordinates="actuator")
     for name in ("t", "q", "qd", "tau"):
         np.testing.assert_array_equal(getattr(again, name), getattr(recording, name))
@@ -316,7 +323,7 @@ def test_detect_format(tmp_path):
 
 def test_an_explicit_format_wins_over_the_name(tmp_path):
     path = write_wpi(tmp_path, wpi_rows()).rename(tmp_path / "motion.mat")
-    assert len(convert(path, tmp_path / "out.csv", format="wpi-csv").recording) == 4
+    assert len(convert(path, tmp_path / "out.csv", format="wpi-csv")) == 4
 
 
 def test_convert_refuses_options_that_do_not_apply_and_unknown_formats(tmp_path):
@@ -350,7 +357,7 @@ def test_convert_leaves_an_old_output_alone_when_it_fails(tmp_path):
 def test_a_real_motion_without_its_header_and_time_converts_back(shared_data, tmp_path):
     original = (shared_data / "trajectories" / "mtm_one.csv").read_text().splitlines()[1:]
     path = write_text(tmp_path, "\n".join(line.split(",", 1)[1] for line in original))
-    _, notes = convert(path, tmp_path / "out.csv")
+    notes = convert(path, tmp_path / "out.csv").notes
     ours = read_recording(tmp_path / "out.csv", coordinates="actuator")
     theirs = read_recording(shared_data / "trajectories" / "mtm_one.csv", coordinates="actuator")
     for name in ("q", "qd", "tau"):

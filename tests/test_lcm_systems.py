@@ -16,12 +16,12 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.lcm_messages import is_status_of
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.dvrk_command_sender import DvrkCommandSender
-from dvrk_drake.systems.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.dvrk_status_receiver import DvrkStatusReceiver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.lcm_serializer import TolerantSerializer
-from dvrk_drake.systems.sim_dvrk_driver import apply_driver_config
+from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
+from dvrk_drake.systems.lcm.serializer import TolerantSerializer
+from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
 ARM = load_arm("mtml")
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
@@ -279,7 +279,9 @@ def test_a_limp_arm_falls_into_the_soft_wall(name):
 def test_off_lets_the_arm_fall():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm)
-    sender = Sending(lcm, control_mode=[float(Command.OFF)])
+    sender = Sending(lcm, control_mode=[float(Command.HOLD)])
+    run(lcm, 10, arm, sender)
+    sender.fix("control_mode", [float(Command.OFF)])
     run(lcm, 200, arm, sender)
     assert arm.statuses[-1].guard_state == Status.STATE_OFF
     assert not np.any(arm.statuses[-1].effort_measured)
@@ -327,7 +329,8 @@ def test_the_sender_asks_for_a_hold_unless_it_is_given_finite_numbers():
         ({"effort": effort, "desired_state": q_v, "control_mode": [2.0]}, Command.POSITION),
         ({"effort": effort, "control_mode": [2.0]}, Command.HOLD),
         ({"effort": effort, "control_mode": [np.nan]}, Command.HOLD),
-        ({"effort": effort, "control_mode": [0.0]}, Command.OFF),
+        ({"effort": effort, "control_mode": [0.0]}, Command.HOLD),
+        ({"effort": effort, "control_mode": [4.0]}, Command.OFF),
         ({"effort": effort * np.nan}, Command.HOLD),
         ({"effort": effort + 1e7}, Command.HOLD),
         ({"effort": effort, "reset_fault": [1.0]}, Command.HOLD),

@@ -26,7 +26,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes.pace import Pace, make_realtime
-from dvrk_drake.systems.dvrk_command_sender import draw_id
+from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
 
 NETWORK_URL, OTHER_URL = (f"udpm://239.255.76.67:{port}?ttl=0" for port in (7667, 7668))
 LCM_TOOLS = Path(lcm.__file__).parent / "../bin"
@@ -209,7 +209,7 @@ def test_command_and_status_go_round(arm):
 @inside
 def test_a_killed_controller_is_followed_by_a_hold(arm):
     name, _, observer = arm
-    realtime = make_realtime() == ""
+    realtime = not make_realtime()
     controller = start_controller(name)
     try:
         observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 60, "start of the controller")
@@ -258,7 +258,7 @@ def test_run_starts_ramps_in_and_leaves_the_arm_to_its_hold(arm, mode):
     assert drift(name, observer.last) < 1e-3
     assert "holds by itself" in said
     assert "effort; " in said and " Hz, round trip " in said
-    print(f"{name} {mode}: {said.splitlines()[-3].strip()}")
+    print(f"{name} {mode}: {said.splitlines()[-2].strip()}")
 
 
 @inside
@@ -279,7 +279,13 @@ def test_run_stops_when_the_arm_faults_and_refuses_one_that_has_a_fault(arm):
     again = start_run(name)
     assert again.wait(60) == 2
     assert "It must be reset first" in again.said()
-    reset(name, observer)
+    meant = start_run(name, "--reset")
+    try:
+        observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 90, "run after the reset")
+    finally:
+        said = meant.end(signal.SIGINT)
+    assert meant.wait(0) == 0, said
+    assert f"{name.upper()} has a fault, which is reset now: senders" in said
     assert drift(name, observer.last) < 1e-3
 
 
@@ -419,7 +425,7 @@ class ScriptedArm:
         self.held = IdentifiedModel.from_arm(load_arm("mtml")).holding_torque(POSES["mtml"])
         self.status = status = Status()
         status.arm_name, status.num_joints, status.session_id, status.utime = "MTML", 7, draw_id(), 10**15
-        status.guard_state, status.accepted_modes = Status.STATE_HOLD, 0b1111
+        status.guard_state, status.accepted_modes = Status.STATE_HOLD, 0b11110
         status.position = status.position_commanded = POSES["mtml"]
         status.velocity, status.joint_flags = [0.0] * 7, [0] * 7
         status.effort_measured = status.effort_commanded = self.held.tolist()

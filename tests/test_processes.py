@@ -51,12 +51,28 @@ def test_pace_far_behind_goes_on_from_now():
     assert beat.late == 1
 
 
-def test_no_permission_for_realtime_is_a_warning(monkeypatch):
+def test_what_is_not_permitted_for_realtime_is_a_warning(monkeypatch):
     def refuse(*arguments):
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    assert pace.make_realtime().startswith("no real-time scheduling (Operation not permitted): ")
+    monkeypatch.setattr(os, "open", refuse)
+    monkeypatch.setattr(pace, "_lock_memory", refuse)
+    scheduling, memory, cores = pace.make_realtime()
+    assert scheduling.startswith("no real-time scheduling") and scheduling.endswith("(Operation not permitted)")
+    assert "memlock" in memory and "/dev/cpu_dma_latency" in cores
+
+
+def test_realtime_is_real_time_and_locks_memory():
+    code = (
+        "import os; from dvrk_drake.processes.pace import make_realtime; "
+        "print(len(make_realtime()), os.sched_getscheduler(0) == os.SCHED_FIFO, "
+        "'VmLck:\\t       0 kB' not in open('/proc/self/status').read())"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    if result.stdout.split()[0] != "0":
+        pytest.skip("no permission for real-time scheduling, locked memory or cores that stay awake")
+    assert result.stdout.split() == ["0", "True", "True"]
 
 
 @pytest.mark.parametrize("url", ["bogus://", "udpm://nonsense"])

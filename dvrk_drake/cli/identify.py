@@ -149,7 +149,7 @@ def _convert(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
 
     console = make_console()
-    recording, notes = convert(
+    recording = convert(
         options.input,
         options.output,
         format=options.format,
@@ -158,7 +158,7 @@ def _convert(options: argparse.Namespace) -> None:
         arm=None if options.arm is None else load_arm(options.arm),
         skip_invalid=options.skip_invalid,
     )
-    for note in notes:
+    for note in recording.notes:
         console.print(note, soft_wrap=True)
     console.print(f"{options.output}: {len(recording)} rows, {recording.coordinates} coordinates", soft_wrap=True)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from contextlib import closing
+from contextlib import closing, nullcontext
 from typing import TYPE_CHECKING
 
 from dvrk_drake.cli.support import add_gravity, mounted, quiet_drake
@@ -35,25 +35,25 @@ def _add_arm(verbs: argparse._SubParsersAction) -> None:
 def _arm(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
+    from dvrk_drake.processes.live_view import live_view
     from dvrk_drake.processes.pace import make_realtime, settle_memory
     from dvrk_drake.processes.simulated_arm import SimulatedArm, load_driver, start_pose, stop_on_signals
-    from dvrk_drake.systems.arm_view import start_meshcat
-    from dvrk_drake.systems.dvrk_driver import DvrkDriver
+    from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
     quiet_drake()
     arm = mounted(load_arm(options.arm), options.gravity)
     driver = DvrkDriver() if options.driver is None else load_driver(options.driver)
     pose = start_pose(arm, options.pose)
-    network = open_lcm(options.lcm_url or driver.lcm_url)
-    meshcat = start_meshcat() if options.meshcat else None
-    simulated = SimulatedArm(arm, driver, network, pose, meshcat)
+    url = open_lcm(options.lcm_url or driver.lcm_url).get_lcm_url()
+    simulated = SimulatedArm(arm, driver, url, pose)
     stopped = stop_on_signals()
-    if options.realtime and (warning := make_realtime()):
-        _warn(warning)
-    settle_memory()
-    where = f"; {meshcat.web_url()}" if meshcat else ""
-    print(f"simulated {arm.name} on LCM {network.get_lcm_url()}{where}; end with Ctrl-C", flush=True)
-    pace = simulated.run(stopped, lambda line: print(line, flush=True))
+    with live_view(options.arm, url) if options.meshcat else nullcontext():
+        if options.realtime:
+            for warning in make_realtime():
+                _warn(warning)
+        settle_memory()
+        print(f"simulated {arm.name} on LCM {url}; end with Ctrl-C", flush=True)
+        pace = simulated.run(stopped, lambda line: print(line, flush=True))
     print(f"ended; {pace.late} ticks began more than a period late", flush=True)
 
 
@@ -61,20 +61,37 @@ def _add_run(verbs: argparse._SubParsersAction) -> None:
     verb = verbs.add_parser("run", help="compensate or hold an arm over LCM")
     add_control(verb)
     verb.add_argument("--mode", choices=("gravity", "hold"), default="gravity", help="default: gravity")
+    verb.add_argument(
+        "--reset", action="store_true", help="say which fault the arm has, if any, and clear it before it is controlled"
+    )
     verb.set_defaults(run=_run)
 
 
 def _run(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.control import ArmLink, control
+    from dvrk_drake.processes.live_line import LiveLine
+    from dvrk_drake.processes.live_status import LiveStatus
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
-    controller, url, period = ready_controller(options, options.mode)
+    controller, url, period = ready_controller(options, options.mode, reset=options.reset)
     arm = controller.arm
     stopped = stop_on_signals()
     print(f"{options.mode} of {arm.name} at {1 / period:.0f} Hz; Ctrl-C leaves it to its own hold", flush=True)
-    line_end = "\r" if sys.stdout.isatty() else "\n"
-    # A link of its own: what was said while the controller was compiled is past.
-    control(ArmLink(arm, url), controller, stopped, lambda line: print(f"{line:100}", end=line_end, flush=True))
+    line, told = LiveLine(sys.stderr), [("", "")]
+
+    def tell(status: LiveStatus) -> None:
+        if (news := (status.state, status.problem)) == told[0]:
+            line.show(lambda: str(status))
+            return
+        told[0] = news
+        line.clear()
+        print(status, flush=True)
+
+    try:
+        # A link of its own: what was said while the controller was compiled is past.
+        control(ArmLink(arm, url), controller, stopped, tell)
+    finally:
+        line.clear()
     print(f"{arm.name} holds by itself", flush=True)
 
 
@@ -86,8 +103,12 @@ def add_control(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--realtime", action="store_true", help="real-time scheduling, or a warning where not permitted")
 
 
-def ready_controller(options: argparse.Namespace, mode: Mode) -> tuple[ArmController, str, float]:
+def ready_controller(
+    options: argparse.Namespace, mode: Mode, *, reset: bool = False
+) -> tuple[ArmController, str, float]:
     """A controller of an arm that may be controlled, the URL of the network, and the period of its statuses [s].
+
+    With `reset` a latched fault is said and cleared first.
 
     Raises:
         ModelError: the model is of another arm.
@@ -97,7 +118,7 @@ def ready_controller(options: argparse.Namespace, mode: Mode) -> tuple[ArmContro
     from dvrk_drake.errors import ModelError
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.arm_controller import ArmController
-    from dvrk_drake.processes.control import ArmLink, first_status
+    from dvrk_drake.processes.control import ArmLink, first_status, reset_fault
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.pace import make_realtime, settle_memory
 
@@ -108,12 +129,15 @@ def ready_controller(options: argparse.Namespace, mode: Mode) -> tuple[ArmContro
         raise ModelError(f"{options.model}: is of {model.load_arm().name}, not of {arm.name}")
     url = open_lcm(options.lcm_url).get_lcm_url()
     with closing(ArmLink(arm, url)) as link:
+        if reset:
+            reset_fault(link, _warn)
         status, period = first_status(link)
     if status.gravity_compensation:
         _warn(f"{arm.name} adds gravity compensation of its own: switch it off, or it is compensated twice")
     controller = ArmController(arm, model, mode, period)
-    if options.realtime and (warning := make_realtime()):
-        _warn(warning)
+    if options.realtime:
+        for warning in make_realtime():
+            _warn(warning)
     settle_memory()
     return controller, url, period
 

@@ -28,8 +28,10 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     add_gravity(verb)
     verb.set_defaults(run=_model)
 
-    verb = verbs.add_parser("view", help="show an arm in a browser, with sliders that keep its linkage together")
+    verb = verbs.add_parser("view", help="show an arm in a browser: with sliders, or as it stands over LCM")
     verb.add_argument("arm", help="mtml, mtmr, psm, or the path of an arm's YAML file")
+    verb.add_argument("--live", action="store_true", help="as its status messages tell; without sliders")
+    verb.add_argument("--lcm-url", metavar="URL", help="of --live; default: LCM_DEFAULT_URL, or LCM's own")
     verb.add_argument("--port", type=int, help="of the page; default: a free one")
     verb.set_defaults(run=_view)
 
@@ -66,13 +68,24 @@ def _model(options: argparse.Namespace) -> None:
 
 def _view(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.processes.control import ArmLink
+    from dvrk_drake.processes.lcm_network import open_lcm
+    from dvrk_drake.processes.live_view import show_status
     from dvrk_drake.systems.arm_view import ArmView, start_meshcat
     from dvrk_drake.systems.camera import framing
 
     quiet_drake()
+    if options.lcm_url is not None and not options.live:
+        raise DvrkDrakeError("--lcm-url is of --live")
     arm = load_arm(options.arm)
+    url = open_lcm(options.lcm_url or "").get_lcm_url() if options.live else ""
     meshcat = start_meshcat(*framing(arm), port=options.port)
     view = ArmView(arm, meshcat)
+    if options.live:
+        link = ArmLink(arm, url)
+        print(f"{arm.name} live at {meshcat.web_url()}; end with Stop, Escape or Ctrl-C", flush=True)
+        until_stopped(meshcat, lambda: show_status(view, link))
+        return
     view.add_sliders()
     print(
         f"{arm.name} at {meshcat.web_url()}; sliders under Open Controls; end with Stop, Escape or Ctrl-C", flush=True

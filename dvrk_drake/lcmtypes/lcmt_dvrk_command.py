@@ -7,8 +7,8 @@ DO NOT MODIFY BY HAND!!!!
 What a controller asks of one arm of a da Vinci Research Kit. Channel: DVRK_COMMAND_<ARM>, e.g. DVRK_COMMAND_MTML.
 
 One command answers one status: read a DVRK_STATUS_<ARM> message, compute, echo its session_id and utime, send.
-The arm applies a command for 50 ms at most and then holds its pose by itself; what it refuses and why is in
-lcmt_dvrk_status. The rules are those of dvrk_drake/systems/command_guard.py.
+The arm obeys a command until 50 ms after status_utime, whenever it came, and then holds its pose by itself, without a
+fault; what it refuses and why is in lcmt_dvrk_status. The rules are those of dvrk_drake/systems/guard/command_guard.py.
 
 Units are SI: rad, rad/s, N m; m, m/s, N on a prismatic joint. Joints are in the dVRK's order; the jaw of a patient
 side manipulator is its last joint, also where ROS gives it a topic of its own.
@@ -25,14 +25,19 @@ class lcmt_dvrk_command(object):
 
     __dimensions__ = [None, None, None, None, None, None, None, None, None, ["num_joints"], ["num_joints"], ["num_joints"]]
 
-    OFF = 0
-    """ control_mode: motors without power; an arm without brakes falls """
+    INVALID = 0
+    """ control_mode: none, what a command has that was never filled in; always refused """
     HOLD = 1
     """ the arm holds its present pose by itself; always safe to send """
     POSITION = 2
     """ the arm follows `position`, and `velocity` as feed-forward """
     EFFORT = 3
     """ the motors apply `effort` """
+    OFF = 4
+    """
+    motors without power; an arm without brakes falls, so it is taken from an arm that holds only, after a HOLD of the
+    same sender, and never in a fault. It is no emergency stop: that is a button
+    """
 
     def __init__(self):
         self.utime = 0
@@ -61,7 +66,8 @@ class lcmt_dvrk_command(object):
 
         self.status_utime = 0
         """
-        utime of the status that this answers: by it the arm knows, on its own clock, how old this is
+        utime of the status that this answers: by it the arm knows, on its own clock, how old the measurement is that this
+        was computed from
         LCM Type: int64_t
         """
 
@@ -73,7 +79,7 @@ class lcmt_dvrk_command(object):
 
         self.control_mode = 0
         """
-        one of the constants above
+        one of the constants above; it must be in accepted_modes of the status
         LCM Type: int8_t
         """
 

@@ -38,11 +38,13 @@ class lcmt_dvrk_status(object):
     FAULT_POSITION_LIMIT = 2
     """ pushed beyond a position limit while effort commands acted """
     FAULT_MEASUREMENT = 3
-    """ measured positions, velocities or efforts were not finite """
+    """ measured positions, velocities or efforts were not finite, or too old """
     FAULT_CLOCK = 4
     """ the arm's own clock went backwards or stood still """
     FAULT_DRIVER = 5
     """ for bridges: whatever the arm itself reports, told in fault_text """
+    FAULT_FOLLOWING = 6
+    """ a joint was too far from where position commands led it: something is in its way """
     REFUSAL_NONE = 0
     """
     refusal_code, why a command was not taken: none was refused so far. A refused command does not act and does not keep
@@ -70,7 +72,7 @@ class lcmt_dvrk_status(object):
     REFUSAL_CLOCK_JUMP = 10
     """ the sender's utime and the arm's clock advanced differently; its next commands must start anew """
     REFUSAL_FAULT = 11
-    """ a fault is latched and this is no reset """
+    """ a fault is latched and this is not HOLD """
     REFUSAL_BAD_RESET = 12
     """ reset_fault with another mode than HOLD """
     REFUSAL_START_FAR = 13
@@ -82,6 +84,8 @@ class lcmt_dvrk_status(object):
     """ starting with efforts while the pose is beyond a position limit by more than half of the margin """
     REFUSAL_OTHER_SENDER = 15
     """ another sender is in command; this is a fault as well """
+    REFUSAL_SUDDEN_OFF = 16
+    """ OFF that does not follow a HOLD of the same sender """
     FLAG_EFFORT_CLAMPED = 1
     """ joint_flags, bits: the commanded effort was beyond the motor's limit """
     FLAG_RATE_LIMITED = 2
@@ -96,7 +100,8 @@ class lcmt_dvrk_status(object):
     def __init__(self):
         self.utime = 0
         """
-        arm's clock when the state was measured [us since 1970]; never jumps or goes backwards
+        arm's clock when the state was measured [us since 1970]; the clock never jumps or goes backwards. Two statuses of one
+        measurement have the same
         LCM Type: int64_t
         """
 
@@ -126,7 +131,7 @@ class lcmt_dvrk_status(object):
 
         self.accepted_modes = 0
         """
-        bit 1 << control_mode for each mode that a command may have now; in a fault only HOLD
+        bit 1 << control_mode for each mode that a command may have now: in a fault only HOLD; OFF only in HOLD and OFF
         LCM Type: int8_t
         """
 

@@ -6,6 +6,7 @@ import csv
 import hashlib
 import io
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,12 @@ def read_rows(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
             "with a point as the decimal sign"
         )
     return rows, hashlib.sha256(content).hexdigest()
+
+
+def listed(numbers: Iterable[int]) -> str:
+    """The first ten of them, in words."""
+    texts = list(map(str, numbers))
+    return ", ".join(texts if len(texts) <= 10 else [*texts[:10], "..."])
 
 
 def is_number(cell: str) -> bool:

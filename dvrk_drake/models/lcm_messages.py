@@ -18,6 +18,26 @@ _STATE_NAMES = {
     if name.startswith("STATE_")
 }
 
+_REFUSALS = {
+    lcmt_dvrk_status.REFUSAL_NONE: "none",
+    lcmt_dvrk_status.REFUSAL_UNREADABLE: "unreadable",
+    lcmt_dvrk_status.REFUSAL_WRONG_ARM: "meant for another arm",
+    lcmt_dvrk_status.REFUSAL_WRONG_SIZE: "of another number of joints",
+    lcmt_dvrk_status.REFUSAL_NOT_FINITE: "not finite",
+    lcmt_dvrk_status.REFUSAL_BAD_MODE: "in a mode that is not accepted now",
+    lcmt_dvrk_status.REFUSAL_NO_SENDER: "without a sender_id",
+    lcmt_dvrk_status.REFUSAL_WRONG_SESSION: "meant for the arm before it was restarted",
+    lcmt_dvrk_status.REFUSAL_STALE: "too late: the measurement is too old",
+    lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER: "sent twice or out of order",
+    lcmt_dvrk_status.REFUSAL_CLOCK_JUMP: "after a jump of the sender's clock",
+    lcmt_dvrk_status.REFUSAL_FAULT: "in a fault",
+    lcmt_dvrk_status.REFUSAL_BAD_RESET: "a reset that is no hold",
+    lcmt_dvrk_status.REFUSAL_START_FAR: "starting too far from the present efforts or pose",
+    lcmt_dvrk_status.REFUSAL_START_OUTSIDE: "starting while the arm is beyond a position limit",
+    lcmt_dvrk_status.REFUSAL_OTHER_SENDER: "from a second sender",
+    lcmt_dvrk_status.REFUSAL_SUDDEN_OFF: "off without a hold before",
+}
+
 
 def command_channel(arm: Arm) -> str:
     """DVRK_COMMAND_<ARM>."""
@@ -48,3 +68,8 @@ def decode(message_type: type[Message], data: bytes) -> Message | None:
 def describe_state(guard_state: int, fault_text: str = "") -> str:
     """A guard's state in words."""
     return _STATE_NAMES.get(guard_state, f"state {guard_state}") + (f": {fault_text}" if fault_text else "")
+
+
+def describe_refusal(refusal_code: int) -> str:
+    """Why a command was refused, in words."""
+    return _REFUSALS.get(refusal_code, f"refusal {refusal_code}")

@@ -10,10 +10,10 @@ from pydrake.systems.framework import DiagramBuilder
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.dvrk_command_sender import DvrkCommandSender
-from dvrk_drake.systems.dvrk_status_receiver import DvrkStatusReceiver
 from dvrk_drake.systems.effort_ramp import EffortRamp
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
+from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
+from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
 
 
 class ArmController:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable
 
 import lcm
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
@@ -16,12 +16,17 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, decode, describe_state, is_status_of, status_channel
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.lcm_network import handle_message
+from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
+from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
 
 #: Without a status for this long there is no arm [s]; at first it may have to be started.
 _SILENCE, _FIRST_WAIT = 1.0, 10.0
 
 #: How long the arm may take to confirm that it holds by itself [s].
 _RELEASE = 1.0
+
+#: The longest time for which a guard may remember a sender that is silent, and a little [s].
+_FORGOTTEN = 1.1
 
 #: How often `tell` hears the live status [s].
 _TELL = 0.2
@@ -78,18 +83,61 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
     """The first status of an arm that may be controlled, and the period in which statuses come [s].
 
     Raises:
-        ControllerError: no arm, a fault, a pose outside the limits, or an arm that takes no efforts.
+        ControllerError: no arm, a fault, a pose outside the limits, an arm that takes no efforts or is restarted.
     """
     status, name = link.next_status(_FIRST_WAIT), link.arm.name
-    if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
-        raise ControllerError(f"{name} has a fault: {status.fault_text}. It must be reset first")
+    _check(status, name, status.session_id, "It must be reset first, with run --reset")
     if violations := link.arm.limit_violations(status.position):
         raise ControllerError(f"{name} stands outside its limits: {'; '.join(violations)}. Move it inside first")
     if not status.accepted_modes >> lcmt_dvrk_command.EFFORT & 1:
         raise ControllerError(f"{name} does not accept efforts now; it is {describe_state(status.guard_state)}")
     for _ in range(20):
         later = link.next_status(_SILENCE)
+        _check(later, name, status.session_id)
+    if not (later.sequence > status.sequence and later.utime > status.utime):
+        raise ControllerError(f"{name} tells nothing new: its utime or sequence does not increase")
     return status, 1e-6 * (later.utime - status.utime) / (later.sequence - status.sequence)
+
+
+def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
+    """Asks the arm to clear its latched fault, if it has one, and leaves it in its hold.
+
+    Args:
+        link: to the arm.
+        tell: hears what the fault was, before it is cleared.
+
+    Raises:
+        ControllerError: no arm, or one whose fault stays, because its cause lasts.
+    """
+    status, name = link.next_status(_FIRST_WAIT), link.arm.name
+    if status.fault_code == lcmt_dvrk_status.FAULT_NONE:
+        return
+    fault = status.fault_text
+    tell(f"{name} has a fault, which is reset now: {fault}")
+    sender = DvrkCommandSender(link.arm)
+    context = sender.CreateDefaultContext()
+    start = time.monotonic()
+    # The flag must be seen to change: false, then true.
+    for reset in [0.0, 0.0, *[1.0] * 20]:
+        context.SetTime(time.monotonic() - start)
+        sender.GetInputPort("reset_fault").FixValue(context, np.array([reset]))
+        sender.GetInputPort("lcmt_dvrk_status").FixValue(context, AbstractValue.Make(status))
+        link.send(sender.get_output_port().Eval(context))
+        status = link.next_status(_SILENCE)
+    # Whoever comes while this sender is still remembered would be a second one: a guard may wait a second for that.
+    end = time.monotonic() + _FORGOTTEN
+    while time.monotonic() < end:
+        status = link.next_status(_SILENCE)
+    if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
+        raise ControllerError(f"{name} has a fault that stays: {status.fault_text or fault}")
+
+
+def _check(status: lcmt_dvrk_status, name: str, session: int, advice: str = "") -> None:
+    """Refuses an arm that was restarted or has a fault."""
+    if status.session_id != session:
+        raise ControllerError(f"{name} was restarted: look at it, then start again")
+    if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
+        raise ControllerError(f"{name} has a fault: {status.fault_text}" + (f". {advice}" if advice else ""))
 
 
 #: Hears a status and the time [s], and says the desired state (2n), or None for the controller's own.
@@ -100,7 +148,7 @@ def control(
     link: ArmLink,
     controller: ArmController,
     stopped: Callable[[], bool],
-    tell: Callable[[str], None],
+    tell: Callable[[LiveStatus], None],
     lead: Lead = lambda status, time: None,
 ) -> None:
     """Answers every status until `stopped`, then leaves the arm to its own hold.
@@ -109,41 +157,33 @@ def control(
         link: to the arm.
         controller: makes the commands.
         stopped: asked once a status.
-        tell: hears the live status a few times a second.
+        tell: hears how it goes a few times a second.
         lead: where to, asked once a status.
 
     Raises:
         ControllerError: the arm fell silent, faulted or was restarted.
     """
     start = time.monotonic()
-    session = link.next_status(_SILENCE).session_id
-    trips: deque[float] = deque(maxlen=1000)
-    answered, told_at, told_count = 0, start, 0
+    first = link.next_status(_SILENCE)
+    live, tell_at = LiveStatusMaker(controller.sender_id, first), _TELL
     while not stopped():
         status = link.next_status(_SILENCE)
-        if status.session_id != session:
-            raise ControllerError(f"{link.arm.name} was restarted: look at it, then start again")
-        if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
-            raise ControllerError(f"{link.arm.name} has a fault: {status.fault_text}")
+        _check(status, link.arm.name, first.session_id)
         now = time.monotonic() - start
         link.send(controller.answer(status, now, lead(status, now)))
-        answered += 1
-        if status.command_sender_id == controller.sender_id:
-            trips.append(now - 1e-6 * status.command_utime)
-        if now + start - told_at >= _TELL:
-            rate = (answered - told_count) / (now + start - told_at)
-            trip = 1e3 * float(np.median(trips)) if trips else float("nan")
-            state = describe_state(status.guard_state)
-            tell(f"{state}; {rate:.0f} Hz, round trip {trip:.2f} ms, {link.lost} statuses lost")
-            told_at, told_count = now + start, answered
-    _release(link, controller, start)
+        live.answer(status, now)
+        if now >= tell_at:
+            tell(live.make(status, now, link.lost))
+            tell_at = now + _TELL
+    _release(link, controller, start, first.session_id)
 
 
-def _release(link: ArmLink, controller: ArmController, start: float) -> None:
+def _release(link: ArmLink, controller: ArmController, start: float, session: int) -> None:
     """Asks the arm to hold until it says that it does."""
     end = time.monotonic() + _RELEASE
     while time.monotonic() < end:
         status = link.next_status(_SILENCE)
+        _check(status, link.arm.name, session)
         if status.guard_state in (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_OFF):
             return
         command = controller.answer(status, time.monotonic() - start)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import secrets
 import select
+import time
 
 import lcm
-from pydrake.lcm import DrakeLcm
+from pydrake.lcm import DrakeLcm, DrakeLcmParams
 
 from dvrk_drake.errors import DvrkDrakeError
 
@@ -20,7 +21,8 @@ def open_lcm(url: str = "") -> DrakeLcm:
     Raises:
         DvrkDrakeError: LCM does not know such a network, or a message to oneself does not come back.
     """
-    network = DrakeLcm(url)
+    # Deferred: a network that only publishes needs no thread that wakes for every message.
+    network = DrakeLcm(DrakeLcmParams(lcm_url=url, defer_initialization=True))
     name = network.get_lcm_url()
     try:
         own = lcm.LCM(name)
@@ -44,3 +46,10 @@ def handle_message(network: lcm.LCM, seconds: float) -> bool:
     if ready:
         network.handle()
     return bool(ready)
+
+
+def listen(network: lcm.LCM, seconds: float) -> None:
+    """Handles what comes within that time, so that a tick begins with little left to do."""
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        handle_message(network, left)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import time
@@ -47,18 +48,42 @@ class Pace:
         self._next += self._period
 
 
-def make_realtime() -> str:
-    """Schedules this process as real-time (SCHED_FIFO, priority 50).
+def make_realtime() -> list[str]:
+    """Schedules this process as real-time (SCHED_FIFO, priority 50), keeps its memory and the machine's cores awake.
+
+    Threads that are started later inherit the priority, as LCM's do. A core that sleeps takes longer to wake than an
+    answer to compute: the request of https://docs.kernel.org/power/pm_qos_interface.html keeps them from it until this
+    process ends.
 
     Returns:
-        "", or a warning that says why it could not.
+        What could not be had and why, a warning each.
     """
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
-    except (OSError, AttributeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        return f"no real-time scheduling ({reason}): give the user an rtprio limit of {_PRIORITY}, or CAP_SYS_NICE"
-    return ""
+    warnings = []
+    for step, what in (
+        (_schedule, f"no real-time scheduling: give the user an rtprio limit of {_PRIORITY}, or CAP_SYS_NICE"),
+        (_lock_memory, "memory may be paged out: give the user an unlimited memlock limit, or CAP_IPC_LOCK"),
+        (_keep_cores_awake, "cores may sleep between messages: let the user write /dev/cpu_dma_latency"),
+    ):
+        try:
+            step()
+        except (OSError, AttributeError) as error:
+            warnings.append(f"{what} ({getattr(error, 'strerror', None) or error})")
+    return warnings
+
+
+def _schedule() -> None:
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+
+
+def _lock_memory() -> None:
+    current, future = 1, 2  # MCL_CURRENT, MCL_FUTURE
+    if ctypes.CDLL(None, use_errno=True).mlockall(current | future):
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+
+def _keep_cores_awake() -> None:
+    # Never closed: the request lasts as long as the file is open.
+    os.write(os.open("/dev/cpu_dma_latency", os.O_WRONLY), (0).to_bytes(4, "little"))
 
 
 def settle_memory() -> None:

@@ -11,20 +11,19 @@ import lcm
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.common.yaml import yaml_load_typed
-from pydrake.geometry import Meshcat
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import command_channel, describe_state
-from dvrk_drake.processes.lcm_network import handle_message
+from dvrk_drake.models.lcm_messages import command_channel, describe_state, status_channel
+from dvrk_drake.processes.lcm_network import handle_message, listen
 from dvrk_drake.processes.pace import Pace
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.command_guard import CommandGuard
-from dvrk_drake.systems.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.sim_dvrk_driver import apply_driver_config
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
 #: More commands in one step are a flood: the rest waits, and is stale when it is looked at.
 _MESSAGES_A_STEP = 200
@@ -69,19 +68,20 @@ class SimulatedArm:
         self,
         arm: Arm,
         driver: DvrkDriver,
-        network: DrakeLcm,
+        url: str,
         q: ArrayLike,
-        meshcat: Meshcat | None = None,
     ) -> None:
-        """At rest at the pose q (n,); the arm's clock starts at the time of day."""
-        self.arm, self.driver = arm, driver
+        """On the LCM network `url`, at rest at the pose q (n,); the arm's clock starts at the time of day."""
+        self.arm, self.driver, self._url = arm, driver, url
         self._ticks = 0
+        self._status = b""
+        self._memory = DrakeLcm("memq://")
+        self._memory.Subscribe(status_channel(arm), self._keep_status)
         builder = DiagramBuilder()
-        station = builder.AddSystem(ArmStation(arm, meshcat=meshcat))
+        station = builder.AddSystem(ArmStation(arm))
         self._driver = apply_driver_config(
-            driver, station, network, builder, start_utime=time.time_ns() // 1000, subscribe=False
+            driver, station, self._memory, builder, start_utime=time.time_ns() // 1000, subscribe=False
         )
-        self._url = network.get_lcm_url()
         self._simulator = Simulator(builder.Build())
         context = self._simulator.get_mutable_context()
         station.set_positions(station.GetMyMutableContextFromRoot(context), q)
@@ -97,44 +97,50 @@ class SimulatedArm:
         self._driver.Receive(data)
 
     def step(self) -> None:
-        """Takes what was heard, moves on by one period of the driver, and tells of it."""
+        """Takes what was heard and moves on by one period of the driver."""
         self._ticks += 1
         self._simulator.AdvanceTo(self._ticks * self.driver.status_period)
+        self._memory.HandleSubscriptions(0)
 
-    def run(self, stopped: Callable[[], bool], tell: Callable[[str], None]) -> Pace:
+    def send(self, network: lcm.LCM) -> None:
+        """Tells of the state as it is now."""
+        network.publish(status_channel(self.arm), self._status)
+
+    def run(self, stopped: Callable[[], bool], tell: Callable[[str], None] = lambda line: None) -> Pace:
         """Steps by the wall clock until `stopped`, and tells of every change of the guard's state.
+
+        A status goes out when its tick begins, and the simulation computes the next state while the controller computes
+        its answer, which acts from the next tick on: as with an arm, whose motors do not wait for it.
 
         Returns:
             The pace, with the count of late ticks.
         """
         # Opened here, as LCM's reading thread is scheduled like the thread that opens it. Drake's own subscription
         # would keep one message between two steps; a second sender must not hide there.
-        commands = lcm.LCM(self._url)
-        commands.subscribe(command_channel(self.arm), self.hear).set_queue_capacity(_MESSAGES_A_STEP)
-        pace = Pace(self.driver.status_period, sleep=lambda seconds: _listen(commands, seconds))
+        network = lcm.LCM(self._url)
+        network.subscribe(command_channel(self.arm), self.hear).set_queue_capacity(_MESSAGES_A_STEP)
+        self.step()
+        pace = Pace(self.driver.status_period, sleep=lambda seconds: listen(network, seconds))
         told = ""
         while not stopped():
             pace.wait()
             for _ in range(_MESSAGES_A_STEP):
-                if not handle_message(commands, 0.0):
+                if not handle_message(network, 0.0):
                     break
+            self.send(network)
             self.step()
             if (state := self._describe()) != told:
                 tell(f"{self._simulator.get_context().get_time():9.3f} s  {state}")
                 told = state
         return pace
 
+    def _keep_status(self, data: bytes) -> None:
+        self._status = data
+
     def _describe(self) -> str:
         guard = self.guard
         sender = f", sender {guard.sender_id}" if guard.sender_id else ""
         return describe_state(guard.state, guard.fault_text) + sender
-
-
-def _listen(network: lcm.LCM, seconds: float) -> None:
-    """Handles what comes within that time, so that a tick begins with little left to do."""
-    end = time.monotonic() + seconds
-    while (left := end - time.monotonic()) > 0:
-        handle_message(network, left)
 
 
 def stop_on_signals() -> Callable[[], bool]:

@@ -16,8 +16,8 @@ from pydrake.systems.primitives import MatrixGain, PassThrough, Saturation
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import Closure, add_arm, set_arm_positions, tree_selector
-from dvrk_drake.systems.arm_connection import connect_arm
-from dvrk_drake.systems.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.arm_connection import connect_arm
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.station_ports import station_ports
 
 

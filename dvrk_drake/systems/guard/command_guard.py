@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
-from dvrk_drake.systems.command_check import is_finite, refusal_by_itself
-from dvrk_drake.systems.command_stream import CommandStream
-from dvrk_drake.systems.guard_limits import GuardLimits, Vector
-from dvrk_drake.systems.guard_output import GuardCounts, GuardOutput
-from dvrk_drake.systems.guard_settings import GuardSettings
+from dvrk_drake.systems.guard.command_stream import CommandInForce, CommandStream, GuardCounts, refusal_by_itself
+from dvrk_drake.systems.guard.follower import Follower, GuardOutput
+from dvrk_drake.systems.guard.limits import GuardLimits, Vector
+from dvrk_drake.systems.guard.measurement import Measurement
+from dvrk_drake.systems.guard.settings import GuardSettings
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
@@ -22,29 +20,10 @@ if TYPE_CHECKING:
 #: No longer time between two steps is made up for in rate limits [s].
 _LONGEST_STEP = 0.01
 
-#: By a clock that stands still nothing expires; Drake takes two steps at the time at which it starts.
-_MOST_STEPS_AT_ONE_TIME = 10
-
-_PASSIVE = (lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD)
 _ACTIVE = {
     lcmt_dvrk_command.POSITION: lcmt_dvrk_status.STATE_POSITION,
     lcmt_dvrk_command.EFFORT: lcmt_dvrk_status.STATE_EFFORT,
 }
-
-
-@dataclass
-class _Force:
-    """The command in force or being watched, when it was accepted, and since when its stream has been good [us].
-
-    The numbers that act are copies, which whoever made the command cannot change any more.
-    """
-
-    command: lcmt_dvrk_command = field(default_factory=lcmt_dvrk_command)
-    position: Vector = field(default_factory=lambda: np.zeros(0))
-    velocity: Vector = field(default_factory=lambda: np.zeros(0))
-    effort: Vector = field(default_factory=lambda: np.zeros(0))
-    accepted: int = 0
-    good_since: int = 0
 
 
 class CommandGuard:
@@ -63,15 +42,23 @@ class CommandGuard:
 
     ::
 
-        OFF <--OFF-- any state but FAULT       OFF --HOLD--> HOLD       any --HOLD--> HOLD, but from FAULT
+        HOLD --OFF after a HOLD--> OFF --HOLD--> HOLD       any --HOLD--> HOLD, but from FAULT
         HOLD --POSITION, EFFORT--> STARTING --good for start_time--> POSITION, EFFORT
-        STARTING --refused, none for expiry--> HOLD
-        POSITION, EFFORT --HOLD, none for expiry, sender's clock jumped--> HOLD; --the other mode--> STARTING
+        STARTING --refused, expired--> HOLD
+        POSITION, EFFORT --HOLD, expired, sender's clock jumped--> HOLD; --the other mode--> STARTING
         any --fault--> FAULT --HOLD with reset_fault, changed from false to true--> HOLD
 
+    **Expiry**: a command is obeyed until `expiry` after the measurement that it answers (its `status_utime`), whenever
+    it came; who answers one measurement again and again gains no time. Then the arm holds, without a fault: nobody
+    need find out what happened before it is safe, and the next sender is watched as the first was.
+
     **What is refused** (`lcmt_dvrk_status.REFUSAL_*` has the list): what is unreadable, of another arm, size or
-    session, not finite, older than `expiry` by the status that it answers, out of order or sent twice, in a mode that
-    is not accepted now. It does not act and does not keep an older command alive, so bad commands end in HOLD.
+    session, not finite, expired when it comes, out of order or sent twice, in a mode that is not accepted now. It does
+    not act and does not keep an older command alive, so bad commands end in HOLD.
+
+    **OFF** drops an arm without brakes, so no single message does it: the arm must hold, and the sender's last command
+    must have been HOLD. In a fault it is refused: somebody is confused then, and the arm is held. An emergency is what
+    the stop button is for, not a message.
 
     **Start guard**: before commands act they must have come without a gap of `expiry` and without a refusal for
     `start_time`, all near the present: efforts near the measured ones, positions near the measured ones, also where the
@@ -79,10 +66,10 @@ class CommandGuard:
     present effort beyond what commands may use. A sender that starts with something else is refused, so a restarted or
     confused controller moves nothing.
 
-    **Faults** are latched: two senders at once, a pose beyond a limit (by half the margin) while efforts
-    act, a measurement that is not finite, the arm's clock going backwards or standing still, and what a driver reports.
-    The reset must be meant: the flag must change from false to true in a HOLD command, and a cause that lasts faults
-    again.
+    **Faults** are latched: two senders at once, a pose beyond a limit (by half the margin) while efforts act, a joint
+    that does not follow position commands, a measurement that is not finite or too old, the arm's clock going backwards
+    or standing still, and what a driver reports. The reset must be meant: the flag must change from false to true in a
+    HOLD command, and a cause that lasts faults again.
 
     **Without a bump**: HOLD keeps the target that was regulated to, after POSITION only while the arm is near it, and
     else latches the measured pose; POSITION starts from the held pose; EFFORT starts from the measured effort, and the
@@ -119,22 +106,17 @@ class CommandGuard:
         self._modes = tuple(_ACTIVE) if modes is None else modes
         self._expiry = round(1e6 * self.settings.expiry)
         self._stream = CommandStream(self._expiry, round(1e6 * self.settings.clock_tolerance))
-        self._force = _Force()
-        self._utime: int | None = None
-        self._steps_at_one_time = 0
+        self._force = CommandInForce()
         self._powered = True
-        self._q: Vector | None = None
-        self._v = self._effort = np.zeros(self.num_joints)
-        self._target = self._last_effort = np.zeros(self.num_joints)
-        # What the walls add at once where efforts begin to act; it is taken back, less and less.
-        self._kick = np.zeros(self.num_joints)
+        self._measured = Measurement(arm.num_joints, round(1e6 * self.settings.measurement_age))
+        self._follower = Follower(self.limits)
         self.output = self._output(0.0)
 
     def __deepcopy__(self, memo: object) -> CommandGuard:
         # A Drake context copies its state before every update, so this must be quick. No array is changed in place.
         other = object.__new__(CommandGuard)
         other.__dict__.update(self.__dict__)
-        for name in ("counts", "_stream", "_force"):
+        for name in ("counts", "_stream", "_force", "_follower", "_measured"):
             part = getattr(self, name)
             twin = object.__new__(type(part))
             twin.__dict__.update(part.__dict__)
@@ -146,7 +128,11 @@ class CommandGuard:
         """Bit 1 << mode for each mode that a command may have now."""
         if self.state == lcmt_dvrk_status.STATE_FAULT:
             return 1 << lcmt_dvrk_command.HOLD
-        modes = _PASSIVE if self.state == lcmt_dvrk_status.STATE_OFF else (*_PASSIVE, *self._modes)
+        modes = [lcmt_dvrk_command.HOLD]
+        if self.state in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_HOLD):
+            modes.append(lcmt_dvrk_command.OFF)
+        if self.state != lcmt_dvrk_status.STATE_OFF:
+            modes.extend(self._modes)
         return sum(1 << mode for mode in modes)
 
     @property
@@ -182,21 +168,31 @@ class CommandGuard:
             self._hold()
         return code
 
-    def step(self, utime: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> GuardOutput:
-        """What to do from `utime` [us] on, given the measured q, v and effort (n,) [rad, rad/s, N m; m, m/s, N]."""
-        dt = 0.0 if self._utime is None else 1e-6 * (utime - self._utime)
+    def step(self, utime: int, measured_utime: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> GuardOutput:
+        """What to do from `utime` [us] on.
+
+        Args:
+            utime: the arm's clock now [us].
+            measured_utime: the arm's clock when q, v and effort were measured [us]; too old is a fault.
+            q: measured positions (n,) [rad, m].
+            v: velocities (n,) [rad/s, m/s].
+            effort: what the motors applied (n,) [N m, N].
+        """
+        dt, problem = self._measured.advance(utime)
         if dt < 0:
             self._stream.forget()
-            self._force = _Force(accepted=utime)
-            self.report_fault(f"the arm's clock went back by {-dt:.6f} s", lcmt_dvrk_status.FAULT_CLOCK)
-        self._steps_at_one_time = 0 if dt else self._steps_at_one_time + 1
-        if self._steps_at_one_time > _MOST_STEPS_AT_ONE_TIME:
-            self.report_fault("the arm's clock stands still", lcmt_dvrk_status.FAULT_CLOCK)
-        self._utime = utime
-        self._measure(np.array(q, float), np.array(v, float), np.array(effort, float))
+        if problem:
+            self.report_fault(problem, lcmt_dvrk_status.FAULT_CLOCK)
+        lost = self._measured.q is None
+        if problem := self._measured.take(utime - measured_utime, q, v, effort):
+            self.report_fault(problem, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=False)
+        elif lost:
+            self._follower.target = self._q()
         self._expire(utime)
-        if self.state == lcmt_dvrk_status.STATE_EFFORT and (excess := self.limits.beyond(self._measured_q())):
+        if self.state == lcmt_dvrk_status.STATE_EFFORT and (excess := self.limits.beyond(self._q())):
             self.report_fault(excess, lcmt_dvrk_status.FAULT_POSITION_LIMIT)
+        if self.state == lcmt_dvrk_status.STATE_POSITION and (away := self._follower.astray(self._q())):
+            self.report_fault(away, lcmt_dvrk_status.FAULT_FOLLOWING)
         self.output = self._output(min(max(dt, 0.0), _LONGEST_STEP))
         return self.output
 
@@ -219,28 +215,18 @@ class CommandGuard:
     def _is_watched_or_in_force(self) -> bool:
         return self.state in (lcmt_dvrk_status.STATE_STARTING, *_ACTIVE.values())
 
-    def _measured_q(self) -> Vector:
-        return self._target if self._q is None else self._q
-
-    def _measure(self, q: Vector, v: Vector, effort: Vector) -> None:
-        shape = (self.num_joints,)
-        if not (q.shape == v.shape == effort.shape == shape and is_finite(q, v, effort)):
-            text = f"the measured positions, velocities or efforts are not {self.num_joints} finite numbers each"
-            self.report_fault(text, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=False)
-            self._q = None
-            return
-        if self._q is None:
-            self._target = q.copy()
-        self._q, self._v, self._effort = q, v, effort
+    def _q(self) -> Vector:
+        """The measured pose (n,), or where it was last wanted."""
+        return self._follower.target if self._measured.q is None else self._measured.q
 
     def _expire(self, utime: int) -> None:
-        if self._is_watched_or_in_force() and utime - self._force.accepted > self._expiry:
+        if self._is_watched_or_in_force() and utime - self._force.status_utime > self._expiry:
             self.counts.expired += self.state != lcmt_dvrk_status.STATE_STARTING
             self._hold()
 
     def _refusal_now(self, command: lcmt_dvrk_command, utime: int) -> int:
         """REFUSAL_* of a command that is good by itself, given who sent what before and what the arm is doing."""
-        if self._utime is None or not 0 <= utime - command.status_utime <= self._expiry:
+        if self._measured.utime is None or not 0 <= utime - command.status_utime <= self._expiry:
             return lcmt_dvrk_status.REFUSAL_STALE
         before, code = self._stream.sender_id, self._stream.refusal(command, utime)
         if code == lcmt_dvrk_status.REFUSAL_OTHER_SENDER:
@@ -255,7 +241,7 @@ class CommandGuard:
         if command.control_mode < 0 or not self.accepted_modes >> command.control_mode & 1:
             return lcmt_dvrk_status.REFUSAL_BAD_MODE
         if command.control_mode in _ACTIVE and self.state != _ACTIVE[command.control_mode]:
-            return self.limits.refusal_to_start(command, self._measured_q(), self._effort)
+            return self.limits.refusal_to_start(command, self._q(), self._measured.effort)
         return lcmt_dvrk_status.REFUSAL_NONE
 
     def _accept(self, command: lcmt_dvrk_command, utime: int) -> None:
@@ -264,10 +250,7 @@ class CommandGuard:
         self.counts.lost = self._stream.lost
         mode, force = command.control_mode, self._force
         goes_on = self.state == lcmt_dvrk_status.STATE_STARTING and mode == force.command.control_mode
-        force.command, force.accepted = command, utime
-        force.position, force.velocity, force.effort = (
-            np.array(numbers, float) for numbers in (command.position, command.velocity, command.effort)
-        )
+        force.take(command)
         if mode == lcmt_dvrk_command.OFF:
             self.state, self._powered = lcmt_dvrk_status.STATE_OFF, False
         elif mode == lcmt_dvrk_command.HOLD:
@@ -281,39 +264,34 @@ class CommandGuard:
             self._hold()
             self.state, force.good_since = lcmt_dvrk_status.STATE_STARTING, utime
         elif utime - force.good_since >= 1e6 * self.settings.start_time:
-            limits = self.limits
-            self._last_effort = np.clip(self._effort, -limits.command_limits, limits.command_limits)
-            restrained, _ = limits.restrain_effort(self._last_effort, self._measured_q(), self._v)
-            self._kick = restrained - self._last_effort
-            self.state = _ACTIVE[mode]
+            self._act(mode)
+
+    def _act(self, mode: int) -> None:
+        self.state = _ACTIVE[mode]
+        if mode == lcmt_dvrk_command.POSITION:
+            self._follower.begin_position()
+        else:
+            self._follower.begin_effort(self._measured.effort, self._q(), self._measured.v)
 
     def _hold(self) -> None:
         """To HOLD, at the pose that is held already or else at the measured one."""
-        q = self._measured_q()
+        q = self._q()
         regulated = (
             self.state in (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_FAULT)
             and self._powered
         )
-        near = bool(np.all(np.abs(self._target - q) <= self.limits.start_position))
-        if not (regulated or (self.state == lcmt_dvrk_status.STATE_POSITION and near)):
-            self._target = q.copy()
+        if not (regulated or (self.state == lcmt_dvrk_status.STATE_POSITION and self._follower.is_near(q))):
+            self._follower.target = q.copy()
         self.state, self._powered = lcmt_dvrk_status.STATE_HOLD, True
 
     def _output(self, dt: float) -> GuardOutput:
-        n, limits, force = self.num_joints, self.limits, self._force
-        velocity, effort, flags = np.zeros(n), np.zeros(n), np.zeros(n, np.int8)
-        q = self._measured_q()
+        follower, force = self._follower, self._force
+        q = self._q()
         if not self._powered:
-            return GuardOutput(lcmt_dvrk_command.OFF, q.copy(), velocity, effort, flags)
+            return follower.off(q)
         if self.state == lcmt_dvrk_status.STATE_POSITION:
-            self._target, flags = limits.limit_position(force.position, self._target, dt)
-            velocity = limits.limit_velocity(force.velocity, self._target, flags)
-            return GuardOutput(lcmt_dvrk_command.POSITION, self._target.copy(), velocity, effort, flags)
-        if self.state == lcmt_dvrk_status.STATE_EFFORT and self._utime is not None:
-            self._last_effort, flags = limits.follow_effort(force.effort, self._last_effort, dt)
-            effort, restrained = limits.restrain_effort(self._last_effort, q, self._v)
-            acted_for = 1e-6 * (self._utime - force.good_since) - self.settings.start_time
-            kick = self._kick * min(max(1.0 - acted_for / self.settings.start_time, 0.0), 1.0)
-            effort = np.clip(effort - kick, -limits.effort_limits, limits.effort_limits)
-            return GuardOutput(lcmt_dvrk_command.EFFORT, q.copy(), velocity, effort, flags | restrained)
-        return GuardOutput(lcmt_dvrk_command.HOLD, self._target.copy(), velocity, effort, flags)
+            return follower.follow_position(force.position, force.velocity, dt)
+        if self.state == lcmt_dvrk_status.STATE_EFFORT and self._measured.utime is not None:
+            share = 1e-6 * (self._measured.utime - force.good_since) / self.settings.start_time - 1.0
+            return follower.follow_effort(force.effort, q, self._measured.v, dt, min(max(share, 0.0), 1.0))
+        return follower.hold()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
-from dvrk_drake.systems.guard_settings import GuardSettings
+from dvrk_drake.systems.guard.settings import GuardSettings
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
@@ -62,6 +62,8 @@ class GuardLimits:
         self.start_position = self.margin[:n]
         self.start_effort = settings.start_effort * self.effort_limits
         self.speed = width[:n] / settings.traverse_time
+        self.following_error = settings.following_error * width[:n]
+        self.following_time = settings.following_time
         self._effort_rate = self.effort_limits / settings.effort_rise_time
         self._wall_effort = np.array([max(self.effort_limits[row != 0] / np.abs(row[row != 0])) for row in self.A])
         self._look_ahead = np.divide(arm.gains.kd, arm.gains.kp)

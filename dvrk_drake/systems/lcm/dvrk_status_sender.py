@@ -7,7 +7,8 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.command_guard import CommandGuard
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.lcm.arm_clock import ArmClock
 
 
 class DvrkStatusSender(LeafSystem):
@@ -34,9 +35,8 @@ class DvrkStatusSender(LeafSystem):
         self,
         arm: Arm,
         guard: CommandGuard,
+        clock: ArmClock | None = None,
         *,
-        start_utime: int = 0,
-        period: float = 1e-3,
         gravity_compensation: bool = False,
     ) -> None:
         """Of `arm`.
@@ -44,14 +44,13 @@ class DvrkStatusSender(LeafSystem):
         Args:
             arm: named in the message.
             guard: a guard of that arm, for the type of the port.
-            start_utime: the arm's clock at time zero of the context [us].
-            period: in which messages are sent [s].
+            clock: whose time and count of periods messages carry; None: ArmClock().
             gravity_compensation: whether the arm adds its own to commanded efforts.
         """
         super().__init__()
         n = arm.num_joints
         self._num_joints, self._arm_name = n, arm.name
-        self._start_utime, self._period = start_utime, period
+        self._clock = clock or ArmClock()
         self._gravity_compensation = gravity_compensation
         self._state = self.DeclareVectorInputPort("state_estimated", 2 * n)
         self._measured = self.DeclareVectorInputPort("effort_measured", n)
@@ -62,11 +61,11 @@ class DvrkStatusSender(LeafSystem):
         )
 
     def _calc_status(self, context: Context, output: AbstractValue) -> None:
-        n, time = self._num_joints, context.get_time()
+        n = self._num_joints
         guard: CommandGuard = self._guard.Eval(context)
         q_v = self._state.Eval(context)
         status = lcmt_dvrk_status()
-        status.utime, status.sequence = self._start_utime + round(1e6 * time), round(time / self._period)
+        status.utime, status.sequence = self._clock.utime(context), self._clock.ticks(context)
         status.arm_name, status.gravity_compensation = self._arm_name, self._gravity_compensation
         status.num_joints = n
         status.position, status.velocity = q_v[:n].tolist(), q_v[n:].tolist()

@@ -11,7 +11,8 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import decode
-from dvrk_drake.systems.command_guard import CommandGuard
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.lcm.arm_clock import ArmClock
 
 #: Messages kept from one update to the next; more is a flood, of which the newest are looked at.
 _INBOX = 256
@@ -52,7 +53,7 @@ class DvrkCommandReceiver(LeafSystem):
       arm's own gravity compensation inside the effort limits), else `position_control_effort`.
     - `guard`: the CommandGuard, to be read only.
 
-    Its clock is the context's time after `start_utime`. The guard is abstract state; it is updated every `period`, and
+    The measurement is always fresh. The guard is abstract state; it is updated once a period of the clock, and
     Drake does that before discrete plants of the same time are stepped, so a command acts in the step that follows it.
     """
 
@@ -60,21 +61,18 @@ class DvrkCommandReceiver(LeafSystem):
         self,
         arm: Arm,
         guard: CommandGuard,
-        *,
-        start_utime: int = 0,
-        period: float = 1e-3,
+        clock: ArmClock | None = None,
     ) -> None:
         """Of `arm` with a `guard` of it.
 
         Args:
             arm: for the number of its joints and their effort limits.
             guard: its state at first; each context has its own.
-            start_utime: the arm's clock at time zero of the context [us].
-            period: of the update [s].
+            clock: by which commands are judged, once a period; None: ArmClock().
         """
         super().__init__()
         n = arm.num_joints
-        self._num_joints, self._start_utime = n, start_utime
+        self._num_joints, self._clock = n, clock or ArmClock()
         self._effort_limits = arm.effort_limits
         self._command = self.DeclareAbstractInputPort("lcmt_dvrk_command", AbstractValue.Make(lcmt_dvrk_command()))
         self._state = self.DeclareVectorInputPort("state_estimated", 2 * n)
@@ -90,16 +88,12 @@ class DvrkCommandReceiver(LeafSystem):
         self.DeclareVectorOutputPort("effort", n, self._calc_effort, own | efforts)
         self.DeclareAbstractOutputPort("guard", lambda: AbstractValue.Make(guard), self._calc_guard, own)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(self._clock.period, 0.0, self._update)
         self._inbox: deque[bytes] = deque(maxlen=_INBOX)
 
     def Receive(self, data: bytes) -> None:
         """Puts a message, as it came over the wire, into the inbox that the next update takes."""
         self._inbox.append(data)
-
-    def utime(self, context: Context) -> int:
-        """The arm's clock [us]."""
-        return self._start_utime + round(1e6 * context.get_time())
 
     def GetGuard(self, context: Context) -> CommandGuard:
         """The guard of this context, to be read only."""
@@ -107,7 +101,7 @@ class DvrkCommandReceiver(LeafSystem):
 
     def _update(self, context: Context, state: State) -> None:
         guard = state.get_mutable_abstract_state(int(self._guard)).get_mutable_value()
-        utime = self.utime(context)
+        utime = self._clock.utime(context)
         while self._inbox:
             guard.receive(decode(lcmt_dvrk_command, self._inbox.popleft()), utime)
         if self._command.HasValue(context):
@@ -120,7 +114,7 @@ class DvrkCommandReceiver(LeafSystem):
         effort = self._effort.Eval(context)
         if self._gravity.HasValue(context):
             effort = effort - self._gravity.Eval(context)
-        guard.step(utime, q_v[: self._num_joints], q_v[self._num_joints :], effort)
+        guard.step(utime, utime, q_v[: self._num_joints], q_v[self._num_joints :], effort)
 
     def _calc_control_mode(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self.GetGuard(context).output.control_mode)

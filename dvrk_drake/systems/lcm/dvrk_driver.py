@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
-from dvrk_drake.systems.guard_settings import GuardSettings
+from dvrk_drake.systems.guard.settings import GuardSettings
 
 _MODES = {"position": lcmt_dvrk_command.POSITION, "effort": lcmt_dvrk_command.EFFORT}
 

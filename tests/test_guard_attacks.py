@@ -4,15 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_command_guard import ARM, LIMIT, MS, SESSION, Bench, N, Q
+from guard_bench import ARM, LIMIT, MS, SESSION, Bench, N, Q, modes
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.systems.command_guard import CommandGuard
-from dvrk_drake.systems.dvrk_status_sender import fill_in_guard
-from dvrk_drake.systems.guard_settings import GuardSettings
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.guard.settings import GuardSettings
+from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
 
 A, LOWER, UPPER = ARM.limit_matrix()
 LOOK_AHEAD = np.array(ARM.gains.kd) / np.array(ARM.gains.kp)
@@ -24,9 +24,9 @@ LOOK_AHEAD = np.array(ARM.gains.kd) / np.array(ARM.gains.kp)
 def test_a_clock_that_stands_still_is_a_fault_since_nothing_expires_by_it():
     bench = Bench().started()
     for _ in range(10):
-        output = bench.guard.step(bench.utime, bench.q, bench.v, bench.effort)
+        output = bench.step()
     assert output.control_mode == Command.EFFORT
-    output = bench.guard.step(bench.utime, bench.q, bench.v, bench.effort)
+    output = bench.step()
     assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_CLOCK)
 
 
@@ -37,7 +37,7 @@ def test_a_long_step_moves_efforts_and_targets_no_further_than_ten_milliseconds(
         before = bench.output
         bench.send(mode, effort=list(-LIMIT), position=list(Q + 5.0))
         bench.utime += round(1e6 * seconds)
-        output = bench.guard.step(bench.utime, bench.q, bench.v, bench.effort)
+        output = bench.step()
         assert output.control_mode == (mode if seconds <= 0.05 else Command.HOLD)
         dt = min(seconds, 0.01)
         assert np.all(np.abs(output.effort - before.effort) <= dt / 0.02 * LIMIT + 1e-12) or seconds > 0.05
@@ -50,7 +50,7 @@ def test_two_controllers_that_alternate_at_the_expiry_never_act():
         for k in range(40):
             bench.send(sender=5 + k % 2)
             bench.utime += gap
-            bench.guard.step(bench.utime, bench.q, bench.v, bench.effort)
+            bench.step()
             assert bench.guard.output.control_mode == Command.HOLD
         assert (bench.guard.fault_code == Status.FAULT_DUPLICATE_SENDER) == fault
 
@@ -99,7 +99,7 @@ def test_a_session_that_an_empty_command_has_is_refused():
 
 def test_no_mode_accepted_is_not_every_mode_accepted():
     bench = Bench(modes=())
-    assert bench.guard.accepted_modes == 0b0011
+    assert bench.guard.accepted_modes == modes(Command.OFF, Command.HOLD)
     assert bench.send(Command.EFFORT) == bench.send(Command.POSITION) == Status.REFUSAL_BAD_MODE
 
 
@@ -153,6 +153,7 @@ def test_a_velocity_leads_a_position_controller_to_no_pose_beyond_the_limits(nam
     A, lower, upper = arm.limit_matrix()
     look_ahead = np.array(arm.gains.kd) / np.array(arm.gains.kp)
     bench = Bench(arm).started(Command.POSITION)
+    bench.follows = True
     generator = np.random.default_rng(2)
     for q in arm.sample_poses(30, generator):
         # The way there takes up to the traverse time.

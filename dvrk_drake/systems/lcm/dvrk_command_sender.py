@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.command_check import is_finite
+from dvrk_drake.systems.guard.command_stream import is_finite
 
 _MODES = (lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD, lcmt_dvrk_command.POSITION, lcmt_dvrk_command.EFFORT)
 
@@ -41,8 +41,8 @@ class DvrkCommandSender(LeafSystem):
       that is sent again without a new status is refused by the arm as sent twice, so a controller that hears nothing
       ends in a hold.
     - `effort` (n) and `desired_state` (2n: q, then v): what is asked for.
-    - `control_mode` (1): lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT. Unconnected: EFFORT if `effort` is connected,
-      else POSITION if `desired_state` is, else HOLD.
+    - `control_mode` (1): lcmt_dvrk_command.HOLD, POSITION, EFFORT or OFF; anything else is HOLD. Unconnected: EFFORT if
+      `effort` is connected, else POSITION if `desired_state` is, else HOLD.
     - `reset_fault` (1): not zero: asks to clear a fault; the mode is then HOLD.
     - `lcmt_dvrk_command`: the message. It is HOLD whenever what is asked for is not connected or not finite.
     """

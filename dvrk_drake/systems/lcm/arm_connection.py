@@ -9,10 +9,10 @@ from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubsc
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, is_status_of, status_channel
-from dvrk_drake.systems.dvrk_command_sender import DvrkCommandSender
-from dvrk_drake.systems.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.dvrk_status_receiver import DvrkStatusReceiver
-from dvrk_drake.systems.lcm_serializer import TolerantSerializer
+from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
+from dvrk_drake.systems.lcm.serializer import TolerantSerializer
 
 
 def connect_arm(

@@ -11,13 +11,14 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.command_guard import CommandGuard
-from dvrk_drake.systems.dvrk_command_receiver import DvrkCommandReceiver
-from dvrk_drake.systems.dvrk_command_sender import draw_id
-from dvrk_drake.systems.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.dvrk_status_sender import DvrkStatusSender
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.lcm_serializer import TolerantSerializer
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.lcm.arm_clock import ArmClock
+from dvrk_drake.systems.lcm.dvrk_command_receiver import DvrkCommandReceiver
+from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.dvrk_status_sender import DvrkStatusSender
+from dvrk_drake.systems.lcm.serializer import TolerantSerializer
 
 
 class SimDvrkDriver(Diagram):
@@ -47,22 +48,19 @@ class SimDvrkDriver(Diagram):
             start_utime: the arm's clock at time zero of the context [us].
         """
         super().__init__()
-        period = driver.status_period
+        clock = ArmClock(start_utime, driver.status_period)
         guard = CommandGuard(arm, draw_id(), driver.guard, driver.accepted_modes())
         builder = DiagramBuilder()
-        self._receiver = builder.AddNamedSystem(
-            "command_receiver", DvrkCommandReceiver(arm, guard, start_utime=start_utime, period=period)
-        )
+        self._receiver = builder.AddNamedSystem("command_receiver", DvrkCommandReceiver(arm, guard, clock))
         position_controller = builder.AddNamedSystem(
-            "position_controller", GravityPidController(IdentifiedModel.from_arm(arm), period=period)
+            "position_controller", GravityPidController(IdentifiedModel.from_arm(arm), period=clock.period)
         )
         status_sender = builder.AddNamedSystem(
             "status_sender",
             DvrkStatusSender(
                 arm,
                 guard,
-                start_utime=start_utime,
-                period=period,
+                clock,
                 gravity_compensation=driver.gravity_compensation,
             ),
         )

@@ -10,6 +10,7 @@ from dvrk_drake.errors import StationError
 #: Lowest and highest value of each: outside, the guard would guard nothing, or nobody could command.
 _ALLOWED = {
     "expiry": (0.002, 1.0),
+    "measurement_age": (0.001, 0.1),
     "start_time": (0.05, 10.0),
     "clock_tolerance": (0.001, 1.0),
     "start_effort": (0.001, 0.25),
@@ -18,6 +19,8 @@ _ALLOWED = {
     "effort_fraction": (0.01, 1.0),
     "effort_rise_time": (0.002, 10.0),
     "traverse_time": (0.1, 100.0),
+    "following_error": (0.01, 0.5),
+    "following_time": (0.01, 1.0),
 }
 
 
@@ -26,7 +29,9 @@ class GuardSettings:
     """What a command guard allows.
 
     Attributes:
-        expiry: age at which a command is not obeyed any more [s].
+        expiry: age at which a command is not obeyed any more, counted from the measurement that it answers [s]; and
+            how long a sender must be silent before another may follow it.
+        measurement_age: above this age a measurement is none [s].
         start_time: how long commands must be good before they act [s].
         clock_tolerance: by how much a sender's clock and the arm's may differ between two commands [s].
         start_effort: how far from the present effort effort commands may start, as a fraction of the effort limit.
@@ -38,9 +43,12 @@ class GuardSettings:
         effort_rise_time: in which the commanded effort may grow from zero to its limit [s].
         traverse_time: in which a joint may cross its range [s]: the speed that it may have. Commanded positions go no
             faster, and while efforts act it is braked above.
+        following_error: how far from its commanded position a joint may be, as a fraction of its range.
+        following_time: how late the arm's position controller may follow [s]; a PD controller: Kd/Kp.
     """
 
     expiry: float = 0.05
+    measurement_age: float = 0.02
     start_time: float = 0.25
     clock_tolerance: float = 0.05
     start_effort: float = 0.1
@@ -49,6 +57,8 @@ class GuardSettings:
     effort_fraction: float = 1.0
     effort_rise_time: float = 0.02
     traverse_time: float = 0.5
+    following_error: float = 0.15
+    following_time: float = 0.2
 
     def __post_init__(self) -> None:
         self.check()

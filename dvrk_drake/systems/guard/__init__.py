@@ -1,0 +1,1 @@
+"""What stands between whoever commands an arm and its motors; neither Drake nor LCM is needed for it."""

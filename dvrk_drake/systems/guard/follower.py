@@ -1,0 +1,115 @@
+"""What an arm does from period to period with what its command guard has let pass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command
+from dvrk_drake.systems.guard.limits import Flags, GuardLimits, Vector
+
+
+@dataclass
+class GuardOutput:
+    """What the arm shall do until the next step; n joints in the arm's order, always finite and inside the limits.
+
+    Attributes:
+        control_mode: lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT.
+        position: (n,) where to regulate to in HOLD and POSITION; else the measured pose [rad, m].
+        velocity: (n,) feed-forward in POSITION; else zero [rad/s, m/s].
+        effort: (n,) what the motors shall apply in EFFORT; else zero [N m, N].
+        joint_flags: (n,) lcmt_dvrk_status.FLAG_* of what was limited.
+    """
+
+    control_mode: int
+    position: Vector
+    velocity: Vector
+    effort: Vector
+    joint_flags: Flags
+
+
+class Follower:
+    """Follows commands inside the limits, each kind from what the arm does when it begins. All arrays are (n,).
+
+    Attributes:
+        target: where the arm is regulated to in HOLD and POSITION [rad, m].
+    """
+
+    def __init__(self, limits: GuardLimits) -> None:
+        """At rest; no array is changed in place, so copies may share them."""
+        self._limits, self._zero = limits, np.zeros(len(limits.effort_limits))
+        self.target = self._laggard = self._effort = self._kick = self._zero
+
+    def off(self, q: Vector) -> GuardOutput:
+        """No power, at the measured q."""
+        return self._output(lcmt_dvrk_command.OFF, q)
+
+    def hold(self) -> GuardOutput:
+        """At the target."""
+        return self._output(lcmt_dvrk_command.HOLD, self.target)
+
+    def is_near(self, q: Vector) -> bool:
+        """Whether q is as near to the target as position commands must be to a pose from which they start."""
+        return bool(np.all(np.abs(self.target - q) <= self._limits.start_position))
+
+    def begin_position(self) -> None:
+        """Position commands act from now on; the target begins where it is."""
+        self._laggard = self.target
+
+    def follow_position(self, position: Vector, velocity: Vector, dt: float) -> GuardOutput:
+        """`dt` seconds on towards a position, with a feed-forward velocity [rad, m, rad/s, m/s]."""
+        self.target, flags = self._limits.limit_position(position, self.target, dt)
+        self._laggard = self._laggard + min(dt / self._limits.following_time, 1.0) * (self.target - self._laggard)
+        velocity = self._limits.limit_velocity(velocity, self.target, flags)
+        return self._output(lcmt_dvrk_command.POSITION, self.target, velocity=velocity, flags=flags)
+
+    def astray(self, q: Vector) -> str:
+        """The joint that follows its target worst, in words, if it is further from it than allowed; or "".
+
+        A position controller without feed-forward is late by Kd/Kp. So an arm may be anywhere between the target and
+        one that follows it late, by first order with the time constant `following_time`, and that much beside it.
+        """
+        ahead = q - np.maximum(self.target, self._laggard)
+        behind = np.minimum(self.target, self._laggard) - q
+        share = np.maximum(ahead, behind) / self._limits.following_error
+        j = int(np.argmax(share))
+        if not share[j] > 1.0:
+            return ""
+        return (
+            f"{self._limits.names[j]} = {q[j]:.4g} does not follow {self.target[j]:.4g}; "
+            f"{self._limits.following_error[j]:.3g} away is allowed"
+        )
+
+    def begin_effort(self, effort: Vector, q: Vector, v: Vector) -> None:
+        """Effort commands act from now on, from the measured effort at q, v [N m, N, rad, m, rad/s, m/s]."""
+        limit = self._limits.command_limits
+        self._effort = np.clip(effort, -limit, limit)
+        # What the walls add at once where efforts begin to act; it is taken back, less and less.
+        self._kick = self._limits.restrain_effort(self._effort, q, v)[0] - self._effort
+
+    def follow_effort(self, effort: Vector, q: Vector, v: Vector, dt: float, begun: float) -> GuardOutput:
+        """`dt` seconds on towards an effort, at q, v; `begun` says which share of the beginning has passed, 0 to 1."""
+        self._effort, flags = self._limits.follow_effort(effort, self._effort, dt)
+        restrained, walls = self._limits.restrain_effort(self._effort, q, v)
+        limit = self._limits.effort_limits
+        applied = np.clip(restrained - (1.0 - begun) * self._kick, -limit, limit)
+        return self._output(lcmt_dvrk_command.EFFORT, q, effort=applied, flags=flags | walls)
+
+    def _output(
+        self,
+        mode: int,
+        position: Vector,
+        *,
+        velocity: Vector | None = None,
+        effort: Vector | None = None,
+        flags: Flags | None = None,
+    ) -> GuardOutput:
+        """Arrays of its own, which whoever gets them may change."""
+        return GuardOutput(
+            mode,
+            position.copy(),
+            self._zero.copy() if velocity is None else velocity,
+            self._zero.copy() if effort is None else effort,
+            np.zeros(len(position), np.int8) if flags is None else flags,
+        )

@@ -1,0 +1,76 @@
+"""A command guard on a bench: a clock, a measured state that the test sets, and commands."""
+
+import numpy as np
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+
+ARM = load_arm("mtml")
+N = ARM.num_joints
+LIMIT = ARM.effort_limits
+SESSION = 77
+Q = np.array([0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5])  # inside all limits
+MS = 1000
+
+
+def modes(*allowed):
+    """`accepted_modes` with these."""
+    return sum(1 << mode for mode in allowed)
+
+
+class Bench:
+    """A guard at rest with a clock; the measured state is set by the test."""
+
+    def __init__(self, arm=ARM, **arguments):
+        self.arm = arm
+        self.guard = CommandGuard(arm, SESSION, **arguments)
+        self.utime = 1_700_000_000_000_000
+        self.q = Q.copy() if arm is ARM else 0.5 * (arm.position_lower + arm.position_upper)
+        self.v, self.effort = np.zeros(arm.num_joints), 0.05 * arm.effort_limits
+        self.sequence = 0
+        self.age = 0  # of the measurement [us]
+        self.follows = False  # positions, at once
+        self.output = self.step()
+
+    def step(self):
+        return self.guard.step(self.utime, self.utime - self.age, self.q, self.v, self.effort)
+
+    def command(self, mode=Command.EFFORT, *, sender=5, **fields):
+        self.sequence += 1
+        command = Command()
+        command.utime, command.sequence, command.sender_id = self.utime - 10**15, self.sequence, sender
+        command.session_id, command.status_utime = SESSION, self.utime
+        command.arm_name, command.control_mode, command.num_joints = self.arm.name, mode, self.arm.num_joints
+        command.position, command.velocity, command.effort = (
+            list(self.q),
+            [0.0] * self.arm.num_joints,
+            list(self.effort),
+        )
+        for name, value in fields.items():
+            setattr(command, name, value)
+        return command
+
+    def send(self, mode=Command.EFFORT, **fields):
+        return self.guard.receive(self.command(mode, **fields), self.utime)
+
+    def tick(self, milliseconds=1):
+        for _ in range(milliseconds):
+            self.utime += MS
+            self.output = self.step()
+            if self.follows:
+                self.q = self.output.position.copy()
+        return self.output
+
+    def run(self, mode, milliseconds, **fields):
+        """A good stream of commands, one a millisecond."""
+        for _ in range(milliseconds):
+            assert self.send(mode, **fields) == Status.REFUSAL_NONE
+            self.tick()
+        return self.output
+
+    def started(self, mode=Command.EFFORT):
+        self.run(mode, 260)
+        assert self.guard.state == {Command.EFFORT: Status.STATE_EFFORT, Command.POSITION: Status.STATE_POSITION}[mode]
+        return self

@@ -1,0 +1,74 @@
+"""An arm whose dry friction sticks, and a collector that leads it, without a network."""
+
+import numpy as np
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.collection_file import CollectionFile
+from dvrk_drake.processes.arm_controller import ArmController
+from dvrk_drake.processes.collector import CollectionSettings, Collector
+
+PERIOD = 1e-3
+
+
+def random_poses(arm, count, seed=0, margin=0.1):
+    return arm.sample_poses(count, np.random.default_rng(seed), margin=margin)
+
+
+class StickyArm:
+    """An arm whose joints do not feel one another: weight, dry friction that truly sticks, efforts as commanded."""
+
+    def __init__(self, arm, model, friction, q):
+        self.arm, self.model, self.friction = arm, model, friction
+        self.inertia = np.array(arm.gains.kd) ** 2 / (4 * np.array(arm.gains.kp))  # critically damped
+        self.q, self.v, self.effort = q.copy(), np.zeros(len(q)), model.holding_torque(q)
+        self.ticks, self.sender_id, self.acts, self.off = 0, 0, False, False
+
+    def status(self):
+        status = Status()
+        status.arm_name, status.num_joints = self.arm.name, len(self.q)
+        status.sequence, status.utime = self.ticks, 1000 * self.ticks
+        status.position, status.velocity = self.q.tolist(), self.v.tolist()
+        status.effort_measured = self.effort.tolist()
+        status.guard_state = Status.STATE_EFFORT if self.acts else Status.STATE_HOLD
+        status.command_sender_id = self.sender_id
+        return status
+
+    def step(self, command):
+        self.ticks += 1
+        self.sender_id, self.acts = command.sender_id, self.ticks > 250 and not self.off
+        if not self.acts:
+            return
+        self.effort = np.array(command.effort)
+        drive = self.effort - self.model.holding_torque(self.q)
+        dv = PERIOD / self.inertia
+        moved = self.v + dv * drive
+        # Friction takes as much of the motion as it can, and no more.
+        self.v = np.sign(moved) * np.maximum(np.abs(moved) - dv * self.friction, 0)
+        self.q = self.q + PERIOD * self.v
+
+
+def make_collector(path, poses, friction, both_sides=True, **options):
+    arm = load_arm("mtml")
+    model = IdentifiedModel.from_arm(arm)
+    controller = ArmController(arm, model, "hold", PERIOD)
+    sticky = StickyArm(arm, model, friction, poses[0] * 0.9)
+    output = CollectionFile(path, arm, both_sides)
+    return Collector(poses, controller, output, CollectionSettings(1.0, both_sides), **options), controller, sticky
+
+
+def lead(collector, controller, sticky, seconds, until=lambda: False):
+    end = sticky.ticks + round(seconds / PERIOD)
+    while not (collector.finished or until()) and sticky.ticks < end:
+        status, time = sticky.status(), PERIOD * sticky.ticks
+        sticky.step(controller.answer(status, time, collector.lead(status, time)))
+
+
+def near_poses(count=3):
+    """Poses at which a one-sided collection takes about 1.3 s each."""
+    return np.array([0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5]) + 0.05 * np.arange(count)[:, None]
+
+
+def make_quick(tmp_path, **options):
+    return make_collector(tmp_path / "o.csv", near_poses(), np.zeros(7), both_sides=False, **options)

@@ -1,0 +1,56 @@
+"""A collection of a PSM from both sides, with real processes over real UDP multicast in a network of their own.
+
+As in test_lcm_udp.py, this file starts itself again inside a network namespace.
+"""
+
+import signal
+
+import numpy as np
+from own_network import end, inside, outside, run_inside
+from test_collect_udp import collect_until, dvrk_drake, holds
+from test_lcm_udp import Observer
+
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.pose_file import load_poses
+from dvrk_drake.models.recording import read_recording
+
+POSES = 3
+
+
+@outside
+def test_in_a_network_of_its_own():
+    run_inside(__file__)
+
+
+@inside
+def test_a_collection_of_a_psm_from_both_sides_completes(tmp_path):
+    arm, poses, output = load_arm("psm"), tmp_path / "poses.yaml", tmp_path / "poses.csv"
+    assert main(["collect", "--arm", "psm", "--poses", str(poses), "--random", str(POSES), "--seed", "3"]) == 0
+    observer = Observer("psm")
+    process = dvrk_drake("arm", "--arm", "psm", "--realtime")
+    try:
+        observer.until(lambda status: True, 90, "first status")
+        command = ["collect", "--arm", "psm", "--poses", poses, "--output", output]
+        command += ["--realtime", "--traverse-time", "2"]
+
+        def finished():
+            return output.exists() and output.read_bytes().count(b"\n") == 1 + POSES
+
+        collecting = collect_until(finished, command)
+        said, _ = collecting.communicate(timeout=60)
+        assert collecting.returncode == 0, said
+        assert f"{POSES} of {POSES} poses" in said
+        observer.until(holds, 2, "hold")
+        assert observer.last.fault_code == 0
+    finally:
+        print(end(process, signal.SIGINT))
+    assert process.returncode == 0
+    recording = read_recording(output, arm)
+    away = np.abs(recording.q - load_poses(poses, arm))
+    print("measured at, from the pose:", away.max(axis=0))
+    assert np.all(away < arm.per_joint(5e-3, 5e-4))
+    error = np.abs(recording.tau - IdentifiedModel.from_arm(arm).holding_torque(recording.q)) / arm.effort_limits
+    print(f"measured efforts are off by {error.max():.2g} of the effort limit at most")
+    assert np.all(error < 0.005)

@@ -1,0 +1,133 @@
+"""Collecting poses without a network: friction cancels, and whatever happens on the way ends well."""
+
+import numpy as np
+import pytest
+from sticky_arm import PERIOD, lead, make_collector, make_quick, near_poses, random_poses
+
+from dvrk_drake.errors import CollectionError, RecordingError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.recording import read_recording
+from dvrk_drake.processes.collector import CollectionSettings
+
+FRICTION = 0.08 * load_arm("mtml").effort_limits
+
+
+def collect_with_friction(path, both_sides):
+    arm = load_arm("mtml")
+    poses = 0.5 * random_poses(arm, 1) + [0, 0.2, 0, 0, 0, 0, 0]
+    lines = []
+    collector, controller, sticky = make_collector(path, poses, FRICTION, both_sides, report=lines.append)
+    lead(collector, controller, sticky, 60.0)
+    collector.close()
+    assert collector.finished and collector.problem is None and not collector.unsettled
+    assert collector.done.all()
+    assert len(lines) == 1
+    recording = read_recording(path, arm)
+    assert np.all(np.abs(recording.q - poses) < 0.1 * (arm.position_upper - arm.position_lower))
+    return recording, (recording.tau - sticky.model.holding_torque(recording.q)) / FRICTION
+
+
+def test_both_sides_cancel_dry_friction_and_one_does_not(tmp_path):
+    _, error = collect_with_friction(tmp_path / "both.csv", True)
+    _, one_sided = collect_with_friction(tmp_path / "one.csv", False)
+    assert np.abs(error).max() < 0.01
+    assert np.sqrt(np.mean(one_sided**2)) > 0.5
+    table = np.genfromtxt(tmp_path / "both.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    friction = np.array([table[f"friction{j + 1}"] for j in range(7)])
+    np.testing.assert_allclose(friction, FRICTION, rtol=0.01)
+
+
+def test_a_stop_on_the_way_brakes_and_the_rest_is_done_next_time(tmp_path):
+    asked = []
+    collector, controller, sticky = make_quick(tmp_path, stopped=lambda: bool(asked))
+    moves = lambda: collector.done.any() and np.abs(sticky.v).max() > 0.03  # noqa: E731
+    lead(collector, controller, sticky, 10.0, moves)
+    assert moves() and not collector.finished
+    asked.append(True)
+    stopped_at = sticky.ticks
+    lead(collector, controller, sticky, 1.0)
+    collector.close()
+    assert collector.finished and collector.problem is None
+    assert PERIOD * (sticky.ticks - stopped_at) < 0.35
+    assert np.abs(sticky.v).max() < 0.03
+    assert collector.done.tolist() == [True, False, False]
+    first = (tmp_path / "o.csv").read_bytes()
+
+    collector, controller, sticky = make_quick(tmp_path)
+    assert collector.done.tolist() == [True, False, False]
+    lead(collector, controller, sticky, 20.0)
+    collector.close()
+    assert collector.done.all()
+    assert (tmp_path / "o.csv").read_bytes().startswith(first)
+    np.testing.assert_allclose(read_recording(tmp_path / "o.csv").q, near_poses(), atol=2e-3)
+
+
+def test_a_stop_before_the_arm_obeys_ends_at_once(tmp_path):
+    collector, controller, sticky = make_quick(tmp_path, stopped=lambda: True)
+    lead(collector, controller, sticky, 0.1)
+    assert collector.finished and collector.problem is None and sticky.ticks <= 2
+    assert not (tmp_path / "o.csv").exists()
+
+
+def test_it_ends_when_the_arm_takes_over(tmp_path):
+    collector, controller, sticky = make_quick(tmp_path)
+    lead(collector, controller, sticky, 10.0, collector.done.any)
+    sticky.off = True
+    lead(collector, controller, sticky, 0.1)
+    collector.close()
+    assert collector.finished and "MTML took over and holds" in str(collector.problem)
+    assert len(read_recording(tmp_path / "o.csv")) == 1
+
+
+def test_it_ends_when_the_arm_never_obeys(tmp_path):
+    collector, controller, sticky = make_quick(tmp_path)
+    sticky.off = True
+    lead(collector, controller, sticky, 12.0)
+    assert collector.finished and "did not let efforts act within 10 s" in str(collector.problem)
+
+
+def test_it_ends_when_something_is_in_the_way(tmp_path):
+    collector, controller, sticky = make_collector(
+        tmp_path / "o.csv", near_poses() + np.outer([0, 1, 0], [0.3, 0.3, 0, 0, 0, 0, 0]), np.zeros(7), False
+    )
+    lead(collector, controller, sticky, 10.0, collector.done.any)
+    sticky.friction = np.array([1e3] + [0.0] * 6)  # outer yaw is held
+    lead(collector, controller, sticky, 5.0)
+    collector.close()
+    assert collector.finished and "does not follow: outer_yaw is at" in str(collector.problem)
+    assert collector.done.tolist() == [True, False, False]
+
+
+def test_a_pose_without_rest_is_left_out_and_named(tmp_path):
+    collector, controller, sticky = make_quick(tmp_path)
+    lead(collector, controller, sticky, 10.0, lambda: collector.describe().endswith("settling at pose 2"))
+    status = sticky.status
+    shaken = lambda: [q + 0.01 * np.sin(60 * PERIOD * sticky.ticks) for q in sticky.q]  # noqa: E731
+
+    def shaking():
+        said = status()
+        if "pose 2" in collector.describe():
+            said.position = shaken()
+        return said
+
+    sticky.status = shaking
+    lead(collector, controller, sticky, 20.0)
+    collector.close()
+    assert collector.finished and collector.problem is None
+    assert collector.unsettled == [2]
+    assert collector.done.tolist() == [True, False, True]
+
+
+def test_a_file_that_cannot_be_written_ends_it(tmp_path):
+    collector, controller, sticky = make_quick(tmp_path)
+    (tmp_path / "o.csv").mkdir()
+    lead(collector, controller, sticky, 10.0)
+    collector.close()
+    assert collector.finished and isinstance(collector.problem, RecordingError)
+    assert not collector.done.any()
+
+
+@pytest.mark.parametrize("seconds", [0.5, 61.0])
+def test_a_speed_that_is_not_allowed(seconds):
+    with pytest.raises(CollectionError, match=r"must be 1..60 s; got"):
+        CollectionSettings(seconds)

@@ -1,0 +1,178 @@
+"""Controlling, resetting and releasing an arm behind a guard, by the wall clock but without a network."""
+
+import time
+
+import numpy as np
+import pytest
+from guard_bench import ARM, LIMIT, SESSION, N, Q
+
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.lcm_messages import describe_refusal
+from dvrk_drake.processes.arm_controller import ArmController
+from dvrk_drake.processes.control import control, first_status, reset_fault
+from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
+
+
+class GuardedArm:
+    """In place of an ArmLink: an arm that stays where it is, and its guard, which is stepped when it is listened to."""
+
+    def __init__(self):
+        self.arm, self.lost = ARM, 0
+        self.guard, self.commands, self.status = CommandGuard(ARM, SESSION), [], Status()
+        self.before_step = lambda: None
+        self.status.arm_name, self.status.num_joints = ARM.name, N
+        self.status.position, self.status.velocity = list(Q), [0.0] * N
+        self.status.effort_measured = self.status.effort_commanded = list(0.05 * LIMIT)
+
+    def next_status(self, seconds):
+        time.sleep(1e-3)
+        self.before_step()
+        status = Status.decode(self.status.encode()) if self.status.session_id else self.status
+        status.utime, status.sequence = time.monotonic_ns() // 1000, self.status.sequence + 1
+        self.guard.step(status.utime, status.utime, status.position, status.velocity, status.effort_measured)
+        fill_in_guard(status, self.guard)
+        self.status = status
+        return status
+
+    def send(self, command):
+        self.commands.append(command)
+        self.guard.receive(command, time.monotonic_ns() // 1000)
+
+    def restart(self):
+        self.guard, self.status.sequence = CommandGuard(ARM, SESSION + 1), 0
+
+
+@pytest.fixture(scope="module")
+def controller():
+    return ArmController(ARM, IdentifiedModel.from_arm(ARM), "hold", 1e-3)
+
+
+def after(count, action):
+    """Does it when it is called for that time."""
+    calls = []
+
+    def step():
+        calls.append(None)
+        if len(calls) == count:
+            action()
+
+    return step
+
+
+def test_a_fault_is_said_then_cleared_and_a_controller_may_follow():
+    link, said = GuardedArm(), []
+    link.guard.report_fault("the amplifier is hot")
+    with pytest.raises(ControllerError, match=r"has a fault: the amplifier is hot\. It must be reset first"):
+        first_status(link)
+    assert not link.commands  # a fault is cleared on request only
+    reset_fault(link, lambda text: said.append((text, len(link.commands))))
+    assert said == [("MTML has a fault, which is reset now: the amplifier is hot", 0)]
+    assert (link.guard.state, link.guard.fault_code) == (Status.STATE_HOLD, Status.FAULT_NONE)
+    assert {command.control_mode for command in link.commands} == {Command.HOLD}
+    # Another sender is no second one any more, with the longest memory that a guard may have.
+    assert time.monotonic_ns() // 1000 - link.commands[-1].status_utime > 10**6
+    status, period = first_status(link)
+    assert status.fault_code == Status.FAULT_NONE
+    assert 0.9e-3 < period < 0.02
+
+
+def test_a_fault_whose_cause_lasts_is_an_error_and_no_fault_needs_no_reset():
+    link = GuardedArm()
+    link.before_step = lambda: link.guard.report_fault("the amplifier is hot")
+    with pytest.raises(ControllerError, match="has a fault that stays: the amplifier is hot"):
+        reset_fault(link, lambda text: None)
+    link = GuardedArm()
+    reset_fault(link, pytest.fail)
+    assert not link.commands
+
+
+@pytest.mark.parametrize("count", [2, 10, 21])
+def test_an_arm_that_is_restarted_while_its_period_is_measured(count):
+    link = GuardedArm()
+    link.before_step = after(count, link.restart)
+    with pytest.raises(ControllerError, match="MTML was restarted"):
+        first_status(link)
+
+
+def test_an_arm_that_tells_nothing_new():
+    link = GuardedArm()
+    status = link.next_status(1.0)
+    link.next_status = lambda seconds: status
+    with pytest.raises(ControllerError, match="tells nothing new"):
+        first_status(link)
+
+
+@pytest.mark.parametrize(("happens", "message"), [("fault", "has a fault: the amplifier is hot"), ("restart", "rest")])
+def test_the_release_of_an_arm_that_faults_or_restarts_does_not_wait(controller, happens, message):
+    link = GuardedArm()
+    action = link.restart if happens == "restart" else lambda: link.guard.report_fault("the amplifier is hot")
+    link.before_step = after(2, action)  # the first status is that of the beginning
+    began = time.monotonic()
+    with pytest.raises(ControllerError, match=message):
+        control(link, controller, lambda: True, lambda status: None)
+    assert time.monotonic() - began < 0.5
+
+
+def test_control_acts_tells_how_it_goes_and_releases(controller):
+    link, told = GuardedArm(), []
+    end = time.monotonic() + 1.5
+    control(link, controller, lambda: time.monotonic() > end, told.append)
+    assert {status.state for status in told} >= {"starting", "effort"}
+    assert "round trip" in str(told[-1]) and not told[-1].problem
+    assert link.guard.state == Status.STATE_HOLD and link.commands[-1].control_mode == Command.HOLD
+
+
+def test_what_was_refused_since_the_last_report_is_in_words():
+    first, status = Status(), Status()
+    first.num_refused, status.num_refused, status.refusal_code = 3, 5, Status.REFUSAL_START_FAR
+    status.num_expired = 1
+    maker = LiveStatusMaker(7, first)
+    live = maker.make(status, 0.2, 0)
+    assert live.problem == (
+        "refused: starting too far from the present efforts or pose, no command for so long that the arm took over"
+    )
+    assert str(live).endswith(live.problem)
+    assert not maker.make(status, 0.4, 0).problem
+
+
+def test_run_prints_what_is_new_and_nothing_twice(controller, monkeypatch, capsys):
+    def control(link, controller, stopped, tell):
+        for state, pace, problem in [
+            ("hold", "1 Hz", ""),
+            ("hold", "2 Hz", ""),
+            ("hold", "3 Hz", "refused: stale"),
+        ] * 2:
+            tell(LiveStatus(state, pace, problem))
+
+    monkeypatch.setattr("dvrk_drake.cli.lcm.ready_controller", lambda options, mode, reset: (controller, "", 1e-3))
+    monkeypatch.setattr("dvrk_drake.processes.control.control", control)
+    monkeypatch.setattr("dvrk_drake.processes.control.ArmLink", lambda arm, url: None)
+    monkeypatch.setattr("dvrk_drake.processes.simulated_arm.stop_on_signals", lambda: None)
+    assert main(["run", "--arm", "mtml", "--reset"]) == 0
+    said = capsys.readouterr()
+    assert said.out.splitlines()[1:-1] == ["hold; 1 Hz", "hold; 3 Hz; refused: stale"] * 2
+    assert not said.err
+
+
+def test_rate_and_round_trip_of_the_report():
+    maker, status = LiveStatusMaker(7, Status()), Status()
+    status.command_sender_id = 7
+    for k in range(1, 201):
+        status.command_utime = 1000 * (k - 2)
+        maker.answer(status, 1e-3 * k)
+    assert maker.make(status, 0.2, 4).pace == "1000 Hz, round trip 2.00 ms, 4 statuses lost"
+
+
+def test_every_refusal_has_words():
+    codes = [value for name, value in vars(Status).items() if name.startswith("REFUSAL_")]
+    words = [describe_refusal(code) for code in codes]
+    assert len(set(words)) == len(codes) == max(codes) + 1
+    assert not [text for text in words if text.startswith("refusal ")]
+    assert describe_refusal(99) == "refusal 99"
+    assert np.all(np.diff(sorted(codes)) == 1)

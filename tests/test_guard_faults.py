@@ -1,0 +1,208 @@
+"""The watchdog's latched faults, and what clears them."""
+
+import numpy as np
+import pytest
+from guard_bench import ARM, LIMIT, Bench, N, Q, modes
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+
+
+def test_two_senders_at_once_are_a_latched_fault():
+    bench = Bench().started()
+    assert bench.send(sender=6) == Status.REFUSAL_OTHER_SENDER
+    output = bench.tick()
+    assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_DUPLICATE_SENDER)
+    assert "5" in bench.guard.fault_text and "6" in bench.guard.fault_text
+    assert bench.guard.accepted_modes == modes(Command.HOLD)
+    for _ in range(400):
+        assert bench.send() == Status.REFUSAL_FAULT
+        assert bench.tick().control_mode == Command.HOLD
+
+
+def test_the_other_sender_is_noticed_while_only_holding_and_while_refused():
+    bench = Bench()
+    bench.run(Command.HOLD, 3)
+    assert bench.send(Command.HOLD, sender=6) == Status.REFUSAL_OTHER_SENDER
+    bench = Bench()
+    assert bench.send(effort=list(LIMIT)) == Status.REFUSAL_START_FAR
+    assert bench.send(sender=6) == Status.REFUSAL_OTHER_SENDER
+
+
+def test_a_sender_may_follow_one_that_is_silent_but_starts_anew():
+    bench = Bench().started()
+    bench.tick(51)
+    assert bench.send(sender=6) == Status.REFUSAL_NONE
+    assert bench.guard.state == Status.STATE_STARTING
+    assert bench.guard.fault_code == Status.FAULT_NONE
+
+
+def test_only_a_meant_reset_clears_a_fault():
+    bench = Bench()
+    bench.guard.report_fault("the amplifier is hot")
+    assert (bench.guard.fault_code, bench.guard.fault_text) == (Status.FAULT_DRIVER, "the amplifier is hot")
+    bench.run(Command.HOLD, 5, reset_fault=True)  # always true is no change to true
+    assert bench.guard.state == Status.STATE_FAULT
+    bench.run(Command.HOLD, 5)
+    assert bench.guard.state == Status.STATE_FAULT
+    assert bench.send(Command.EFFORT, reset_fault=True) == Status.REFUSAL_BAD_RESET
+    assert bench.send(Command.OFF) == Status.REFUSAL_FAULT
+    bench.tick(500)
+    assert bench.guard.state == Status.STATE_FAULT
+    bench.run(Command.HOLD, 1)
+    bench.run(Command.HOLD, 1, reset_fault=True)
+    assert (bench.guard.state, bench.guard.fault_code, bench.guard.fault_text) == (Status.STATE_HOLD, 0, "")
+
+
+def test_a_pose_beyond_a_limit_faults_while_efforts_act_and_is_held():
+    bench = Bench().started()
+    bench.q = Q.copy()
+    bench.q[5] = ARM.position_upper[5] + 0.02
+    assert bench.run(Command.EFFORT, 1).control_mode == Command.EFFORT
+    bench.q[5] = ARM.position_upper[5] + 0.03
+    output = bench.tick()
+    assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_POSITION_LIMIT)
+    assert bench.guard.fault_text.startswith("wrist_yaw = 0.8154 is beyond")
+    np.testing.assert_array_equal(output.position, bench.q)
+    bench.run(Command.HOLD, 1)
+    bench.run(Command.HOLD, 1, reset_fault=True)
+    assert bench.send(Command.EFFORT) == Status.REFUSAL_START_OUTSIDE
+
+
+def test_the_coupled_limit_faults_too():
+    bench = Bench().started()
+    bench.q = Q.copy()
+    bench.q[1:3] = 0.2, -0.2 - 0.36  # each inside its own limits
+    bench.tick()
+    assert bench.guard.fault_text == "parallelogram = -0.36 is beyond -0.33..0.68"
+
+
+@pytest.mark.parametrize("which", ["q", "v", "effort"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e9])
+def test_a_lost_measurement_turns_the_motors_off_until_a_reset(which, value):
+    bench = Bench().started()
+    good = getattr(bench, which)
+    setattr(bench, which, np.where(np.arange(N) == 3, value, good))
+    output = bench.tick()
+    assert (output.control_mode, bench.guard.fault_code) == (Command.OFF, Status.FAULT_MEASUREMENT)
+    assert np.all(np.isfinite(output.position))
+    # A reset while it is still lost faults again.
+    healthy = {"position": list(Q), "effort": [0.0] * N}
+    for reset in (False, True):
+        bench.send(Command.HOLD, reset_fault=reset, **healthy)
+        assert bench.tick().control_mode == Command.OFF
+    # Found again, at another pose: off until reset, then held where it is.
+    setattr(bench, which, good)
+    bench.q = Q - 0.03
+    assert bench.tick(100).control_mode == Command.OFF
+    bench.run(Command.HOLD, 1)
+    output = bench.run(Command.HOLD, 1, reset_fault=True)
+    assert output.control_mode == Command.HOLD
+    np.testing.assert_array_equal(output.position, Q - 0.03)
+
+
+def test_a_reset_just_before_the_measurement_is_found_again_holds_the_pose_that_is_found():
+    bench = Bench().started()
+    bench.q = Q * np.nan
+    bench.tick()
+    healthy = {"position": list(Q)}
+    bench.send(Command.HOLD, **healthy)
+    bench.tick()
+    bench.send(Command.HOLD, reset_fault=True, **healthy)
+    bench.q = Q - 0.03  # it fell meanwhile
+    output = bench.tick()
+    assert output.control_mode == Command.HOLD
+    np.testing.assert_array_equal(output.position, Q - 0.03)
+
+
+def test_a_fault_while_off_stays_off():
+    bench = Bench()
+    bench.run(Command.HOLD, 1)
+    bench.run(Command.OFF, 1)
+    bench.guard.report_fault("x")
+    assert bench.tick().control_mode == Command.OFF
+    bench.run(Command.HOLD, 1)
+    assert bench.run(Command.HOLD, 1, reset_fault=True).control_mode == Command.HOLD
+
+
+def test_nobody_turns_the_motors_off_in_a_fault_but_whoever_resets_it_first():
+    bench = Bench()
+    bench.guard.report_fault("the amplifier is hot")
+    bench.run(Command.HOLD, 2)
+    assert bench.send(Command.OFF) == Status.REFUSAL_FAULT
+    assert bench.tick().control_mode == Command.HOLD
+    bench.run(Command.HOLD, 1, reset_fault=True)
+    assert bench.run(Command.OFF, 1).control_mode == Command.OFF
+
+
+@pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])
+def test_a_measurement_that_is_too_old_is_none(mode):
+    bench = Bench()
+    bench.run(mode, 260)
+    bench.age = 20_000
+    assert bench.run(mode, 1).control_mode == mode
+    bench.age = 20_001
+    output = bench.tick()
+    assert (output.control_mode, bench.guard.fault_code) == (Command.OFF, Status.FAULT_MEASUREMENT)
+    assert bench.guard.fault_text == "the measurement is 0.020 s old; allowed is 0 to 0.02 s"
+    # It goes on elsewhere: held there after a reset, not where it was.
+    bench.age, bench.q = 0, Q - 0.03
+    bench.tick()
+    bench.run(Command.HOLD, 1)
+    output = bench.run(Command.HOLD, 1, reset_fault=True)
+    assert output.control_mode == Command.HOLD
+    np.testing.assert_array_equal(output.position, Q - 0.03)
+
+
+def test_a_measurement_from_the_future_is_none():
+    bench = Bench().started()
+    bench.age = -1
+    assert bench.tick().control_mode == Command.OFF
+    assert bench.guard.fault_code == Status.FAULT_MEASUREMENT
+
+
+RANGE = ARM.position_upper - ARM.position_lower
+
+
+@pytest.mark.parametrize("joint", range(N))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_joint_that_does_not_follow_position_commands_is_a_fault_and_held_where_it_is(joint, side):
+    away = side * 0.15 * RANGE[joint] * np.eye(N)[joint]
+    bench = Bench().started(Command.POSITION)
+    bench.q = Q + 0.99 * away
+    bench.run(Command.POSITION, 200, position=list(Q))
+    bench.q = Q + 1.01 * away
+    output = bench.tick()
+    assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_FOLLOWING)
+    assert bench.guard.fault_text.startswith(f"{ARM.joint_names[joint]} = ")
+    np.testing.assert_array_equal(output.position, bench.q)
+
+
+def test_an_arm_that_is_stuck_while_it_is_led_on_is_a_fault():
+    bench = Bench().started(Command.POSITION)
+    target = Q - 0.5 * RANGE * np.eye(N)[0]
+    for k in range(1000):  # noqa: B007
+        bench.send(Command.POSITION, position=list(np.maximum(target, ARM.position_lower + 0.1)))
+        bench.tick()
+        if bench.guard.fault_code == Status.FAULT_FOLLOWING:
+            break
+    # The target crosses 0.15 of the range in 75 ms, a half in 250 ms; one that is late by 200 ms is far away by then.
+    assert 75 < k < 350
+    np.testing.assert_array_equal(bench.output.position, Q)
+
+
+def test_an_arm_that_follows_late_is_no_fault():
+    """A PD controller without feed-forward, at the highest speed from end to end: late by Kd/Kp, and no fault."""
+    late = np.array(ARM.gains.kd) / np.array(ARM.gains.kp)
+    bench = Bench().started(Command.POSITION)
+    worst = 0.0
+    for k in range(4000):
+        goal = Q.copy()
+        goal[0] = ARM.position_lower[0] if k // 1000 % 2 else ARM.position_upper[0]
+        goal[4] = ARM.position_upper[4] if k // 700 % 2 else ARM.position_lower[4]
+        assert bench.send(Command.POSITION, position=list(goal)) == Status.REFUSAL_NONE
+        bench.q = bench.q + 1e-3 / late * (bench.output.position - bench.q)
+        bench.tick()
+        worst = max(worst, np.abs((bench.output.position - bench.q) / RANGE).max())
+    assert bench.guard.state == Status.STATE_POSITION
+    assert worst > 0.2  # more than is allowed to who is not late

@@ -1,0 +1,100 @@
+"""What the watchdog refuses, and that what is refused ends in a hold."""
+
+import numpy as np
+import pytest
+from guard_bench import ARM, MS, SESSION, Bench
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.lcm_messages import decode
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+
+
+@pytest.mark.parametrize(
+    ("fields", "code"),
+    [
+        ({"arm_name": "MTMR"}, Status.REFUSAL_WRONG_ARM),
+        ({"arm_name": ""}, Status.REFUSAL_WRONG_ARM),
+        ({"num_joints": 6}, Status.REFUSAL_WRONG_SIZE),
+        ({"num_joints": -1}, Status.REFUSAL_WRONG_SIZE),
+        ({"effort": [0.0] * 6}, Status.REFUSAL_WRONG_SIZE),
+        ({"velocity": []}, Status.REFUSAL_WRONG_SIZE),
+        ({"effort": [0.0] * 6 + [np.nan]}, Status.REFUSAL_NOT_FINITE),
+        ({"position": [np.inf] + [0.0] * 6}, Status.REFUSAL_NOT_FINITE),
+        ({"velocity": [-1e7] + [0.0] * 6}, Status.REFUSAL_NOT_FINITE),
+        ({"sender_id": 0}, Status.REFUSAL_NO_SENDER),
+        ({"session_id": SESSION + 1}, Status.REFUSAL_WRONG_SESSION),
+        ({"control_mode": 0}, Status.REFUSAL_BAD_MODE),
+        ({"control_mode": Command().control_mode}, Status.REFUSAL_BAD_MODE),
+        ({"control_mode": Command.OFF}, Status.REFUSAL_SUDDEN_OFF),
+        ({"control_mode": 5}, Status.REFUSAL_BAD_MODE),
+        ({"control_mode": -1}, Status.REFUSAL_BAD_MODE),
+        ({"reset_fault": True}, Status.REFUSAL_BAD_RESET),
+    ],
+)
+def test_bad_commands_are_refused_and_end_in_a_hold(fields, code):
+    bench = Bench().started()
+    for _ in range(52):
+        assert bench.send(**fields) == code
+        bench.tick()
+    assert bench.guard.state == Status.STATE_HOLD
+    assert (bench.guard.refusal_code, bench.guard.counts.refused) == (code, 52)
+
+
+def test_unreadable_messages_are_refused():
+    bench = Bench()
+    assert decode(Command, b"garbage") is None
+    assert bench.guard.receive(None, bench.utime) == Status.REFUSAL_UNREADABLE
+
+
+def test_a_command_that_answers_an_old_status_is_stale():
+    bench = Bench()
+    bench.tick(100)
+    assert bench.send(status_utime=bench.utime - 50 * MS) == Status.REFUSAL_NONE
+    assert bench.send(status_utime=bench.utime - 50 * MS - 1) == Status.REFUSAL_STALE
+    assert bench.send(status_utime=bench.utime + 1) == Status.REFUSAL_STALE  # no such status was ever sent
+    assert bench.send(status_utime=0) == Status.REFUSAL_STALE
+    unborn = CommandGuard(ARM, SESSION)
+    assert unborn.receive(bench.command(), bench.utime) == Status.REFUSAL_STALE
+
+
+def test_out_of_order_and_duplicates_are_refused_and_gaps_are_counted():
+    bench = Bench()
+    first = bench.command()
+    bench.tick()
+    second = bench.command()
+    bench.tick()
+    assert bench.guard.receive(second, bench.utime) == Status.REFUSAL_NONE
+    assert bench.guard.receive(second, bench.utime) == Status.REFUSAL_OUT_OF_ORDER
+    assert bench.guard.receive(first, bench.utime) == Status.REFUSAL_OUT_OF_ORDER
+    bench.sequence += 3
+    bench.tick()
+    assert bench.send() == Status.REFUSAL_NONE
+    assert bench.guard.counts.lost == 3
+
+
+@pytest.mark.parametrize("jump", [-MS - 1, -3600 * 10**6, 51 * MS, 3600 * 10**6])
+def test_a_jump_of_the_senders_clock_ends_in_a_hold_and_a_new_start(jump):
+    bench = Bench().started()
+    base = bench.utime - 10**15
+    assert bench.send(utime=base + jump) == Status.REFUSAL_CLOCK_JUMP
+    assert bench.guard.state == Status.STATE_HOLD
+    for _ in range(251):
+        bench.tick()
+        assert bench.send(utime=bench.utime - 10**15 + jump) == Status.REFUSAL_NONE
+    assert bench.guard.state == Status.STATE_EFFORT
+
+
+def test_the_arms_clock_jumping_forward_expires_and_backward_is_a_fault():
+    bench = Bench().started()
+    bench.utime += 3600 * 10**6
+    assert bench.tick().control_mode == Command.HOLD
+    bench.started()
+    bench.utime -= 3600 * 10**6
+    assert bench.tick().control_mode == Command.HOLD
+    assert bench.guard.fault_code == Status.FAULT_CLOCK
+    # The reset works on the clock as it is now.
+    bench.run(Command.HOLD, 2)
+    bench.run(Command.HOLD, 1, reset_fault=True)
+    assert bench.guard.state == Status.STATE_HOLD
+    bench.started()

@@ -1,0 +1,73 @@
+"""Ways from pose to pose, and when an arm rests."""
+
+import itertools
+
+import numpy as np
+import pytest
+from sticky_arm import random_poses
+
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.processes.leg import Leg, beside
+from dvrk_drake.processes.rest_detector import RestDetector
+
+ARMS = ("mtml", "psm")
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_no_joint_is_faster_than_it_may_be_or_leaves_the_limits(name):
+    arm = load_arm(name)
+    speed = (arm.position_upper - arm.position_lower) / 5.0
+    poses = random_poses(arm, 20, margin=0.0)
+    for start, end in itertools.pairwise(poses):
+        leg = Leg.between(start, end, speed)
+        states = np.array([leg.state(t) for t in np.linspace(-1.0, leg.duration + 1.0, 400)])
+        q, v = np.split(states, 2, axis=1)
+        assert np.all(np.abs(v) <= speed * (1 + 1e-9))
+        if leg.duration > 0.3:  # and none is slower than it need be
+            assert np.max(np.abs(v) / speed) > 0.99
+        assert not any(arm.limit_violations(pose, 1e-9) for pose in q)
+        np.testing.assert_array_equal(q[0], start)
+        np.testing.assert_allclose(q[-1], end, atol=1e-12)
+        assert np.abs(v[[0, -1]]).max() < 1e-12
+
+
+def test_braking_stays_on_the_way():
+    """Whenever it is stopped, a leg's rest is between its ends, and the speed only falls."""
+    arm = load_arm("mtml")
+    start, end = random_poses(arm, 2)
+    leg = Leg.between(start, end, np.full(7, 0.5))
+    for t in np.linspace(0, leg.duration, 50):
+        duration = min(0.3, max(leg.duration - t, 1e-3))
+        stop = Leg.braking(leg.state(t), duration)
+        states = np.array([stop.state(s) for s in np.linspace(0, duration, 20)])
+        share = (states[:, :7] - start) / (end - start)
+        assert np.all((share >= -1e-9) & (share <= 1 + 1e-9))
+        assert np.all(np.diff(np.abs(states[:, 7:]), axis=0) <= 1e-9)
+        np.testing.assert_allclose(states[0], leg.state(t), atol=1e-12)
+        assert np.abs(states[-1, 7:]).max() < 1e-12
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_approaches_begin_inside_the_limits(name):
+    arm = load_arm(name)
+    offset = 0.3 * arm.effort_limits / np.array(arm.gains.kp)
+    for pose in random_poses(arm, 200, margin=0.0):
+        for side in (-1, 1):
+            point = beside(arm, pose, side * offset)
+            assert not arm.limit_violations(point, 1e-9)
+            assert np.all(side * (point - pose) >= 0)
+    middle = random_poses(arm, 1, margin=0.3)[0]
+    np.testing.assert_allclose(beside(arm, middle, offset), middle + offset)
+
+
+def test_rest_is_all_joints_near_one_pose_for_a_while():
+    detector = RestDetector(np.array([0.01, 0.001]), 0.5)
+    times = np.arange(0, 3, 0.01)
+    q = np.column_stack([np.where(times < 1.0, times, 1.0), np.where(times < 1.8, 0.0, 0.1)])
+    q += 1e-4 * np.sin(50 * times)[:, None]
+    rests = np.array([detector.rests(t, pose) for t, pose in zip(times, q, strict=True)])
+    expected = ((times > 1.5) & (times < 1.795)) | (times > 2.3)
+    assert np.count_nonzero(rests != expected) <= 4
+    assert not detector.rests(9.0, np.array([np.nan, 0.1]))
+    creeping = RestDetector(np.array([0.01]), 0.5)
+    assert not any(creeping.rests(t, np.array([0.03 * t])) for t in times)

@@ -1,0 +1,99 @@
+"""Poses shown by hand."""
+
+import os
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from sticky_arm import near_poses
+
+from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.pose_file import load_poses
+from dvrk_drake.processes.teacher import EnterKey, Teacher
+
+
+class Hand:
+    """Tells a teacher of an arm that obeys, wherever the test puts it."""
+
+    def __init__(self, path, at_rest=False):
+        self.controller = SimpleNamespace(arm=load_arm("mtml"), ramped=True)
+        self.lines, self.enter, self.time = [], False, 0.0
+        self.teacher = Teacher(self.controller, path, at_rest=at_rest, told=self.told, report=self.lines.append)
+
+    def told(self):
+        enter, self.enter = self.enter, False
+        return enter
+
+    def at(self, pose, seconds, enter=False):
+        """Stays at a pose; with `enter`, presses the key at first and waits until the file is written."""
+        self.enter = enter
+        end, said = self.time + seconds, len(self.lines)
+        deadline = time.monotonic() + 10
+        while self.time < end or (enter and len(self.lines) == said and time.monotonic() < deadline):
+            self.time += 0.01
+            self.teacher.lead(SimpleNamespace(position=list(pose)), self.time)
+            time.sleep(1e-4)
+
+
+def test_enter_takes_a_pose(tmp_path):
+    path, arm = tmp_path / "p.yaml", load_arm("mtml")
+    hand, poses = Hand(path), near_poses()
+    hand.controller.ramped = False
+    hand.at(poses[0], 0.1)
+    hand.enter = True
+    hand.at(poses[0], 0.1)
+    assert not path.exists()  # the arm does not obey yet
+    hand.controller.ramped = True
+    hand.at(poses[0], 3.0)
+    assert not path.exists()  # nobody pressed Enter
+    hand.at(poses[0], 0.1, enter=True)
+    np.testing.assert_array_equal(load_poses(path, arm), poses[:1])
+    hand.at(poses[0] + 1e-3, 0.1, enter=True)
+    hand.at([1.2, *poses[0, 1:]], 0.1, enter=True)
+    hand.at(poses[1], 0.1, enter=True)
+    hand.teacher.close()
+    assert hand.lines[0] == "pose 1 taken"
+    assert hand.lines[1] == "not taken: it is pose 1 again"
+    assert hand.lines[2].startswith("not taken: outer_yaw = 1.2 is outside")
+    assert hand.lines[3] == "pose 2 taken"
+    np.testing.assert_array_equal(load_poses(path, arm), poses[:2])
+    again = Hand(path)
+    again.at(poses[2], 0.1, enter=True)
+    np.testing.assert_array_equal(load_poses(path, arm), poses)
+
+
+def test_a_rest_takes_a_pose_once(tmp_path):
+    path, arm = tmp_path / "p.yaml", load_arm("mtml")
+    hand, poses = Hand(path, at_rest=True), near_poses()
+    hand.at(poses[0], 0.9)
+    hand.at(poses[1], 3.0)
+    hand.at([1.2, *poses[0, 1:]], 3.0)  # outside the limits: not taken, and nothing is said of it all the time
+    hand.at(poses[2], 0.9)
+    hand.at(poses[1], 3.0)
+    hand.at(poses[2], 3.0)
+    hand.teacher.close()
+    np.testing.assert_array_equal(load_poses(path, arm), poses[1:])
+    assert hand.lines == ["pose 1 taken", "pose 2 taken"]
+
+
+def test_a_file_of_poses_that_cannot_be_written_is_an_error(tmp_path):
+    (tmp_path / "folder").mkdir()
+    hand = Hand(tmp_path / "folder" / "p.yaml")
+    (tmp_path / "folder").rmdir()
+    with pytest.raises(DvrkDrakeError, match="cannot be written"):
+        hand.at(near_poses()[0], 0.1, enter=True)
+
+
+def test_enter_key_never_waits():
+    reading, writing = os.pipe()
+    with os.fdopen(reading) as stream:
+        key = EnterKey(stream)
+        assert not key()
+        os.write(writing, b"abc")
+        assert not key()
+        os.write(writing, b"\n")
+        assert key() and not key()
+        os.close(writing)
+        assert not key() and not key()
