@@ -10,6 +10,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContact
 from pydrake.multibody.tree import MultibodyForces
 from pydrake.systems.framework import DiagramBuilder
 
+from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import (
     LinkInertia,
@@ -18,7 +19,7 @@ from dvrk_drake.dynamics.inertial_parameters import (
 )
 from dvrk_drake.dynamics.sdf_export import changed_links, sdf_difference, write_sdf
 from dvrk_drake.dynamics.urdf_export import to_urdf, write_urdf
-from dvrk_drake.errors import ModelError
+from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
@@ -178,8 +179,19 @@ def test_only_what_changed_is_written_anew(tmp_path):
     assert all("mass" in line or "i" in line for line in changed) and len(changed) <= 18
 
 
+def test_meshes_that_cannot_be_copied_are_one_line_and_no_model(tmp_path, capsys):
+    (tmp_path / "arm_meshes").write_text("in the way")
+    assert main(["export", "mtml", "--sdf", str(tmp_path / "arm.sdf")]) == 2
+    assert "arm_meshes" in capsys.readouterr().err and not (tmp_path / "arm.sdf").exists()
+    write_sdf(load_arm("mtml"), [], tmp_path / "other.sdf", "a test")
+    (tmp_path / "other_meshes" / "mtm" / "base_link.gltf").unlink()
+    incomplete = dataclasses.replace(load_arm("mtml"), sdf=(str(tmp_path / "other.sdf"),))
+    with pytest.raises(ArmError, match=r"base_link.gltf: no such mesh"):
+        write_sdf(incomplete, [], tmp_path / "again.sdf", "a test")
+
+
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_an_arm_file_can_name_the_written_sdf(name, tmp_path):
+def test_an_arm_file_can_name_the_written_sdf(name, tmp_path, capsys):
     """The recipe of docs/export.md."""
     arm = load_arm(name)
     write_sdf(arm, perturbed(arm), tmp_path / "identified.sdf", "a test")
@@ -191,6 +203,8 @@ def test_an_arm_file_can_name_the_written_sdf(name, tmp_path):
             text = text.replace(f"{kind}: {part}", f"{kind}: {kind}.yaml")
     (tmp_path / "arm.yaml").write_text(text)
     own = load_arm(str(tmp_path / "arm.yaml"))
+    assert main(["export", str(tmp_path / "arm.yaml"), "--sdf", str(tmp_path / "again.sdf")]) == 0
+    assert "All links are as in the arm's own SDF" in capsys.readouterr().out
     assert own.joint_names == arm.joint_names and own.sdf == (str(tmp_path / "identified.sdf"),)
     np.testing.assert_array_equal(own.transmission.matrix, arm.transmission.matrix)
     for expected, link in zip(perturbed(arm), link_inertias(own), strict=True):

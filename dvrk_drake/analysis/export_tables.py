@@ -14,6 +14,7 @@ from dvrk_drake.dynamics.gravity_compensation import MTM_JOINTS
 from dvrk_drake.dynamics.kinematic_compensation import ARM_JOINTS, NAMES, KinematicCompensation
 from dvrk_drake.dynamics.model_links import ModelBodies
 from dvrk_drake.dynamics.sdf_export import LinkChange
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
 
 
@@ -38,12 +39,12 @@ def print_changed_links(console: Console, changes: Sequence[LinkChange], bodies:
         console.print("Centre of mass in the link's frame; principal moments about it.")
     if bodies.rotors:
         rotors = ", ".join(f"{name} {inertia:.3g}" for name, inertia in bodies.rotors.items())
-        console.print(f"Inertia that motors add to joints [kg m^2; kg if prismatic]: {rotors}", soft_wrap=True)
+        console.print(escape(f"Inertia that motors add to joints [kg m^2; kg if prismatic]: {rotors}"), soft_wrap=True)
     for remark in bodies.left_out:
-        console.print(f"Left out: {remark}", soft_wrap=True)
+        console.print(escape(f"Left out: {remark}"), soft_wrap=True)
 
 
-def print_compensation(console: Console, path: str, file: GravityCompensationFile) -> None:
+def print_compensation(console: Console, path: str, arm: Arm, file: GravityCompensationFile) -> None:
     """What a person should read before the controller does."""
     table = _table("", "clip [N m]", "friction [N m]", "ratio", "dead band [rad/s]", "saturation [rad/s]")
     friction = (file.positive - file.negative)[10::5] / 2
@@ -57,6 +58,9 @@ def print_compensation(console: Console, path: str, file: GravityCompensationFil
             f"{file.saturation[j]:g}",
         )
     console.print(table)
+    largest = np.maximum(np.abs(file.torque_lower), np.abs(file.torque_upper))
+    if short := [name for name, at_limit in zip(MTM_JOINTS, largest >= arm.effort_limits, strict=True) if at_limit]:
+        console.print(f"Clipped at the motor's limit somewhere in the joint box: {', '.join(short)}")
     console.print(f'gravity compensation: {path}; "gravity_compensation" of the arm\'s JSON names it', soft_wrap=True)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dvrk_drake.cli.support import check_output
@@ -113,8 +114,9 @@ def _write_gc(model: IdentifiedModel, path: str, options: argparse.Namespace) ->
         "saturation": options.saturation,
     }
     file = compensation_from_model(model, CompensationOptions(**{k: v for k, v in given.items() if v is not None}))
-    file.save(path, model.load_arm().name, f"dvrk-drake export of {options.model}")
-    print_compensation(make_console(), path, file)
+    arm = model.load_arm()
+    file.save(path, arm.name, f"dvrk-drake export of {options.model}")
+    print_compensation(make_console(), path, arm, file)
 
 
 def _write_kinematic(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
@@ -153,15 +155,23 @@ def _compare(options: argparse.Namespace) -> None:
 
 
 def _load_model(name: str) -> IdentifiedModel:
-    """The model of a file, or what the SDF of a known arm states."""
+    """The model of a file, or what the SDF of an arm states, known or of an arm's own file."""
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm import known_arms, load_arm
 
-    if name.lower() in known_arms():
+    if name.lower() in known_arms() or _is_arm_file(name):
         return IdentifiedModel.from_arm(load_arm(name))
     return IdentifiedModel.load(name)
 
 
+def _is_arm_file(name: str) -> bool:
+    """An arm's YAML names its mechanism; a model's has no such field."""
+    try:
+        return any(line.startswith("mechanism:") for line in Path(name).read_text(encoding="utf-8").splitlines())
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
 _export_help = "Writes a model for other programs; several files at once if several are named."
-_model_help = "MODEL.yaml, from identify; or mtml, mtmr, psm: what the SDF of that arm states"
+_model_help = "MODEL.yaml, from identify; or mtml, mtmr, psm, an arm's YAML file: what the SDF of that arm states"
 _tolerance_help = "error [N m] to accept where the file cannot hold what the model says; default: 1e-6"

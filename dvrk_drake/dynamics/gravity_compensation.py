@@ -225,11 +225,11 @@ def _refuse_errors(
         raise ModelError(
             f"the controller's file cannot hold this model: it would be off by up to {off} N m. It knows gravity along "
             "-z, a last link balanced about its roll axis, nothing at joint 7, a polynomial of order 4 elsewhere, and "
-            f"trust only where it is 1; to accept the error, set the tolerance to {_round_up(error.max()):g} N m"
+            f"trust only where it is 1; to accept the error, set the tolerance to {round_up(error.max()):g} N m"
         )
 
 
-def _round_up(x: float) -> float:
+def round_up(x: float) -> float:
     """x rounded up to two digits."""
     unit = 10.0 ** (np.floor(np.log10(x)) - 1)
     return float(np.ceil(x / unit) * unit)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.plant import MultibodyPlant
 
+from dvrk_drake.dynamics.gravity_compensation import round_up
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.dynamics.model_links import model_bodies
@@ -124,7 +125,8 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
         off = ", ".join(f"{name} {e:.2g}" for name, e in zip(ARM_JOINTS, error, strict=True) if e > tolerance)
         raise ModelError(
             f"the controller's file cannot hold this model: it would be off by up to {off} (N m; N on insertion). It "
-            "knows gravity only: no joint effects, and trust only where it is 1"
+            "knows gravity only: no joint effects, and trust only where it is 1; to accept the error, set the "
+            f"tolerance to {round_up(error.max()):g}"
         )
     center = np.divide(known[:, 1:], mass[:, None], out=np.zeros((7, 3)), where=mass[:, None] > 0)
     wrist = np.abs(model.holding_torque(q)[:, :3] - tau_model).max(axis=0)

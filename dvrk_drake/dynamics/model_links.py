@@ -49,13 +49,13 @@ def model_bodies(model: IdentifiedModel) -> ModelBodies:
     links = {link.link: np.array(link.parameters) for link in model.dynamics.links}
     rotors, lost = _place_rotors(arm, links, [rotor.value for rotor in model.dynamics.rotors])
     if lost:
-        left_out.append(f"by what these rotors couple joints, which SDF cannot say: {', '.join(lost)}")
+        left_out.append(f"by what rotors couple joints, which SDF cannot say [kg m^2, largest]: {', '.join(lost)}")
     return ModelBodies(tuple(LinkInertia(name, phi) for name, phi in links.items()), rotors, left_out)
 
 
 def _static_effects(model: IdentifiedModel) -> list[str]:
     remarks = []
-    if effects := [f"{e.joint} {e.kind} {e.value:+.4g}" for e in model.joint_effects]:
+    if effects := [f"{e.joint} {e.kind} {e.value:+.4g}" for e in model.joint_effects if abs(e.value) > 1e-12]:
         remarks.append(f"joint effects [N m; N if prismatic]: {', '.join(effects)}")
     if doubted := [f"{j.name} {j.trust:g}" for j in model.joints if j.trust != 1.0]:
         remarks.append(f"trust below 1: {', '.join(doubted)}")
@@ -85,7 +85,8 @@ def _place_rotors(
             continue
         joints += inertia * row**2
         if np.count_nonzero(row) > 1 and inertia > 0:
-            lost.append(name)
+            coupling = inertia * np.outer(row, row)
+            lost.append(f"{name} {np.abs(coupling - np.diag(np.diag(coupling))).max():.2g}")
     return {name: float(x) for name, x in zip(arm.joint_names, joints, strict=True)}, lost
 
 

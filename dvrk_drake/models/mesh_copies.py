@@ -7,7 +7,7 @@ import shutil
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-from dvrk_drake.errors import ArmError
+from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
 
@@ -54,7 +54,10 @@ def copy_meshes(copies: dict[Path, Path]) -> None:
     for source, target in copies.items():
         if source == target.resolve():
             continue
-        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DvrkDrakeError(f"{target.parent}: cannot be made a folder: {error.strerror}") from error
         with source.open("rb") as stream, atomic_write(target, "wb") as copy:
             shutil.copyfileobj(stream, copy)
 
