@@ -24,6 +24,7 @@ lint: $(VENV)/.installed-lint
 
 benchmark: $(VENV)/.installed-benchmark
 	$(BIN)/python benchmarks/gravity_regressor.py
+	$(BIN)/python benchmarks/dynamic_regressor.py
 	$(BIN)/python benchmarks/control_step.py
 	$(BIN)/python benchmarks/psm_simulation.py
 

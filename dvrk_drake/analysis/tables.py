@@ -47,14 +47,14 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
         f"{model.arm}, {provenance.poses} poses, method {provenance.method}, rank {provenance.rank} of "
         f"{len(model.base_parameters)}, condition number {provenance.condition_number:.3g}\n"
     )
-    table = _table("Base parameters", "", "value", "standard error", "unit", "|value| < 2 se")
+    table = make_table("Base parameters", "", "value", "standard error", "unit", "|value| < 2 se")
     units = derive_gravity(model.load_arm()).base.units
     for p, unit in zip(model.base_parameters, units, strict=True):
         zero = "" if p.distinguishable else "zero?"
         table.add_row(escape(p.name), f"{p.value:+.5f}", f"{p.standard_error:.5f}", unit, zero)
     console.print(table)
     if model.joint_effects:
-        table = _table("Joint effects [N m; N if prismatic]", "", "value", "standard error", "|value| < 2 se")
+        table = make_table("Joint effects [N m; N if prismatic]", "", "value", "standard error", "|value| < 2 se")
         for e in model.joint_effects:
             name = f"{e.joint} {e.kind}"
             table.add_row(name, f"{e.value:+.5f}", f"{e.standard_error:.5f}", "" if e.distinguishable else "zero?")
@@ -70,7 +70,7 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
         for j in model.joints
     ]
     title = "RMS torque error [N m; N if prismatic], doubted measurements left out"
-    table = _table(title, "", "zero torque", "fit", "leave-one-out", "ten-fold*", "doubted", "trust", "poses cover")
+    table = make_table(title, "", "zero torque", "fit", "leave-one-out", "ten-fold*", "doubted", "trust", "poses cover")
     for j, (name, *errors) in zip(model.joints, rows, strict=True):
         cover = f"{j.position_lower:+.2f}..{j.position_upper:+.2f} ({100 * j.coverage:.0f} %)"
         table.add_row(name, *(f"{e:.4f}" for e in errors), str(j.num_doubted), f"{j.trust:.2f}", cover)
@@ -79,7 +79,7 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
         "* each tenth of the poses predicted from the rest, joint effects and trust chosen anew\n", style="dim"
     )
     if any(j.num_doubted for j in model.joints):
-        table = _table("The same with the doubted measurements", "", "zero torque", "fit", "leave-one-out")
+        table = make_table("The same with the doubted measurements", "", "zero torque", "fit", "leave-one-out")
         for j in model.joints:
             errors = [j.rms_zero_torque, j.rms_fit, j.rms_leave_one_out]
             table.add_row(j.name, *(f"{e:.4f}" for e in errors))
@@ -100,7 +100,7 @@ def print_simulation(console: Console, simulation: Simulation, arm: Arm) -> None
     """Where each joint was and how far from where it was wanted, over all recorded samples."""
     recording, desired = simulation.recording, simulation.desired
     effort = np.abs(recording.measured_effort())
-    table = _table(
+    table = make_table(
         f"{arm.name}, simulated for {simulation.time[-1]:g} s [rad, N m; m, N if prismatic]",
         "",
         "start",
@@ -126,7 +126,7 @@ def print_demo(console: Console, result: DemoResult, folder: str) -> None:
     """What the demo measured, what it wrote, and what a person would do next."""
     print_model(console, result.identification.model)
     fresh = list(zip(result.fresh.joints, result.fresh_paper.joints, strict=True))
-    table = _table(
+    table = make_table(
         f"RMS torque error on {result.fresh.poses} fresh poses [N m; N if prismatic]",
         "",
         "zero torque",
@@ -136,7 +136,7 @@ def print_demo(console: Console, result: DemoResult, folder: str) -> None:
     for ours, paper in fresh:
         table.add_row(ours.name, f"{ours.rms_torque:.4f}", f"{ours.rms_error:.4f}", f"{paper.rms_error:.4f}")
     console.print(table)
-    table = _table(
+    table = make_table(
         "Released for 4 s, then a step home [rad; m if prismatic]",
         "",
         *(f"drift, {k}" for k in result.drift),
@@ -160,11 +160,11 @@ def print_demo(console: Console, result: DemoResult, folder: str) -> None:
 def print_symbolic_model(console: Console, gravity: SymbolicGravity) -> None:
     """The base parameters of an arm with the values that its SDF gives them, and its joints' limits."""
     arm = gravity.arm
-    table = _table(f"{arm.name}: base parameters of gravity", "", "nominal value", "unit")
+    table = make_table(f"{arm.name}: base parameters of gravity", "", "nominal value", "unit")
     for name, value, unit in zip(gravity.base.names, gravity.base_values, gravity.base.units, strict=True):
         table.add_row(escape(name), f"{value:+.5f}", unit)
     console.print(table)
-    table = _table("Joints [rad, N m; m, N if prismatic]", "", "position", "effort limit")
+    table = make_table("Joints [rad, N m; m, N if prismatic]", "", "position", "effort limit")
     for i, name in enumerate(arm.joint_names):
         position = f"{arm.position_lower[i]:+.4f}..{arm.position_upper[i]:+.4f}"
         table.add_row(f"q{i + 1} {name}", position, f"{arm.effort_limits[i]:.4g}")
@@ -187,7 +187,7 @@ def print_doubts(console: Console, doubts: Sequence[Doubt], most: int = 30) -> N
 
 def print_validation(console: Console, validation: Validation) -> None:
     """Error beside zero torque, joint by joint."""
-    table = _table(
+    table = make_table(
         f"RMS over {validation.poses} poses [N m; N if prismatic]; without doubted measurements in brackets",
         "",
         "zero torque",
@@ -210,7 +210,7 @@ def print_validation(console: Console, validation: Validation) -> None:
 
 def print_teleoperation(console: Console, result: TeleoperationResult, file: str) -> None:
     """How well the tip followed."""
-    table = _table("Tip against handle", "", "RMS", "largest")
+    table = make_table("Tip against handle", "", "RMS", "largest")
     table.add_row(
         escape("position [mm]"), f"{1e3 * result.rms_position_error:.3f}", f"{1e3 * result.max_position_error:.3f}"
     )
@@ -227,7 +227,8 @@ def print_teleoperation(console: Console, result: TeleoperationResult, file: str
     )
 
 
-def _table(title: str, *columns: str) -> Table:
+def make_table(title: str, *columns: str) -> Table:
+    """An empty table with a bold title; the first column left, the others right."""
     # A title may be wider than its table, and would be wrapped.
     text = Text(title, style="bold", no_wrap=True, overflow="ignore")
     table = Table(title=text, title_justify="left", box=None, pad_edge=False, expand=False)

@@ -8,6 +8,7 @@ import json
 from dvrk_drake.cli.support import (
     ProgressBar,
     add_gravity,
+    add_recording,
     check_output,
     made_folder,
     mounted,
@@ -18,7 +19,7 @@ from dvrk_drake.cli.support import (
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
     """Adds the verbs and their options."""
     verb = verbs.add_parser("identify", help="identify a model from a recording of poses and holding torques")
-    _add_recording(verb)
+    add_recording(verb)
     verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, psm, or a YAML file")
     verb.add_argument("--output", required=True, metavar="MODEL.yaml", help="the model file to write")
     verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="default: robust")
@@ -29,7 +30,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
     verb = verbs.add_parser("validate", help="compare a model with a recording that it was not made from")
     verb.add_argument("model", metavar="MODEL.yaml")
-    _add_recording(verb)
+    add_recording(verb)
     verb.add_argument("--json", metavar="FILE", help="write the errors as JSON")
     verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
@@ -37,7 +38,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
     verb = verbs.add_parser("predict", help="write a model's holding torques at a recording's poses")
     verb.add_argument("model", metavar="MODEL.yaml")
-    _add_recording(verb)
+    add_recording(verb)
     verb.add_argument("--output", required=True, metavar="FILE.csv", help="columns tau1.., one row a row")
     verb.set_defaults(run=_predict)
 
@@ -163,12 +164,3 @@ def _convert(options: argparse.Namespace) -> None:
 
 
 _slow_parts_help = "of a motion without rests, take where a joint is slow as poses"
-
-
-def _add_recording(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "recording", metavar="RECORDING", help="CSV with header q1..qn, tau1..taun; t, qd1.. optional; or an LCM log"
-    )
-    verb.add_argument(
-        "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
-    )

@@ -111,6 +111,16 @@ def print_notes(path: str, notes: Sequence[str]) -> None:
         print(f"dvrk-drake: note: {path}: {note}", file=sys.stderr)
 
 
+def add_recording(verb: argparse.ArgumentParser) -> None:
+    """Adds RECORDING and the option --coordinates."""
+    verb.add_argument(
+        "recording", metavar="RECORDING", help="CSV with header q1..qn, tau1..taun; t, qd1.. optional; or an LCM log"
+    )
+    verb.add_argument(
+        "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
+    )
+
+
 def add_gravity(verb: argparse.ArgumentParser) -> None:
     """Adds the option --gravity."""
     verb.add_argument(

@@ -11,18 +11,36 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class StandardParameter:
-    """One inertial parameter of one link: its mass m [kg] (axis "") or a first moment m c [kg m] (axis "x", "y", "z").
+    """One inertial parameter of one link, as the field writes it.
 
-    `label` is the link as the field counts it ("2", or a name such as "crank").
+    `label` is the link as the field counts it ("2", or a name such as "crank"). `axis` is "" for the mass m [kg], "x",
+    "y", "z" for a first moment m c [kg m], "xx", "yy", "zz", "xy", "xz", "yz" for a moment or product of inertia
+    [kg m^2], and "a" for the inertia of an actuator's rotor [kg m^2; kg if the actuator `slides`], which `label` then
+    counts.
     """
 
     label: str
     axis: str = ""
+    slides: bool = False
 
     def __str__(self) -> str:
+        if self.is_inertia:
+            return f"I{self.axis}_{self.label}"
         separator = "" if self.label.isdigit() else "_"
         mass = f"m{separator}{self.label}"
         return f"{mass} c{separator}{self.label}{separator}{self.axis}" if self.axis else mass
+
+    @property
+    def is_inertia(self) -> bool:
+        """A second moment of mass, of a link or of a rotor."""
+        return self.axis == "a" or len(self.axis) == 2
+
+    @property
+    def unit(self) -> str:
+        """In SI."""
+        if self.is_inertia:
+            return "kg" if self.slides else "kg m^2"
+        return "kg m" if self.axis else "kg"
 
 
 @dataclass(frozen=True)
@@ -33,7 +51,7 @@ class BaseParameters:
         columns: (b,) index of the standard parameter whose column stands for each base parameter.
         combination: (b, p) coefficients.
         names: (b,) such as "L2 (m2+...+m7) + m2 c2x".
-        units: (b,) "kg m", or "kg" of the mass that a prismatic joint lifts.
+        units: (b,) those of the standard parameters of `columns`; "kg" is of a mass that a prismatic joint lifts.
     """
 
     columns: tuple[int, ...]
@@ -58,7 +76,7 @@ def reduce_to_base(
         regressor: (rows, p) stacked over random poses; rows must be well over p.
         parameters: the p standard parameters.
         preference: a permutation of 0..p-1.
-        lengths: named lengths [m], to print 0.2794 as L2.
+        lengths: named coefficients, to print 0.2794 as L2: lengths [m], and where there are inertias their products.
         tolerance: relative size below which a column counts as dependent.
     """
     scale = np.linalg.norm(regressor, axis=0).max()
@@ -76,7 +94,7 @@ def reduce_to_base(
     solution = np.linalg.lstsq(regressor[:, columns], regressor, rcond=None)[0]
     combination = _snap(np.asarray(solution, dtype=np.float64), lengths)
     names = tuple(_readable(row, parameters, lengths) for row in combination)
-    units = tuple("kg m" if parameters[column].axis else "kg" for column in columns)
+    units = tuple(parameters[column].unit for column in columns)
     return BaseParameters(tuple(columns), combination, names, units)
 
 
@@ -88,18 +106,24 @@ def _snap(combination: NDArray[np.float64], lengths: Mapping[str, float]) -> NDA
 
 
 def _readable(row: NDArray[np.float64], parameters: Sequence[StandardParameter], lengths: Mapping[str, float]) -> str:
-    """One combination as the field writes it: masses with a common length grouped first, then first moments."""
+    """One combination as the field writes it: inertias, masses with a common coefficient grouped, first moments."""
     groups: dict[float, list[StandardParameter]] = {}
+    inertias: list[tuple[float, str]] = []
     moments: list[tuple[float, str]] = []
     for coefficient, parameter in zip(row, parameters, strict=True):
-        if coefficient and parameter.axis:
+        if coefficient and parameter.is_inertia:
+            inertias.append((coefficient, str(parameter)))
+        elif coefficient and parameter.axis:
             moments.append((coefficient, str(parameter)))
         elif coefficient:
-            groups.setdefault(coefficient, []).append(parameter)
-    terms = [(coefficient, _sum_of_masses(group)) for coefficient, group in groups.items()] + moments
+            # One that has no name is known to rounding only.
+            groups.setdefault(round(coefficient, 12), []).append(parameter)
+    terms = inertias + [(coefficient, _sum_of_masses(group)) for coefficient, group in groups.items()] + moments
     text = ""
     for coefficient, what in terms:
-        size = next((name for name, v in lengths.items() if v == abs(coefficient)), f"{abs(coefficient):.6g}")
+        size = next(
+            (name for name, v in lengths.items() if abs(v - abs(coefficient)) < 1e-11), f"{abs(coefficient):.6g}"
+        )
         factor = "" if size == "1" else f"{size} "
         sign = ("- " if coefficient < 0 else "+ ") if text else ("-" if coefficient < 0 else "")
         text += f"{' ' if text else ''}{sign}{factor}{what}"

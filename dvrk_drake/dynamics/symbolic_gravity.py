@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 
@@ -89,7 +90,7 @@ def derive_gravity(arm: Arm, frames: str = "dh", serial: bool = False) -> Symbol
     energies = [plant.simplify(plant.to_sympy(energy)) for link in plant.potential_energy(labels) for energy in link]
     standard = sympy.Matrix([[energy.diff(q) for q in plant.q] for energy in energies]).T
 
-    lengths = _named_lengths(plant, frames)
+    lengths = named_lengths(plant.numeric, plant.bodies, frames)
     base = reduce_to_base(
         _evaluate_at_random_poses(standard, plant.q, arm), parameters, _readable_preference(parameters), lengths
     )
@@ -132,9 +133,10 @@ def _named_frames(plant: MultibodyPlant) -> list[Frame]:
     return [frame for frame in frames if frame.name().startswith("dh_")]
 
 
-def _named_lengths(symbolic_plant: SymbolicPlant, frames: str) -> dict[str, float]:
-    """Constant distances between the frames of neighbouring links, named as the field does: L2, L3, L4, L_crank."""
-    plant, labels = symbolic_plant.numeric, symbolic_plant.bodies
+def named_lengths(
+    plant: MultibodyPlant, labels: Mapping[str, tuple[RigidBody, RigidTransform]], frames: str = "dh"
+) -> dict[str, float]:
+    """Constant distances between the frames of neighbouring links as the field names them: L2, L_crank; and "1"."""
     context = plant.CreateDefaultContext()
     lengths = {"1": 1.0}
     for label in labels:

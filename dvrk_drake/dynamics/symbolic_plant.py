@@ -41,7 +41,7 @@ class SymbolicPlant:
         """
         self.arm, self._frames = arm, frames
         self.numeric = make_arm_plant(arm)
-        self.bodies = _labelled_bodies(self.numeric, frames)
+        self.bodies = labelled_bodies(self.numeric, frames)
         self._plant = self.numeric.ToSymbolic()
         self._context = self._plant.CreateDefaultContext()
         self.drake_q = [symbolic.Variable(f"q{i + 1}") for i in range(arm.num_joints)]
@@ -123,7 +123,7 @@ def _tree_positions(arm: Arm, q: list[symbolic.Variable]) -> list[symbolic.Expre
     ]
 
 
-def _labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[RigidBody, RigidTransform]]:
+def labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[RigidBody, RigidTransform]]:
     """Bodies by label with the frame F that their parameters are written in, X_BF; numbered links first.
 
     The links are those with a frame <frames>_<number>, the base's 0 left out, or dh_<name> for links of a linkage.

@@ -44,6 +44,7 @@ class Arm:
         loop_closures: frames that must coincide.
         gravity: (3,) gravity vector in the base frame [m/s^2].
         gains: default gains of the controller.
+        effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].
     """
 
     name: str
@@ -61,6 +62,7 @@ class Arm:
     loop_closures: tuple[LoopClosure, ...]
     gravity: NDArray[np.float64]
     gains: Gains
+    effort_cut_off: float
 
     @property
     def num_joints(self) -> int:
@@ -219,6 +221,7 @@ def _build_arm(
         loop_closures=tuple(mechanism.loop_closures),
         gravity=_checked_gravity(description.gravity),
         gains=gains,
+        effort_cut_off=_checked_cut_off(path, mechanism),
     )
 
 
@@ -238,6 +241,14 @@ def _coupled_limits(path: Path, description: ArmDescription, mechanism: Mechanis
             raise ArmError(f"{path}: coupled_limits.{name} must be [lower, upper] with lower < upper")
         limits[name] = dataclasses.replace(limits[name], lower=bounds[0], upper=bounds[1])
     return tuple(limits.values())
+
+
+def _checked_cut_off(path: Path, mechanism: Mechanism) -> float:
+    if not 0.1 <= mechanism.effort_cut_off <= 1000:
+        raise ArmError(
+            f"{path}: effort_cut_off = {mechanism.effort_cut_off:g} Hz of its mechanism; 0.1..1000 Hz is allowed"
+        )
+    return mechanism.effort_cut_off
 
 
 def _checked_gravity(gravity: Sequence[float]) -> NDArray[np.float64]:

@@ -35,7 +35,10 @@ class Gains:
 
 @dataclass
 class Mechanism:
-    """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common."""
+    """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common.
+
+    `effort_cut_off` [Hz] is that of the low-pass behind which measured and modelled efforts are compared.
+    """
 
     sdf: str = ""
     joints: list[str] = field(default_factory=list)
@@ -43,6 +46,7 @@ class Mechanism:
     transmission: dict[str, dict[str, float]] = field(default_factory=dict)
     coupled_limits: list[CoupledLimit] = field(default_factory=list)
     loop_closures: list[LoopClosure] = field(default_factory=list)
+    effort_cut_off: float = 10.0
 
 
 @dataclass

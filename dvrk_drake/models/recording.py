@@ -110,6 +110,23 @@ class Recording:
             coordinates="joint",
         )
 
+    def in_actuator_coordinates(self, arm: Arm) -> Recording:
+        """The same recording with q, qd and tau of the arm's actuators.
+
+        Raises:
+            RecordingError: wrong number of joints.
+        """
+        self._check_joint_count(arm)
+        if self.coordinates == "actuator":
+            return self
+        return replace(
+            self,
+            q=arm.transmission.position(self.q),
+            qd=None if self.qd is None else arm.transmission.velocity(self.qd),
+            tau=None if self.tau is None else arm.transmission.inverse().pull_back_effort(self.tau),
+            coordinates="actuator",
+        )
+
     def check_fits(self, arm: Arm) -> None:
         """Refuses poses that `arm` cannot have taken.
 

@@ -1,0 +1,95 @@
+"""Where in frequency a motion's signals are noise: cut-offs that follow from it, and noise of a narrow band."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+from scipy.signal import welch
+
+#: Length of the pieces whose periodograms are averaged [s]; 1 / it is the resolution [Hz].
+PIECE = 2.56
+#: Lowest cut-off that is proposed [Hz].
+LEAST_CUT_OFF = 2.0
+#: A narrow band: noise above this many times what it is on both sides.
+PEAK = 4.0
+#: Its edges: where the noise falls below this share of its peak; at most this many octaves apart.
+EDGE, WIDEST = 0.15, 2.0
+#: It matters from this share of the signal's RMS on.
+LEAST_SHARE = 0.03
+
+
+class Spectra(NamedTuple):
+    """Power spectral densities over frequency, (k,) and (k, n)."""
+
+    frequency: NDArray[np.float64]
+    signal: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+
+class Band(NamedTuple):
+    """Noise between two frequencies [Hz], and its RMS over that of the signal [1]."""
+
+    lower: float
+    upper: float
+    share: float
+
+
+def spectra(x: NDArray[np.float64], rate: float, period: float | None) -> Spectra:
+    """Spectra of what repeats and of what does not.
+
+    With a period T, noise is (x(t) - x(t + T)) / sqrt(2) and the signal what is left of the power of x. Without one,
+    noise is taken for white: the median density above a quarter of the rate.
+
+    Args:
+        x: (m, n) at a constant rate.
+        rate: samples a second [Hz].
+        period: of the motion [s], or None.
+    """
+    length = min(int(PIECE * rate), len(x) // 4)
+    frequency, power = welch(x, rate, nperseg=length, axis=0)
+    if period is None:
+        noise = np.tile(np.median(power[frequency > rate / 4], axis=0), (len(frequency), 1))
+    else:
+        shift = round(period * rate)
+        _, noise = welch(x[shift:] - x[:-shift], rate, nperseg=min(length, len(x) - shift), nfft=length, axis=0)
+        noise = noise / 2
+    return Spectra(frequency, np.maximum(power - noise, 0), noise)
+
+
+def cut_offs(of: Spectra) -> NDArray[np.float64]:
+    """(n,) the lowest frequency above which the signal is under the noise [Hz], at least `LEAST_CUT_OFF`.
+
+    Both are smoothed over five lines. Where the signal is above the noise up to the end, that is half the rate.
+    """
+    kernel = np.ones(5) / 5
+    result = []
+    for signal, noise in zip(of.signal.T, of.noise.T, strict=True):
+        under = np.convolve(signal, kernel, "same") < np.convolve(noise, kernel, "same")
+        under &= of.frequency >= LEAST_CUT_OFF
+        result.append(of.frequency[np.argmax(under)] if np.any(under) else of.frequency[-1])
+    return np.array(result)
+
+
+def narrow_band(of: Spectra, joint: int) -> Band | None:
+    """The strongest narrow band of one joint's noise, if it stands out on both sides and matters."""
+    noise = median_filter(of.noise[:, joint], 3)
+    noise[0] = noise[1]
+    peak = int(np.argmax(noise))
+    inside = noise > EDGE * noise[peak]
+    lower, upper = peak, peak
+    while lower > 0 and inside[lower - 1]:
+        lower -= 1
+    while upper < len(noise) - 1 and inside[upper + 1]:
+        upper += 1
+    below, above = noise[:lower], noise[upper + 1 :]
+    if lower < 2 or len(above) < 2 or noise[peak] < PEAK * max(np.median(below), np.median(above)):
+        return None
+    f, step = of.frequency, of.frequency[1]
+    total = np.sum(of.signal[:, joint] + of.noise[:, joint])
+    share = float(np.sqrt(np.sum(of.noise[lower : upper + 1, joint]) / total))
+    if share < LEAST_SHARE or f[upper] > f[lower] * 2**WIDEST:
+        return None
+    return Band(float(f[lower] - step / 2), float(f[upper] + step / 2), share)

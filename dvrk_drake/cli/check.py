@@ -1,0 +1,41 @@
+"""The verb `check`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from dvrk_drake.cli.support import add_recording, check_output
+from dvrk_drake.errors import RecordingError
+
+
+def add_verbs(verbs: argparse._SubParsersAction) -> None:
+    """Adds the verb and its options."""
+    verb = verbs.add_parser(
+        "check", help="say what is wrong with a recording before anything is identified from it; exit code 2: unusable"
+    )
+    add_recording(verb)
+    verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, psm, or a YAML file")
+    verb.add_argument("--json", metavar="FILE", help="write the findings and numbers as JSON")
+    verb.set_defaults(run=_check)
+
+
+def _check(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.recording_check import check_recording
+    from dvrk_drake.analysis.recording_tables import print_report
+    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.recording import read_recording
+
+    arm = load_arm(options.arm)
+    if options.json is not None:
+        check_output(options.json, options.recording)
+    report = check_recording(read_recording(options.recording, arm, options.coordinates), arm)
+    print_report(make_console(), report)
+    if options.json is not None:
+        with atomic_write(options.json) as stream:
+            json.dump(report.as_dict(), stream, indent=2)
+            stream.write("\n")
+    if count := len(report.refusals):
+        raise RecordingError(f"{options.recording}: refused for {count} reason{'s' * (count > 1)}: see above")

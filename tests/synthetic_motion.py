@@ -1,0 +1,86 @@
+"""A motion whose efforts are known: the arm's own inverse dynamics with friction, and clean channels."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.models.recording import Recording
+
+RATE, PERIOD, PASSES = 200.0, 6.0, 4
+#: White noise of the efforts, as a share of their RMS.
+EFFORT_NOISE = 0.01
+#: Coulomb and viscous friction of each actuator take about this share of the RMS of the rigid-body effort each.
+FRICTION = 0.2
+
+
+def trajectory(arm: Arm, t: np.ndarray, period: float = PERIOD, seed: int = 1) -> tuple[np.ndarray, ...]:
+    """q, v, vd (m, n): a Fourier series of five harmonics a joint, over 60 % of each range."""
+    generator = np.random.default_rng(seed)
+    n = arm.num_joints
+    amplitude = generator.uniform(0.3, 1.0, (5, n)) / np.arange(1, 6)[:, None]
+    phase = generator.uniform(0, 2 * np.pi, (5, n))
+    w = 2 * np.pi * np.arange(1, 6)[:, None, None] / period
+    angle = w * t[:, None] + phase[:, None, :]
+    q = np.sum(amplitude[:, None] * np.sin(angle), axis=0)
+    v = np.sum(amplitude[:, None] * w * np.cos(angle), axis=0)
+    vd = -np.sum(amplitude[:, None] * w**2 * np.sin(angle), axis=0)
+    middle, half = (arm.position_upper + arm.position_lower) / 2, (arm.position_upper - arm.position_lower) / 2
+    scale = 0.6 * np.minimum(half, 2.0) / np.max(np.abs(q), axis=0)
+    return middle + scale * q, scale * v, scale * vd
+
+
+def inverse_dynamics(arm: Arm, plant: MultibodyPlant, q: np.ndarray, v: np.ndarray, vd: np.ndarray) -> np.ndarray:
+    """(m, n) efforts of the joints: those of the tree, projected with the linkage's map."""
+    context = plant.CreateDefaultContext()
+    order = [plant.GetJointByName(name).velocity_start() for name in arm.tree_joint_names]
+    tree = np.empty((3, len(q), plant.num_velocities()))
+    tree[0][:, order] = arm.linkage.position(q)
+    tree[1][:, order] = arm.linkage.velocity(v)
+    tree[2][:, order] = arm.linkage.velocity(vd)
+    tau = np.empty((len(q), len(order)))
+    from pydrake.multibody.tree import MultibodyForces
+
+    forces = MultibodyForces(plant)
+    for i in range(len(q)):
+        plant.SetPositions(context, tree[0][i])
+        plant.SetVelocities(context, tree[1][i])
+        forces.SetZero()
+        plant.CalcForceElementsContribution(context, forces)
+        tau[i] = plant.CalcInverseDynamics(context, tree[2][i], forces)[order]
+    return arm.linkage.pull_back_effort(tau)
+
+
+@cache
+def efforts(name: str, period: float = PERIOD) -> tuple[np.ndarray, ...]:
+    """t, q, v, tau (joint coordinates) on a grid five times as fine as the recording's, of PASSES * PERIOD seconds."""
+    arm = load_arm(name)
+    t = np.arange(0, PASSES * PERIOD, 0.2 / RATE)
+    coarse = t[::5]
+    q, v, vd = trajectory(arm, coarse, period)
+    rigid = inverse_dynamics(arm, make_arm_plant(arm), q, v, vd)
+    a_rigid = arm.transmission.inverse().pull_back_effort(rigid)
+    fine = np.column_stack([np.interp(t, coarse, x) for x in a_rigid.T])
+    q, v, _ = trajectory(arm, t, period)
+    v_act = arm.transmission.velocity(v)
+    speed = np.sqrt(np.mean(v_act**2, axis=0))
+    size = np.maximum(np.sqrt(np.mean(a_rigid**2, axis=0)), 1e-3)
+    friction = FRICTION * size * (np.tanh(v_act / (0.02 * speed)) + v_act / speed)
+    return t, q, v, arm.transmission.pull_back_effort(fine + friction)
+
+
+def clean_motion(name: str = "psm", *, at: np.ndarray | None = None, effort_lag: float = 0.0, **options) -> Recording:
+    """Joint coordinates at 200 Hz, or at true times `at`; efforts late by `effort_lag` [s], with white noise."""
+    t, q, v, tau = efforts(name, **options)
+    times = t[::5] if at is None else at
+
+    def sample(x, times=times):
+        return np.column_stack([np.interp(times, t, column) for column in x.T])
+
+    tau = sample(tau, np.clip(times - effort_lag, 0, None))
+    noise = np.random.default_rng(2).normal(size=tau.shape) * EFFORT_NOISE * np.sqrt(np.mean(tau**2, axis=0))
+    return Recording(sample(q), tau + noise, sample(v), np.arange(len(times)) / RATE, source="motion.csv")
