@@ -30,12 +30,13 @@ def plot_report(folder: Path, report: RecordingReport, recording: Recording, arm
     noise = "does not repeat" if report.period is not None else "white noise"
     figure, axes = plt.subplots(2, -(-arm.num_joints // 2), figsize=(13, 6.5), layout="constrained", sharex=True)
     for j, (joint, ax) in enumerate(zip(report.joints, axes.flat, strict=False)):
-        ax.loglog(of.frequency[1:], np.maximum(of.signal[1:, j], 1e-300), color=MODEL_COLOUR, label="signal")
-        ax.loglog(of.frequency[1:], of.noise[1:, j], color=MEASURED_COLOUR, label=noise)
+        # Without a bottom, a silent or a perfect effort has no logarithm.
+        bottom = 0.1 * max(float(np.min(of.noise[1:, j])), 1e-12 * float(np.max(of.signal[:, j])), 1e-30)
+        for density, colour, label in ((of.signal, MODEL_COLOUR, "signal"), (of.noise, MEASURED_COLOUR, noise)):
+            ax.loglog(of.frequency[1:], np.maximum(density[1:, j], bottom), color=colour, label=label)
         ax.axvline(joint.effort_cut_off, color=ZERO_COLOUR, label="cut-off")
-        ax.set_ylim(bottom=0.1 * float(np.min(of.noise[1:, j])) or None)
         ax.set_title(f"J{j + 1} {joint.name}: {joint.effort_cut_off:.1f} Hz", fontsize=10)
-        ax.set_ylabel(f"tau{j + 1} [{'N' if arm.prismatic[j] else 'N m'}$^2$/Hz]", fontsize=8)
+        ax.set_ylabel(f"tau{j + 1} [({'N' if arm.prismatic[j] else 'N m'})$^2$/Hz]", fontsize=8)
         ax.set_xlabel("frequency [Hz]", fontsize=8)
         ax.tick_params(labelsize=7)
     for ax in axes.flat[arm.num_joints :]:
