@@ -106,9 +106,7 @@ def least_eigenvalue_bound(link: LinkInertia) -> float:
     return min(LEAST_EIGENVALUE, 0.5 * float(np.linalg.eigvalsh(link.pseudo_inertia())[0]))
 
 
-def _constrain_link(
-    program: MathematicalProgram, y: NDArray, scale: NDArray[np.float64], link: LinkInertia
-) -> None:
+def _constrain_link(program: MathematicalProgram, y: NDArray, scale: NDArray[np.float64], link: LinkInertia) -> None:
     size = LinkScale.of(link)
     # A congruence keeps the sign of every eigenvalue and brings a finger's and a forearm's numbers to the same size.
     D = np.diag([1 / size.length] * 3 + [1.0]) / np.sqrt(size.mass)

@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.common.yaml import yaml_load_typed
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.arm_schema import ArmDescription, CoupledLimit, Gains, Instrument, LoopClosure, Mechanism, MotionSettings
+from dvrk_drake.models.arm_schema import (
+    ArmDescription,
+    CoupledLimit,
+    Gains,
+    Instrument,
+    LoopClosure,
+    Mechanism,
+    MotionSettings,
+)
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, compose_sdf, read_sdf_facts
 
