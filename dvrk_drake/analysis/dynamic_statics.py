@@ -1,4 +1,4 @@
-"""What of an arm's dynamics holds it at rest: base parameters of the links, and joint effects as controllers read them."""
+"""What of an arm's dynamics holds it at rest: base parameters of the links, effects of the drive."""
 
 from __future__ import annotations
 

@@ -30,9 +30,7 @@ def print_dynamics(console: Console, model: IdentifiedModel) -> None:
             soft_wrap=True,
         )
     title = f"Efforts of the actuators behind {section.signals.effort_cut_off:g} Hz [N m; N]"
-    table = make_table(
-        title, "", "measured RMS", "error, fit", "cross-validated*", "%, fit", "% cross-v.*", "% floor**"
-    )
+    table = make_table(title, "", "measured RMS", "error, fit", "cross-validated*", "%, fit", "%, cross*", "%, floor**")
     for a in section.actuators:
         shares = [_percent(x, a.rms_effort) for x in (a.rms_fit, a.rms_cross_validation, a.rms_repeatability)]
         numbers = (a.rms_effort, a.rms_fit, a.rms_cross_validation)

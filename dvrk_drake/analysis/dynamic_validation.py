@@ -27,7 +27,7 @@ class ActuatorError:
     `relative_error` = rms_error / rms_effort, None where nothing was measured. The rest of it splits rms_error^2 into
     shares: `bias` is its mean, `friction_like` what viscous and Coulomb friction in the actuator would explain of it
     then, `position_dependent` what two harmonics over its travel would explain of what is left, `other` the remainder.
-    `repeatability` is the relative error that no model of q, v and vd can be below, None where the motion does not repeat.
+    `repeatability`: the relative error that no model of q, v and vd is below, None where the motion does not repeat.
     """
 
     name: str
@@ -140,14 +140,15 @@ def _actuator_error(
         [v, np.tanh(v / width)],
         [f(np.pi * k * travel) for k in range(1, _HARMONICS + 1) for f in (np.sin, np.cos)],
     ]
-    shares, columns, left = [], [], float(np.sum(error**2)) or 1.0
-    whole = left
+    shares = []
+    columns: list[NDArray[np.float64]] = []
+    whole = left = float(np.sum(error**2)) or 1.0
     for kind in kinds:
         columns += kind
         X = np.column_stack(columns)
         rest = float(np.sum((error - X @ np.linalg.lstsq(X, error, rcond=None)[0]) ** 2))
         shares.append((left - rest) / whole)
         left = rest
-    return ActuatorError(
-        name, effort, size, size / effort if effort > 0 else None, *shares, left / whole, repeatability
-    )
+    bias, friction, position = shares
+    relative = size / effort if effort > 0 else None
+    return ActuatorError(name, effort, size, relative, bias, friction, position, left / whole, repeatability)

@@ -21,7 +21,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     """Adds the verbs and their options."""
     verb = verbs.add_parser(
         "identify",
-        help="identify a model: of a motion the full dynamics, of poses and holding torques what holds the arm",
+        help="identify a model: of a motion the full dynamics, of poses what holds the arm",
     )
     add_recording(verb)
     verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, psm, or a YAML file")
@@ -42,8 +42,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
     verb = verbs.add_parser(
         "predict",
-        help="write a model's efforts at a recording's rows: in a motion behind the low-pass it was identified with, else "
-        "those that hold the poses",
+        help="write a model's efforts at a recording's rows: of a motion behind its low-pass, of poses what holds them",
     )
     verb.add_argument("model", metavar="MODEL.yaml")
     add_recording(verb)

@@ -92,7 +92,7 @@ def consistent_parameters(
         status = result.get_solver_details().status
         raise IdentificationError(
             f"the program for physically consistent parameters did not converge: Clarabel says {status}, after "
-            f"{result.get_solver_details().iterations} iterations; do the recording's efforts and positions belong to this arm?"
+            f"{result.get_solver_details().iterations} iterations; are efforts and positions this arm's?"
         )
     x = np.asarray(result.GetSolution(y), dtype=float) * scale
     # Interior-point solutions keep their inequalities to the tolerance; these are kept exactly.
