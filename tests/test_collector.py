@@ -131,3 +131,15 @@ def test_a_file_that_cannot_be_written_ends_it(tmp_path):
 def test_a_speed_that_is_not_allowed(seconds):
     with pytest.raises(CollectionError, match=r"must be 1..60 s; got"):
         CollectionSettings(seconds)
+
+
+def test_an_arm_whose_computer_is_slow_is_not_hurried(tmp_path):
+    """A simulated arm that takes four times as long as its clock says: the way goes by the arm's clock."""
+    poses = random_poses(load_arm("mtml"), 3, seed=4)
+    collector, controller, sticky = make_collector(tmp_path / "o.csv", poses, np.zeros(7), both_sides=False)
+    while not collector.finished and sticky.ticks < 20_000:
+        status, time = sticky.status(), 4 * PERIOD * sticky.ticks
+        sticky.step(controller.answer(status, time, collector.lead(status, time)))
+    collector.close()
+    assert collector.problem is None
+    assert collector.done.all()

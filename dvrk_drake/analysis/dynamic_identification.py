@@ -59,7 +59,7 @@ def identify_dynamic(
     smoothed Coulomb and presliding friction at its actuators and at the joints that actuators share; springs, cable
     torques and friction that differs by direction are chosen by cross-validation over the phases of the motion. The
     links' parameters are those nearest to the recording that bodies can have, the SDF's where it says nothing
-    (`consistent_parameters`). The direction of gravity is found along, where the arm's file says that its base may tilt.
+    (`consistent_parameters`). The direction of gravity is found along where the arm's file says that its base may tilt.
 
     Args:
         recording: a motion with t and tau, in either coordinates.

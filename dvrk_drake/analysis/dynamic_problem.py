@@ -78,7 +78,7 @@ class DynamicProblem:
         """(p,) by which the truth may differ from it."""
         links = [LINK_DEVIATION * LinkScale.of(link).deviations for link in self.regressor.links]
         rotors = np.maximum(LINK_DEVIATION * self.prior[10 * len(links) :], LEAST_ROTOR_DEVIATION)
-        return np.concatenate([*links, rotors])
+        return np.asarray(np.concatenate([*links, rotors]), dtype=float)
 
     @cached_property
     def effect_precision(self) -> NDArray[np.float64]:
@@ -177,7 +177,7 @@ class ConsistentFit:
         self._equations = NormalEquations.of(stacked, columns.tau, problem.fold, problem.edge)
         total = self._equations.total()
         self.x, H = self._solve(total)
-        self.covariance = np.linalg.inv(H)
+        self.covariance = np.asarray(np.linalg.inv(H), dtype=float)
         self.errors = squared_errors(total, self.x)
 
     @property

@@ -116,7 +116,10 @@ class EffectSelection:
         with_effort = np.append(index, products.shape[-1] - 1)
         x = np.zeros(len(self.precision))
         x[index] = solve(
-            products[:, with_effort[:, None], with_effort], self.weights, self.precision[index], self.non_negative[index]
+            products[:, with_effort[:, None], with_effort],
+            self.weights,
+            self.precision[index],
+            self.non_negative[index],
         )
         return x
 

@@ -1,4 +1,4 @@
-"""What of an arm's dynamics holds it at rest: base parameters of the links, and joint effects as controllers read them."""
+"""What of an arm's dynamics holds it at rest: base parameters of the links, effects of the drive."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ def base_parameter_map(gravity: SymbolicGravity, regressor: DynamicRegressor) ->
     """(b, 10 links) B with beta = B phi: both regressors give the torque that holds the arm, at all poses."""
     arm = gravity.arm
     q = np.random.default_rng(0).uniform(-1, 1, (60, arm.num_joints))
-    Y = sympy.lambdify(gravity.q, gravity.regressor.subs(GRAVITY, gravity.gravity_magnitude).tolist(), "numpy", cse=True)
+    Y = sympy.lambdify(
+        gravity.q, gravity.regressor.subs(GRAVITY, gravity.gravity_magnitude).tolist(), "numpy", cse=True
+    )
     ours = np.array([Y(*pose) for pose in q], dtype=float).reshape(-1, len(gravity.base.names))
     rest = np.zeros_like(q)
     full = regressor.regressor(q, rest, rest)[..., : 10 * len(regressor.links)]

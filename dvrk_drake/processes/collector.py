@@ -107,9 +107,10 @@ class Collector:
         self._steps = self._collect()
 
     def lead(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:
-        """The desired state (2n) at `time` [s], after that status."""
-        self._time += min(max(time - self._heard, 0.0), _LONGEST_STEP)
-        self._heard = time
+        """The desired state (2n) after that status. Time goes by the arm's clock, so that a slow one is not hurried."""
+        measured = 1e-6 * status.utime
+        self._time += min(max(measured - self._heard, 0.0), _LONGEST_STEP)
+        self._heard = measured
         self._q, self._tau = np.array(status.position), np.array(status.effort_measured)
         if self.finished:
             return self._desired
