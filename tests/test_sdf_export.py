@@ -17,7 +17,9 @@ from dvrk_drake.dynamics.inertial_parameters import (
     link_inertias,
     parameters_from_pseudo_inertia,
 )
+from dvrk_drake.dynamics.nearest_links import nearest_links
 from dvrk_drake.dynamics.sdf_export import changed_links, sdf_difference, write_sdf
+from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.dynamics.urdf_export import to_urdf, write_urdf
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm, load_arm
@@ -194,7 +196,9 @@ def test_meshes_that_cannot_be_copied_are_one_line_and_no_model(tmp_path, capsys
 def test_an_arm_file_can_name_the_written_sdf(name, tmp_path, capsys):
     """The recipe of docs/export.md."""
     arm = load_arm(name)
-    write_sdf(arm, perturbed(arm), tmp_path / "identified.sdf", "a test")
+    # What `export --sdf` writes of a static model.
+    links = nearest_links(arm, 1.1 * derive_gravity(arm).base_values)
+    write_sdf(arm, links, tmp_path / "identified.sdf", "a test")
     text = (MODELS_FOLDER / "arms" / f"{name}.yaml").read_text()
     for kind, part, sdf in (("mechanism", name[:3], "sdf: identified.sdf"), ("instrument", "large_needle_driver", "")):
         if f"{kind}: {part}" in text:
@@ -207,8 +211,7 @@ def test_an_arm_file_can_name_the_written_sdf(name, tmp_path, capsys):
     assert "All links are as in the arm's own SDF" in capsys.readouterr().out
     assert own.joint_names == arm.joint_names and own.sdf == (str(tmp_path / "identified.sdf"),)
     np.testing.assert_array_equal(own.transmission.matrix, arm.transmission.matrix)
-    for expected, link in zip(perturbed(arm), link_inertias(own), strict=True):
-        np.testing.assert_allclose(link.parameters, expected.parameters, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(derive_gravity(own).base_values, 1.1 * derive_gravity(arm).base_values, atol=1e-12)
 
 
 def test_rotor_inertia_is_what_it_adds_to_the_mass_matrix(tmp_path):

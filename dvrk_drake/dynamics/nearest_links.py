@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -14,6 +17,7 @@ from dvrk_drake.dynamics.inertial_parameters import (
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import make_arm_plant
 
 #: Least eigenvalue of a link's pseudo-inertia, as a share of that of the SDF's link in all directions.
 LEAST_SHARE = 0.01
@@ -38,11 +42,8 @@ def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
         ModelError: no bodies have these base parameters, or the solver did not converge.
     """
     regressor = DynamicRegressor(arm)
-    factors = [np.linalg.cholesky(link.pseudo_inertia()) for link in regressor.links]
-    # phi of a link as a linear function of the ten numbers z of its Z.
-    maps = [
-        np.column_stack([parameters_from_pseudo_inertia(L @ _symmetric(e) @ L.T) for e in np.eye(10)]) for L in factors
-    ]
+    # phi of a link as a linear function of the ten numbers z of its Z; a rotor stays as it is.
+    maps = {i: _map(link) for i, link in enumerate(regressor.links) if not _is_rotor(arm, link.link)}
     A, b = _equations(regressor, maps, np.asarray(base_values, dtype=np.float64))
     z = _nearest(A, b)
     if _least_eigenvalue(z) < LEAST_SHARE:
@@ -50,21 +51,41 @@ def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
     z = _polished(A, b, z)
     if _least_eigenvalue(z) < LEAST_SHARE / 2:
         raise ModelError(f"{arm.name}: no bodies were found that have these base parameters")
-    return tuple(
-        LinkInertia(link.link, T @ part) for link, T, part in zip(regressor.links, maps, z.reshape(-1, 10), strict=True)
-    )
+    links = list(regressor.links)
+    for (i, T), part in zip(maps.items(), z.reshape(-1, 10), strict=True):
+        links[i] = LinkInertia(links[i].link, T @ part)
+    return tuple(links)
+
+
+def _map(link: LinkInertia) -> NDArray[np.float64]:
+    L = np.linalg.cholesky(link.pseudo_inertia())
+    return np.column_stack([parameters_from_pseudo_inertia(L @ _symmetric(e) @ L.T) for e in np.eye(10)])
+
+
+def _is_rotor(arm: Arm, link: str) -> bool:
+    """Links without a frame dh_<name> are centred on their axis, see `derive_gravity`, and must stay so."""
+    plant = _plant(arm)
+    frames = map(plant.get_frame, plant.GetFrameIndices(plant.GetBodyByName(link).model_instance()))
+    return not any(f.name().startswith("dh_") and f.body().name() == link for f in frames)
+
+
+@cache
+def _plant(arm: Arm) -> MultibodyPlant:
+    return make_arm_plant(arm)
 
 
 def _equations(
-    regressor: DynamicRegressor, maps: list[NDArray[np.float64]], base_values: NDArray[np.float64]
+    regressor: DynamicRegressor, maps: dict[int, NDArray[np.float64]], base_values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """A z = b: as many independent rows as there are base parameters, from random poses beyond the joint box."""
     arm = regressor.arm
     q = np.random.default_rng(0).uniform(-1.5, 1.5, (60, arm.num_joints))
     Y = regressor.regressor(q, np.zeros_like(q), np.zeros_like(q))
-    Y = Y.reshape(-1, Y.shape[2])[:, : 10 * len(maps)]
-    tau = (compile_static_model(arm).regressor(q) @ base_values).ravel()
-    A = np.hstack([Y[:, 10 * i : 10 * i + 10] @ T for i, T in enumerate(maps)])
+    Y = Y.reshape(-1, Y.shape[2])
+    fixed = np.repeat([i not in maps for i in range(len(regressor.links))], 10)
+    fixed = np.append(fixed, np.zeros(len(regressor.rotors), dtype=bool))
+    tau = (compile_static_model(arm).regressor(q) @ base_values).ravel() - Y[:, fixed] @ regressor.values[fixed]
+    A = np.hstack([Y[:, 10 * i : 10 * i + 10] @ T for i, T in maps.items()])
     U, s, Vt = np.linalg.svd(A, full_matrices=False)
     rank = int(np.sum(s > 1e-9 * s[0]))
     # Rows of unit size, so that the solver's tolerance is one of torques of each kind alike.
