@@ -210,7 +210,7 @@ def _build_arm(
     for which, values in dataclasses.asdict(gains).items():
         if len(values) != len(joints):
             raise ArmError(f"{path}: gains.{which} has {len(values)} numbers, one a joint is {len(joints)}")
-    motion = _motion_settings(path, mechanism.motion, instrument.motion, len(joints))
+    motion = _motion_settings(path, mechanism, instrument)
     G = np.zeros((len(facts.joint_names), len(joints)))
     c = np.zeros(len(facts.joint_names))
     for row, name in enumerate(facts.joint_names):
@@ -243,15 +243,17 @@ def _build_arm(
     )
 
 
-def _motion_settings(path: Path, arm: MotionSettings, instrument: MotionSettings, num_joints: int) -> MotionSettings:
-    """The mechanism's with the instrument's appended; what neither states is 20 Hz and no delay."""
+def _motion_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -> MotionSettings:
+    """The mechanism's with the instrument's appended; what one of them does not state is 20 Hz and no delay."""
     both: dict[str, list[float]] = {}
     for which, default in (("acceleration_cut_off", 20.0), ("effort_delay", 0.0)):
-        values = getattr(arm, which) + getattr(instrument, which)
-        if values and len(values) != num_joints:
-            raise ArmError(f"{path}: motion.{which} has {len(values)} numbers, one a joint is {num_joints}")
-        both[which] = values or [default] * num_joints
-    return MotionSettings(both["acceleration_cut_off"], both["effort_delay"], arm.base_may_tilt)
+        both[which] = []
+        for part in (mechanism, instrument):
+            values = getattr(part.motion, which)
+            if values and len(values) != len(part.joints):
+                raise ArmError(f"{path}: motion.{which} has {len(values)} numbers for {len(part.joints)} joints")
+            both[which] += values or [default] * len(part.joints)
+    return MotionSettings(both["acceleration_cut_off"], both["effort_delay"], mechanism.motion.base_may_tilt)
 
 
 def _check_limits(path: Path, joint: str, limits: list[float], prismatic: bool) -> None:
