@@ -11,9 +11,9 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.lcm_messages import describe_refusal
+from dvrk_drake.models.lcm_messages import describe_refusal, status_channel
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.processes.control import control, first_status, reset_fault
+from dvrk_drake.processes.control import ArmLink, control, first_status, reset_fault
 from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
@@ -176,3 +176,30 @@ def test_every_refusal_has_words():
     assert not [text for text in words if text.startswith("refusal ")]
     assert describe_refusal(99) == "refusal 99"
     assert np.all(np.diff(sorted(codes)) == 1)
+
+
+@pytest.mark.parametrize("replays", [False, True])
+def test_statuses_of_the_past_are_not_heard_as_the_present(replays):
+    """Played from a log on the arm's own network: once they let a compensated arm move by 8 rad."""
+    link = ArmLink(ARM, "memq://", replays=replays)
+
+    def hear(sequence, session):
+        status = Status()
+        status.arm_name, status.num_joints, status.sequence, status.session_id = ARM.name, N, sequence, session
+        for name in ("position", "velocity", "effort_measured", "position_commanded", "effort_commanded"):
+            setattr(status, name, [0.0] * N)
+        status.joint_flags = [0] * N
+        link._lcm.publish(status_channel(ARM), status.encode())
+
+    for sequence in (100, 3, 101, 4):
+        hear(sequence, SESSION)
+    assert link.next_status(0.1).sequence == (4 if replays else 101)
+    assert link.lost == (97 if replays else 0)
+    hear(4, SESSION)
+    if replays:
+        assert link.next_status(0.1).sequence == 4
+    else:
+        with pytest.raises(ControllerError, match="no status of MTML"):
+            link.next_status(0.1)
+    hear(1, SESSION + 1)  # restarted: the controller is to know
+    assert link.next_status(0.1).session_id == SESSION + 1

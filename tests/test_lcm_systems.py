@@ -356,7 +356,7 @@ def full_status(arm_name="MTML", n=7, utime=1):
 def test_the_status_receiver_knows_nothing_before_the_first_status_and_ignores_what_is_not_of_its_arm():
     lcm = DrakeLcm("memq://")
     builder = DiagramBuilder()
-    serializer = TolerantSerializer(Status, is_status_of(ARM))
+    serializer = TolerantSerializer(Status, lambda status, last: is_status_of(ARM)(status))
     subscriber = builder.AddSystem(LcmSubscriberSystem("DVRK_STATUS_MTML", serializer, lcm))
     receiver = builder.AddSystem(DvrkStatusReceiver(ARM))
     builder.Connect(subscriber.get_output_port(), receiver.get_input_port())
@@ -378,6 +378,26 @@ def test_the_status_receiver_knows_nothing_before_the_first_status_and_ignores_w
     assert good["effort_measured"] == list(range(20, 27))
     for bad in (b"", b"garbage", full_status("MTMR").encode(), full_status(n=6).encode(), full_status().encode()[:-30]):
         assert after(bad) == good
+
+
+def test_the_hardware_station_ignores_statuses_of_the_past():
+    lcm = DrakeLcm("memq://")
+    arm, controller = SimulatedArm(lcm), Controller(lcm)
+    old = []
+    lcm.Subscribe("DVRK_STATUS_MTML", old.append)
+    run(lcm, 400, arm, controller)
+    past = Status.decode(old[100])
+    past.position = [9.0] * ARM.num_joints
+    station = controller.simulator.get_system().GetSubsystemByName("mtml_station")
+    for _ in range(20):
+        arm.step()
+        lcm.Publish("DVRK_STATUS_MTML", past.encode())
+        lcm.HandleSubscriptions(0)
+        controller.step()
+        q = station.GetOutputPort("mtml.position_measured").Eval(
+            station.GetMyContextFromRoot(controller.simulator.get_context())
+        )
+        np.testing.assert_allclose(q, POSES["mtml"], atol=1e-3)
 
 
 def test_each_context_has_a_guard_of_its_own():

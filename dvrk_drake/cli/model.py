@@ -82,7 +82,7 @@ def _view(options: argparse.Namespace) -> None:
     meshcat = start_meshcat(*framing(arm), port=options.port)
     view = ArmView(arm, meshcat)
     if options.live:
-        link = ArmLink(arm, url)
+        link = ArmLink(arm, url, replays=True)
         print(f"{arm.name} live at {meshcat.web_url()}; end with Stop, Escape or Ctrl-C", flush=True)
         until_stopped(meshcat, lambda: show_status(view, link))
         return

@@ -54,6 +54,11 @@ def is_status_of(arm: Arm) -> Callable[[lcmt_dvrk_status], bool]:
     return lambda status: status.arm_name == arm.name and status.num_joints == arm.num_joints
 
 
+def is_old(status: lcmt_dvrk_status, last: lcmt_dvrk_status) -> bool:
+    """Whether `status` was sent before `last` or is it: of a log that is played on the arm's network, or overtaken."""
+    return status.session_id == last.session_id and status.sequence <= last.sequence
+
+
 def decode(message_type: type[Message], data: bytes) -> Message | None:
     """The message of that type in `data`, or None if there is none.
 

@@ -13,7 +13,7 @@ from pydrake.common.value import AbstractValue
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import command_channel, decode, describe_state, is_status_of, status_channel
+from dvrk_drake.models.lcm_messages import command_channel, decode, describe_state, is_old, is_status_of, status_channel
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
@@ -35,9 +35,16 @@ _TELL = 0.2
 class ArmLink:
     """Both channels of one arm, for a loop that is driven by its messages: only the newest status counts."""
 
-    def __init__(self, arm: Arm, url: str) -> None:
-        """Of `arm` on the LCM network `url`."""
-        self.arm, self.lost = arm, 0
+    def __init__(self, arm: Arm, url: str, *, replays: bool = False) -> None:
+        """Of `arm` on the LCM network `url`.
+
+        Args:
+            arm: whose statuses count.
+            url: of the network.
+            replays: also take statuses older than the last one, as of a log that is played again. Never for a
+                controller: what it is told of the arm's past would go into what it answers to the present.
+        """
+        self.arm, self.lost, self._replays = arm, 0, replays
         self._lcm = lcm.LCM(url)
         self._is_of_arm = is_status_of(arm)
         self._last: lcmt_dvrk_status | None = None
@@ -73,6 +80,8 @@ class ArmLink:
     def _hear(self, channel: str, data: bytes) -> None:
         status = decode(lcmt_dvrk_status, data)
         if status is None or not self._is_of_arm(status):
+            return
+        if self._last is not None and not self._replays and is_old(status, self._last):
             return
         if self._last is not None and status.session_id == self._last.session_id:
             self.lost += max(0, status.sequence - self._last.sequence - 1)

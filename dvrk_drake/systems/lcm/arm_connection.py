@@ -8,7 +8,7 @@ from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubsc
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import command_channel, is_status_of, status_channel
+from dvrk_drake.models.lcm_messages import command_channel, is_old, is_status_of, status_channel
 from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
@@ -22,7 +22,7 @@ def connect_arm(
 
     Args:
         builder: of the Diagram.
-        arm: whose channels they are; messages that are not of it are ignored.
+        arm: whose channels they are; messages that are not of it are ignored, and those older than the last one.
         driver: its configuration.
         lcm: whose `HandleSubscriptions` somebody else calls; None: one at `driver.lcm_url` that a Simulator handles.
 
@@ -31,7 +31,10 @@ def connect_arm(
     """
     if lcm is None:
         lcm = builder.AddNamedSystem("lcm", LcmInterfaceSystem(lcm=DrakeLcm(driver.lcm_url)))
-    serializer = TolerantSerializer(lcmt_dvrk_status, is_status_of(arm))
+    is_of_arm = is_status_of(arm)
+    serializer = TolerantSerializer(
+        lcmt_dvrk_status, lambda status, last: is_of_arm(status) and not is_old(status, last)
+    )
     subscriber = builder.AddNamedSystem("status_subscriber", LcmSubscriberSystem(status_channel(arm), serializer, lcm))
     receiver = builder.AddNamedSystem("status_receiver", DvrkStatusReceiver(arm))
     sender = builder.AddNamedSystem("command_sender", DvrkCommandSender(arm))

@@ -18,13 +18,13 @@ class TolerantSerializer(PySerializer):
     process.
     """
 
-    def __init__(self, message_type: type, wanted: Callable[[Any], bool] = lambda message: True) -> None:
-        """Of a type made by lcm-gen; messages for which `wanted` is False are ignored."""
+    def __init__(self, message_type: type, wanted: Callable[[Any, Any], bool] = lambda message, last: True) -> None:
+        """Of a type made by lcm-gen; messages for which `wanted`, of one and the last taken, is False are ignored."""
         super().__init__(message_type)
         self._message_type, self._wanted = message_type, wanted
 
     def Deserialize(self, buffer: bytes, abstract_value: AbstractValue) -> None:
         """Sets the value if the buffer holds a wanted message."""
         message = decode(self._message_type, buffer)
-        if message is not None and self._wanted(message):
+        if message is not None and self._wanted(message, abstract_value.get_value()):
             abstract_value.set_value(message)
