@@ -1,0 +1,94 @@
+"""Our identification of the full dynamics beside the published one, on the public recordings of a real MTM and PSM.
+
+    python benchmarks/dynamic_recordings.py FOLDER [--coordinates actuator]
+
+FOLDER holds mtm_one.csv, psm_one.csv and, if it is to be judged, psm_one_no_weight.csv, as `dvrk-drake convert` writes
+them (docs/public_recordings.md) or in the actuators' coordinates with `--coordinates actuator`.
+
+Errors are |tau - tau_hat| / |tau| of the actuators, both behind a zero-phase Butterworth low-pass of order 6 (5.65 Hz
+for the MTM, 16.96 Hz for the PSM), without the ends. "Published" are those of Wang et al., "A Convex Optimization-based
+Dynamic Model Identification Package for the da Vinci Research Kit", RA-L 2019: fitted to the same motion, and on a
+second one that is not in FOLDER. Ours are of the fit, of phases that are predicted from the other phases, and the
+repeatability of the motion itself, below which no function of q, v and vd can be on all of its periods.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from dvrk_drake.analysis.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.dynamic_validation import validate_motion
+from dvrk_drake.dynamics.dynamic_model import DynamicModel
+from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.recording import Recording, read_recording
+
+#: Percent: fitted to the motion, and on another motion.
+PUBLISHED = {
+    "mtmr": ([7.95, 15.63, 11.79, 18.56, 24.22, 18.25, 28.00], [8.18, 16.31, 19.06, 20.90, 26.30, 23.48, 33.96]),
+    "psm": ([6.59, 15.56, 17.73, 13.61, 21.07, 20.96, 25.56], [10.28, 18.28, 19.76, 13.44, 23.99, 21.11, 26.62]),
+}
+
+
+def main() -> None:
+    """One table an arm."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--coordinates", choices=("joint", "actuator"), default="joint")
+    parser.add_argument("--poses", type=int, default=2000, help="random poses at which M(q) is looked at")
+    options = parser.parse_args()
+    for name, file, others in (("mtmr", "mtm_one.csv", []), ("psm", "psm_one.csv", ["psm_one_no_weight.csv"])):
+        arm = load_arm(name)
+
+        def read(file: str, arm: Arm = arm) -> Recording:
+            return read_recording(options.folder / file, arm, options.coordinates)
+
+        begin = time.perf_counter()
+        model = identify_dynamic(read(file), arm).model
+        seconds = time.perf_counter() - begin
+        dynamics = model.dynamics
+        assert dynamics is not None
+
+        def percent(which: str, actuators: list[ActuatorStatistics] = dynamics.actuators) -> np.ndarray:
+            return np.array([100 * getattr(a, which) / a.rms_effort for a in actuators])
+
+        rows = {
+            "published, fit": PUBLISHED[name][0],
+            "published, another motion": PUBLISHED[name][1],
+            "ours, fit": percent("rms_fit"),
+            "ours, phases from other phases": percent("rms_cross_validation"),
+            "repeatability of the motion": percent("rms_repeatability"),
+        }
+        for other in others:
+            if (options.folder / other).is_file():
+                errors = validate_motion(model, read(other)).actuators
+                rows[f"ours on {other}"] = [100 * (e.relative_error or 0.0) for e in errors]
+        print_table(f"{arm.name}: error of the actuators' effort [%]", arm, rows)
+        box = (arm.position_lower, arm.position_upper)
+        q = np.random.default_rng(0).uniform(*box, (options.poses, arm.num_joints))
+        least = float(np.linalg.eigvalsh(DynamicModel(arm, dynamics).mass_matrix(q)).min())
+        print(f"least eigenvalue of a pseudo-inertia {min(e.least_eigenvalue for e in dynamics.links):.1e}")
+        print(f"least eigenvalue of M(q) at {len(q)} poses of the joint box {least:.1e}")
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(f"identified in {seconds:.1f} s; peak memory of this process so far {peak:.0f} MB\n")
+
+
+def print_table(title: str, arm: Arm, rows: dict) -> None:
+    """One row a model, one column a joint, and the mean."""
+    table = Table(title=title)
+    for heading in ("", *(f"J{j + 1}" for j in range(arm.num_joints)), "mean"):
+        table.add_column(heading, justify="left" if not heading else "right")
+    for name, values in rows.items():
+        table.add_row(name, *(f"{v:.1f}" for v in values), f"{np.mean(values):.1f}")
+    Console(width=110).print(table)
+
+
+if __name__ == "__main__":
+    main()
