@@ -98,8 +98,8 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
     """The first status of an arm that may be controlled, and the period in which statuses come [s].
 
     Raises:
-        ControllerError: no arm, a fault, a state that is not known, a pose outside the limits, an arm that takes no efforts,
-            is restarted, or is measured too seldom.
+        ControllerError: no arm, a fault, a state that is not known, a pose outside the limits, an arm that takes no
+            efforts, is restarted, or is measured too seldom.
     """
     status, name = link.next_status(_FIRST_WAIT), link.arm.name
     _check(status, name, status.session_id, "It must be reset first, with run --reset")
