@@ -1,6 +1,11 @@
 """The Meshcat view: the linkage follows, sliders cannot leave the coupled limit, and the camera sees the whole arm."""
 
 import math
+import os
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -107,3 +112,37 @@ def test_a_live_view_draws_what_the_status_tells_and_keeps_it_in_silence():
     for _ in range(3):
         show_status(view, link)
         np.testing.assert_array_equal(view._q, pose)  # what was drawn last
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
+def test_a_viewer_ends_with_the_arm_that_is_killed():
+    """What draws is a sleep here: `kill -9` leaves nobody to end it, and it would keep its port."""
+    program = (
+        "import sys, time\n"
+        "from dvrk_drake.processes import live_view\n"
+        "popen = live_view.subprocess.Popen\n"
+        "live_view.subprocess.Popen = lambda command, **options: popen(['sleep', '60'], **options)\n"
+        "with live_view.live_view('mtml', '') as viewer:\n"
+        "    print(viewer.pid, flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
+        pid = int(parent.stdout.readline())
+        os.kill(pid, 0)
+        parent.send_signal(signal.SIGKILL)
+    end = time.monotonic() + 5
+    while time.monotonic() < end and _runs(pid):
+        time.sleep(0.01)
+    try:
+        assert not _runs(pid)
+    finally:
+        if _runs(pid):
+            os.kill(pid, signal.SIGKILL)
+
+
+def _runs(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

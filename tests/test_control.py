@@ -1,5 +1,6 @@
 """Controlling, resetting and releasing an arm behind a guard, by the wall clock but without a network."""
 
+import itertools
 import time
 
 import numpy as np
@@ -108,6 +109,36 @@ def test_an_arm_that_tells_nothing_new():
         first_status(link)
 
 
+@pytest.mark.parametrize(("measured", "told", "refused"), [(1, 1, False), (5, 5, False), (10, 10, True), (10, 1, True)])
+def test_an_arm_that_is_measured_too_seldom_is_refused_however_often_it_is_told(measured, told, refused):
+    """A dVRK's 100 Hz, at which the pose hold of `run --mode hold` swings by 0.9 rad; its bridge may tell at 1 kHz."""
+    link, count = GuardedArm(), itertools.count()
+    good = link.next_status(1.0)
+
+    def next_status(seconds):
+        status, milliseconds = Status.decode(good.encode()), told * next(count)
+        status.sequence = good.sequence + milliseconds // told
+        status.utime = good.utime + 1000 * (milliseconds - milliseconds % measured)
+        return status
+
+    link.next_status = next_status
+    if refused:
+        with pytest.raises(ControllerError, match="MTML is measured at 100 Hz; control needs 200 Hz"):
+            first_status(link)
+    else:
+        assert first_status(link)[1] == pytest.approx(1e-3 * told)
+
+
+@pytest.mark.parametrize("name", ["position", "velocity", "effort_measured"])
+def test_an_arm_that_does_not_know_its_state_is_not_controlled(name):
+    link = GuardedArm()
+    status = link.next_status(1.0)
+    setattr(status, name, [float("nan")] * N)
+    link.next_status = lambda seconds: status
+    with pytest.raises(ControllerError, match="does not know its state"):
+        first_status(link)
+
+
 @pytest.mark.parametrize(("happens", "message"), [("fault", "has a fault: the amplifier is hot"), ("restart", "rest")])
 def test_the_release_of_an_arm_that_faults_or_restarts_does_not_wait(controller, happens, message):
     link = GuardedArm()
@@ -162,6 +193,8 @@ def test_run_prints_what_is_new_and_nothing_twice(controller, monkeypatch, capsy
 
 def test_rate_and_round_trip_of_the_report():
     maker, status = LiveStatusMaker(7, Status()), Status()
+    assert maker.make(status, 0.1, 0).pace == "0 Hz, no command accepted yet, 0 statuses lost"
+    maker = LiveStatusMaker(7, Status())
     status.command_sender_id = 7
     for k in range(1, 201):
         status.command_utime = 1000 * (k - 2)

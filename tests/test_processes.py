@@ -101,7 +101,7 @@ def test_start_pose():
         assert not arm.limit_violations(start_pose(arm), tolerance=-0.01)
     arm = load_arm("mtml")
     np.testing.assert_array_equal(start_pose(arm, [0.1] * 7), [0.1] * 7)
-    with pytest.raises(StationError, match="a pose of MTML is 7 numbers"):
+    with pytest.raises(StationError, match="a pose of MTML is 7 finite numbers"):
         start_pose(arm, [0.1] * 6)
     with pytest.raises(StationError, match=r"parallelogram = 1.2 is outside"):
         start_pose(arm, [0.0, 0.7, 0.5, 0.0, 0.0, 0.0, 0.0])
@@ -116,14 +116,21 @@ def test_driver_file(tmp_path):
         path.write_text(text)
         with pytest.raises(StationError, match=r"driver\.yaml: "):
             load_driver(path)
-    with pytest.raises(StationError, match=r"nowhere\.yaml"):
+    for text, message in (
+        ("guard: 3", "3; allowed: lcm_url, status_period, .*, guard, the last one with expiry, "),
+        ("control_modes: effort", "control_modes must be a list of position, effort"),
+    ):
+        path.write_text(text)
+        with pytest.raises(StationError, match=rf"driver\.yaml: .*{message}"):
+            load_driver(path)
+    with pytest.raises(StationError, match=r"nowhere\.yaml: cannot be read: No such file"):
         load_driver(tmp_path / "nowhere.yaml")
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["arm", "--arm", "mtml", "--pose", "1", "2"], "a pose of MTML is 7 numbers"),
+        (["arm", "--arm", "mtml", "--pose", "1", "2"], "a pose of MTML is 7 finite numbers"),
         (["arm", "--arm", "mtml", "--lcm-url", "bogus://"], 'LCM network "bogus://" cannot be used'),
         (["arm", "--arm", "mtml", "--driver", "nowhere.yaml"], "nowhere.yaml"),
         (["run", "--arm", "mtml", "--lcm-url", "bogus://"], 'LCM network "bogus://" cannot be used'),

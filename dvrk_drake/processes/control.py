@@ -22,6 +22,12 @@ from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
 #: Without a status for this long there is no arm [s]; at first it may have to be started.
 _SILENCE, _FIRST_WAIT = 1.0, 10.0
 
+#: Measurements may not be further apart [us]: a PSM held with its own gains swings at 7 ms, an MTM at 10 ms.
+_SLOWEST = 5000
+
+#: How many statuses are looked at before an arm is controlled.
+_FIRST_STATUSES = 60
+
 #: How long the arm may take to confirm that it holds by itself [s].
 _RELEASE = 1.0
 
@@ -92,19 +98,30 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
     """The first status of an arm that may be controlled, and the period in which statuses come [s].
 
     Raises:
-        ControllerError: no arm, a fault, a pose outside the limits, an arm that takes no efforts or is restarted.
+        ControllerError: no arm, a fault, a state that is not known, a pose outside the limits, an arm that takes no
+            efforts, is restarted, or is measured too seldom.
     """
     status, name = link.next_status(_FIRST_WAIT), link.arm.name
     _check(status, name, status.session_id, "It must be reset first, with run --reset")
+    if not np.all(np.isfinite([*status.position, *status.velocity, *status.effort_measured])):
+        raise ControllerError(f"{name} does not know its state: a position, velocity or effort is not finite")
     if violations := link.arm.limit_violations(status.position):
         raise ControllerError(f"{name} stands outside its limits: {'; '.join(violations)}. Move it inside first")
     if not status.accepted_modes >> lcmt_dvrk_command.EFFORT & 1:
-        raise ControllerError(f"{name} does not accept efforts now; it is {describe_state(status.guard_state)}")
-    for _ in range(20):
+        raise ControllerError(f"{name} does not accept efforts now; its state is {describe_state(status.guard_state)}")
+    utimes = [status.utime]
+    for _ in range(_FIRST_STATUSES):
         later = link.next_status(_SILENCE)
         _check(later, name, status.session_id)
+        utimes.append(later.utime)
     if not (later.sequence > status.sequence and later.utime > status.utime):
         raise ControllerError(f"{name} tells nothing new: its utime or sequence does not increase")
+    # The least one: on a busy computer some are missed. Several statuses of one measurement have one utime.
+    gaps = np.diff(np.unique(utimes))
+    if min(gaps) > _SLOWEST:
+        raise ControllerError(
+            f"{name} is measured at {1e6 / min(gaps):.0f} Hz; control needs {1e6 / _SLOWEST:.0f} Hz, better 1 kHz"
+        )
     return status, 1e-6 * (later.utime - status.utime) / (later.sequence - status.sequence)
 
 

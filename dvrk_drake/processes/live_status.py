@@ -47,12 +47,12 @@ class LiveStatusMaker:
     def make(self, status: lcmt_dvrk_status, time: float, lost: int) -> LiveStatus:
         """How it went since the last one; `lost` statuses never came."""
         rate = self._answered / (time - self._told_at)
-        trip = 1e3 * float(np.median(self._trips)) if self._trips else float("nan")
+        trip = f"round trip {1e3 * float(np.median(self._trips)):.2f} ms" if self._trips else "no command accepted yet"
         problem = []
         if status.num_refused > self._before.num_refused:
             problem.append(f"refused: {describe_refusal(status.refusal_code)}")
         if status.num_expired > self._before.num_expired:
             problem.append("no command for so long that the arm took over")
         self._before, self._told_at, self._answered = status, time, 0
-        pace = f"{rate:.0f} Hz, round trip {trip:.2f} ms, {lost} statuses lost"
+        pace = f"{rate:.0f} Hz, {trip}, {lost} statuses lost"
         return LiveStatus(describe_state(status.guard_state), pace, ", ".join(problem))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -27,16 +29,26 @@ def show_status(view: ArmView, link: ArmLink) -> None:
         view.show(q)
 
 
+# Looked up before a fork, after which little is safe to do.
+_prctl = getattr(ctypes.CDLL(None), "prctl", None)
+_PR_SET_PDEATHSIG = 1
+
+
+def _end_with_parent() -> None:
+    if _prctl is not None:
+        _prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
 @contextlib.contextmanager
-def live_view(arm: str, url: str) -> Iterator[None]:
+def live_view(arm: str, url: str) -> Iterator[subprocess.Popen]:
     """`dvrk-drake view --live` of an arm (name or path), in a process that ends with the block.
 
-    A process of its own, because a loop at 1 kHz that draws is late.
+    A process of its own, because a loop at 1 kHz that draws is late. On Linux it also ends if this one is killed.
     """
     command = [sys.executable, "-m", "dvrk_drake.cli", "view", arm, "--live", "--lcm-url", url]
-    viewer = subprocess.Popen(command)
+    viewer = subprocess.Popen(command, preexec_fn=_end_with_parent)  # noqa: PLW1509
     try:
-        yield
+        yield viewer
     finally:
         viewer.terminate()
         viewer.wait()

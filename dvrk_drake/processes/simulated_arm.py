@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 
 import lcm
@@ -22,6 +23,7 @@ from dvrk_drake.processes.lcm_network import handle_message, listen
 from dvrk_drake.processes.pace import Pace
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
@@ -39,9 +41,16 @@ def load_driver(path: str | Path) -> DvrkDriver:
         driver = yaml_load_typed(schema=DvrkDriver, filename=str(path), defaults=DvrkDriver())
         driver.check()
         return driver
-    except Exception as error:
-        # yaml_load_typed raises many types, from YAML's to KeyError; each text names the field.
+    except OSError as error:
+        raise StationError(f"{path}: cannot be read: {error.strerror}") from error
+    except StationError as error:
         raise StationError(f"{path}: {error}") from error
+    except Exception as error:
+        # yaml_load_typed raises many types, from YAML's to KeyError; not each text says more than the value.
+        allowed, guard = (", ".join(field.name for field in fields(schema)) for schema in (DvrkDriver, GuardSettings))
+        raise StationError(
+            f"{path}: not a driver's configuration: {error}; allowed: {allowed}, the last one with {guard}"
+        ) from error
 
 
 def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.float64]:
@@ -55,7 +64,7 @@ def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.floa
         return np.clip(0.0, arm.position_lower + inset, arm.position_upper - inset)
     q = np.asarray(pose, float)
     if q.shape != (arm.num_joints,) or not np.all(np.isfinite(q)):
-        raise StationError(f"a pose of {arm.name} is {arm.num_joints} numbers [rad, m]; got {len(q)}")
+        raise StationError(f"a pose of {arm.name} is {arm.num_joints} finite numbers [rad, m]; got {q.tolist()}")
     if violations := arm.limit_violations(q):
         raise StationError(f"{arm.name} cannot start there: {'; '.join(violations)}")
     return q

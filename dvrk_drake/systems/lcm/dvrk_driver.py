@@ -40,8 +40,8 @@ class DvrkDriver:
             StationError: an unknown control mode, a period that is not positive or above 10 ms, or a guard's setting.
         """
         self.guard.check()
-        if unknown := [mode for mode in self.control_modes if mode not in _MODES]:
-            raise StationError(f'unknown control mode "{unknown[0]}"; known: {", ".join(_MODES)}')
+        if any(mode not in _MODES for mode in self.control_modes):
+            raise StationError(f"control_modes must be a list of {', '.join(_MODES)}; got {list(self.control_modes)}")
         if not 0 < self.status_period <= 0.01:
             raise StationError(f"status_period must be above 0 and at most 0.01 s; got {self.status_period}")
 
