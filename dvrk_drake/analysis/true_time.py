@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.low_pass import low_pass
 from dvrk_drake.analysis.velocity_agreement import velocity_agreement
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.recording import Recording
@@ -17,6 +18,8 @@ SAME_VALUE = 1e-9
 LEAST_ROWS, LEAST_JOINTS = 100, 2
 #: The recorded times are kept unless they leave this many times the variance that made ones leave.
 WORSE = 3.0
+#: Slower than this the recorded times are right [Hz].
+DRIFT = 1.0
 #: Shortest interval between two different rows, as a share of the mean.
 SHORTEST = 0.02
 _ITERATIONS = 8
@@ -67,8 +70,15 @@ def true_time(recording: Recording) -> TrueTime:
     intervals *= (own[-1] - own[0]) / np.sum(intervals)
     if _left(dq, mean_qd, np.diff(own), noise) < WORSE * _left(dq, mean_qd, intervals, noise):
         return TrueTime(rows, own, 0.0, False)
-    jitter = float(np.std(intervals - np.diff(own))) / mean
-    return TrueTime(rows, own[0] + np.concatenate([[0.0], np.cumsum(intervals)]), jitter, True)
+    made = _without_drift(own, own[0] + np.concatenate([[0.0], np.cumsum(intervals)]), mean)
+    return TrueTime(rows, made, float(np.std(np.diff(made) - np.diff(own))) / mean, True)
+
+
+def _without_drift(own: NDArray[np.float64], made: NDArray[np.float64], mean: float) -> NDArray[np.float64]:
+    """The made times that keep to the recorded ones on the whole: an error of qd of a percent makes a drift of ms."""
+    lead = made - own
+    intervals = np.diff(own + lead - low_pass(lead, 1 / mean, DRIFT))
+    return own[0] + np.concatenate([[0.0], np.cumsum(np.maximum(intervals, SHORTEST * mean))])
 
 
 def repeated_rows(recording: Recording) -> NDArray[np.bool_]:
