@@ -74,15 +74,15 @@ def assert_same_torque(ours: DynamicRegressor, model: pinocchio.Model, motion: l
     np.testing.assert_allclose(ours.torque(*motion, without_rotors), reference, rtol=0, atol=1e-10)
 
 
-def median_times(functions: dict[str, Callable[[], object]], repetitions: int) -> dict[str, float]:
-    """Median seconds of each function, called in turn so that drift of the machine's speed hits all alike."""
+def measured_times(functions: dict[str, Callable[[], object]], repetitions: int) -> dict[str, NDArray]:
+    """Seconds of each function, called in turn so that drift of the machine's speed hits all alike."""
     times: dict[str, list[float]] = {name: [] for name in functions}
     for _ in range(repetitions):
         for name, function in functions.items():
             start = time.perf_counter()
             function()
             times[name].append(time.perf_counter() - start)
-    return {name: float(np.median(values)) for name, values in times.items()}
+    return {name: np.array(values) for name, values in times.items()}
 
 
 def pinocchio_loop(model: pinocchio.Model, motion: list[NDArray]) -> Callable[[], None]:
@@ -119,10 +119,10 @@ def benchmark(name: str, samples: int, repetitions: int) -> dict[str, float]:
     if bases <= driven | {"base_link"}:  # the independent joints are a chain, as on an MTM: fewer links, less to do
         chain = build_pinocchio(arm, plant, list(arm.joint_names))
         functions["pinocchio, chain without linkage"] = pinocchio_loop(chain, motion)
-    times = median_times(functions, repetitions)
+    times = measured_times(functions, repetitions)
     for what, seconds in times.items():
-        result[f"{what}_us"] = 1e6 * seconds / samples
-        result[f"{what}_ratio"] = times["ours"] / seconds
+        result[f"{what}_us"] = 1e6 * float(np.median(seconds)) / samples
+        result[f"{what}_ratio"] = float(np.median(times["ours"] / seconds))
     columns = len(ours.names)
     print(f"{arm.name}: {len(ours.links)} links, {columns} columns, {samples} samples; first call ", end="")
     print(f"{result['first_call_s']:.2f} s (compiled code is kept on disk)")

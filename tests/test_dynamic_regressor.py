@@ -134,6 +134,18 @@ def test_many_samples_equal_single_ones(arm):
     assert model.regressor(*(x[:0] for x in motion)).shape == (0, arm.num_joints, len(model.names))
 
 
+def test_writes_to_memory_that_is_given(arm):
+    model = DynamicRegressor(arm)
+    motion = random_motion(arm, 700)
+    out = np.full((700, arm.num_joints, len(model.names)), np.nan)
+    assert model.regressor(*motion, out=out) is out
+    np.testing.assert_array_equal(out, model.regressor(*motion))
+    with pytest.raises(ModelError, match="C-contiguous"):
+        model.regressor(*motion, out=out[:-1])
+    with pytest.raises(ModelError, match="C-contiguous"):
+        model.regressor(*motion, out=np.asfortranarray(out))
+
+
 def test_bad_input_is_refused(arm):
     model = DynamicRegressor(arm)
     q, v, vd = random_motion(arm, 3)

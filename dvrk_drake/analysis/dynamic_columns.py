@@ -47,7 +47,7 @@ class DynamicColumns:
 
 
 def friction_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """What every drive may have: offset at the actuators; viscous, Coulomb and presliding friction at all coordinates."""
+    """What every drive may have: offset at the actuators; viscous, Coulomb and presliding friction everywhere."""
     effects = []
     for name, x, v in _coordinates(arm, grid):
         if name.startswith("actuator."):
@@ -60,7 +60,7 @@ def friction_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
 
 
 def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """What some drives have beside friction: springs, cables, friction that differs by direction or falls with speed."""
+    """What some drives have beside friction: springs, cables, friction that differs by direction."""
     effects = []
     for name, _, v in _coordinates(arm, grid):
         if v.std() == 0:

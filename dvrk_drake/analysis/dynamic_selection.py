@@ -23,7 +23,8 @@ class EffectSelection:
     """The choice of effects on one motion, in unknowns that are 0 before the recording.
 
     Attributes:
-        equations: columns: the rigid body's unknowns, then the effects.
+        equations: columns: the rigid body's unknowns, then the effects; the last is what remains of the effort.
+        efforts: (n,) sum of squares of the measured efforts.
         num_rigid: of the rigid body's.
         precision: (k,) of all unknowns.
         non_negative: (k,).
@@ -32,6 +33,7 @@ class EffectSelection:
     """
 
     equations: NormalEquations
+    efforts: NDArray[np.float64]
     num_rigid: int
     precision: NDArray[np.float64]
     non_negative: NDArray[np.bool_]
@@ -40,22 +42,21 @@ class EffectSelection:
 
     def __post_init__(self) -> None:
         self._total = self.equations.total()
-        self._efforts = self._total[:, -1, -1].copy()
         folds = range(self.equations.folds)
         self._learnt = [self.equations.without_fold(fold) for fold in folds]
         self._predicted = [self.equations.of_fold(fold) for fold in folds]
-        self.weights = self._weights(np.full(len(self._efforts), 0.1**2))
+        self.weights = self._weights(np.full(len(self.efforts), 0.1**2))
 
     def fit(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:
         """(k,) all unknowns, 0 where an effect is not chosen; weighs every actuator by the error that is left."""
         for _ in range(3):
             x = self._solve(self._total, effects)
-            self.weights = self._weights(squared_errors(self._total, x) / self._efforts)
+            self.weights = self._weights(squared_errors(self._total, x) / self.efforts)
         return x
 
     def relative_error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n,) |tau - X x| / |tau|."""
-        return np.asarray(np.sqrt(squared_errors(self._total, x) / self._efforts))
+        return np.asarray(np.sqrt(squared_errors(self._total, x) / self.efforts))
 
     def cross_validated(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:
         """(n,) relative error of folds that are predicted from the others, with the current weights."""
@@ -63,7 +64,7 @@ class EffectSelection:
             squared_errors(predicted, self._solve(learnt, effects))
             for learnt, predicted in zip(self._learnt, self._predicted, strict=True)
         ]
-        return np.asarray(np.sqrt(np.sum(errors, axis=0) / self._efforts))
+        return np.asarray(np.sqrt(np.sum(errors, axis=0) / self.efforts))
 
     def choose(
         self, start: NDArray[np.int_], candidates: NDArray[np.int_], report: Callable[[float], object] = lambda _: None
@@ -115,11 +116,14 @@ class EffectSelection:
         with_effort = np.append(index, products.shape[-1] - 1)
         x = np.zeros(len(self.precision))
         x[index] = solve(
-            products[:, with_effort[:, None], with_effort], self.weights, self.precision[index], self.non_negative[index]
+            products[:, with_effort[:, None], with_effort],
+            self.weights,
+            self.precision[index],
+            self.non_negative[index],
         )
         return x
 
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         """One over the variance of an independent measurement, from the squared relative errors."""
-        variance = np.maximum(squared, LEAST_ERROR**2) * self._efforts / self.rows
+        variance = np.maximum(squared, LEAST_ERROR**2) * self.efforts / self.rows
         return self.independent / self.rows / variance

@@ -51,7 +51,7 @@ class MotionGrid:
         return slice(ends, len(self.row_times) - ends)
 
     def at_rows(self, x: NDArray[np.float64], actuator: int) -> NDArray[np.float64]:
-        """x (m, ...), what the grid says of an actuator's effort, at the rows (r, ...), later by that effort's delay."""
+        """x (m, ...), what explains an actuator's effort, at the rows (r, ...), later by that effort's delay."""
         place = (self.row_times - self.settings.effort_delay[actuator] - self.t[0]) * GRID_RATE
         before = np.clip(np.floor(place).astype(int), 0, len(x) - 2)
         share = np.clip(place - before, 0.0, 1.0).reshape(-1, *[1] * (x.ndim - 1))

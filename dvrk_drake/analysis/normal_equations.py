@@ -23,7 +23,11 @@ class NormalEquations:
 
     @classmethod
     def of(
-        cls, columns: list[NDArray[np.float64]], tau: NDArray[np.float64], fold: NDArray[np.int_], edge: NDArray[np.bool_]
+        cls,
+        columns: list[NDArray[np.float64]],
+        tau: NDArray[np.float64],
+        fold: NDArray[np.int_],
+        edge: NDArray[np.bool_],
     ) -> NormalEquations:
         """Sums up.
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.repetition import find_period
 from dvrk_drake.analysis.motion_grid import GRID_RATE, MotionGrid
+from dvrk_drake.analysis.repetition import find_period
 
 FOLDS = 12
 #: What is nearer than this to the part that is predicted is not learnt from: the filters reach over [s].
@@ -18,7 +18,9 @@ def period_of(grid: MotionGrid) -> float | None:
     return find_period(grid.arm.transmission.position(grid.q), GRID_RATE)
 
 
-def phase_folds(grid: MotionGrid, period: float | None, folds: int = FOLDS) -> tuple[NDArray[np.int_], NDArray[np.bool_]]:
+def phase_folds(
+    grid: MotionGrid, period: float | None, folds: int = FOLDS
+) -> tuple[NDArray[np.int_], NDArray[np.bool_]]:
     """The fold of each inner row, and which of them lie at its edge.
 
     A motion that repeats is cut by its phase: cut by time, every stretch would be learnt from its own repetition.

@@ -1,7 +1,7 @@
 """Torques of friction, cables and springs in the drive: each a named model, linear in one coefficient.
 
-An effect acts along a coordinate x of the drive (see `effect_coordinates`): an actuator, a joint that actuators share, or
-a place where parts rub. The effort that the motors must add is coefficient * shape(x, v, state), pulled back to the
+An effect acts along a coordinate x of the drive (see `effect_coordinates`): an actuator, a joint that actuators share,
+or a place where parts rub. The effort that the motors must add is coefficient * shape(x, v, state), pulled back to the
 actuators. A shape is written once, as a step; a batch runs the step over a motion, a simulation runs it in time.
 """
 

@@ -111,13 +111,14 @@ class DynamicRegressor:
     def _fill(self, motion: tuple[NDArray, ...], gravity: NDArray, Y: NDArray) -> None:
         tree = self._tree
 
-        def fill(start: int, stop: int) -> None:
+        chunks = iter(range(0, len(Y), _CHUNK))  # shared: a thread that was kept waiting takes fewer
+
+        def work() -> None:
             # A part at a time, where the caches hold it: Y itself goes to memory once and in order.
-            part = np.zeros((min(_CHUNK, stop - start), *Y.shape[1:]))
-            for first in range(start, stop, _CHUNK):
-                chunk = slice(first, min(first + _CHUNK, stop))
+            part = np.zeros((min(_CHUNK, len(Y)), *Y.shape[1:]))
+            for first in chunks:
+                chunk = slice(first, first + _CHUNK)
                 q, v, vd = (x[chunk] for x in motion)
-                count = len(q)
                 fill_regressor(
                     tree.joint_motion(q, v, vd),
                     vd,
@@ -128,17 +129,17 @@ class DynamicRegressor:
                     tree.G,
                     tree.affects,
                     self._rotor_rows,
-                    part[:count],
+                    part[: len(q)],
                 )
-                Y[chunk] = part[:count]
+                Y[chunk] = part[: len(q)]
 
-        threads = min(os.cpu_count() or 1, -(-len(Y) // _CHUNK))
+        threads = min(os.cpu_count() or 1, len(Y) // (2 * _CHUNK))
         if threads <= 1:
-            fill(0, len(Y))
+            work()
             return
-        bounds = np.linspace(0, len(Y), threads + 1).astype(int).tolist()
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(fill, bounds[:-1], bounds[1:]))
+            for result in [pool.submit(work) for _ in range(threads)]:
+                result.result()
 
     @cached_property
     def _rotor_rows(self) -> NDArray[np.float64]:

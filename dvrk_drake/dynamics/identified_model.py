@@ -83,8 +83,8 @@ class Provenance:
 class IdentifiedModel:
     """A static model of one arm: tau = trust o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
 
-    `gravity` [m/s^2] is the gravity vector in the base frame that the base parameters were identified with. A model that
-    was identified from a motion also has `dynamics`; its base parameters are those of the links there.
+    `gravity` [m/s^2] is the gravity vector in the base frame that the base parameters were identified with. A model
+    identified from a motion also has `dynamics`; its base parameters are those of the links there.
     """
 
     format: str = "dvrk_drake identified model 1"

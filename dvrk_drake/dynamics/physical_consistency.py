@@ -92,7 +92,7 @@ def consistent_parameters(
         status = result.get_solver_details().status
         raise IdentificationError(
             f"the program for physically consistent parameters did not converge: Clarabel says {status}, after "
-            f"{result.get_solver_details().iterations} iterations; do the recording's efforts and positions belong to this arm?"
+            f"{result.get_solver_details().iterations} iterations; are efforts and positions this arm's?"
         )
     x = np.asarray(result.GetSolution(y), dtype=float) * scale
     # Interior-point solutions keep their inequalities to the tolerance; these are kept exactly.
@@ -106,9 +106,7 @@ def least_eigenvalue_bound(link: LinkInertia) -> float:
     return min(LEAST_EIGENVALUE, 0.5 * float(np.linalg.eigvalsh(link.pseudo_inertia())[0]))
 
 
-def _constrain_link(
-    program: MathematicalProgram, y: NDArray, scale: NDArray[np.float64], link: LinkInertia
-) -> None:
+def _constrain_link(program: MathematicalProgram, y: NDArray, scale: NDArray[np.float64], link: LinkInertia) -> None:
     size = LinkScale.of(link)
     # A congruence keeps the sign of every eigenvalue and brings a finger's and a forearm's numbers to the same size.
     D = np.diag([1 / size.length] * 3 + [1.0]) / np.sqrt(size.mass)

@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.common.yaml import yaml_load_typed
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.arm_schema import ArmDescription, CoupledLimit, Gains, Instrument, LoopClosure, Mechanism, MotionSettings
+from dvrk_drake.models.arm_schema import (
+    ArmDescription,
+    CoupledLimit,
+    Gains,
+    Instrument,
+    LoopClosure,
+    Mechanism,
+    MotionSettings,
+)
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, compose_sdf, read_sdf_facts
 
@@ -237,13 +245,13 @@ def _build_arm(
 
 def _motion_settings(path: Path, arm: MotionSettings, instrument: MotionSettings, num_joints: int) -> MotionSettings:
     """The mechanism's with the instrument's appended; what neither states is 20 Hz and no delay."""
-    both = {}
+    both: dict[str, list[float]] = {}
     for which, default in (("acceleration_cut_off", 20.0), ("effort_delay", 0.0)):
         values = getattr(arm, which) + getattr(instrument, which)
         if values and len(values) != num_joints:
             raise ArmError(f"{path}: motion.{which} has {len(values)} numbers, one a joint is {num_joints}")
         both[which] = values or [default] * num_joints
-    return dataclasses.replace(arm, **both)
+    return MotionSettings(both["acceleration_cut_off"], both["effort_delay"], arm.base_may_tilt)
 
 
 def _check_limits(path: Path, joint: str, limits: list[float], prismatic: bool) -> None:

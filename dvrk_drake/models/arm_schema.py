@@ -38,8 +38,8 @@ class MotionSettings:
     """How the signals of a recorded motion are treated; per joint, in the order of the joints that the file has.
 
     `acceleration_cut_off` [Hz] of the low-pass for accelerations, `effort_delay` [s] by which the recorded effort is
-    later than the positions (negative: earlier). Of a mechanism also `base_may_tilt`, whether the direction of gravity is
-    estimated from a motion.
+    later than the positions (negative: earlier). Of a mechanism also `base_may_tilt`, whether the direction of gravity
+    is estimated from a motion.
     """
 
     acceleration_cut_off: list[float] = field(default_factory=list)
