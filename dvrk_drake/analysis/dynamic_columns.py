@@ -89,14 +89,14 @@ def dynamic_columns(
     """
     arm, n = grid.arm, grid.arm.num_joints
     p = len(regressor.values) - len(regressor.rotors) + n
-    nominal = regressor.regressor(grid.q, grid.v, grid.vd)[..., :p]
-    rigid = _filtered(grid, nominal)
+    rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd)[..., :p])
     tilts = []
-    for axis in range(2):
-        if not arm.motion.base_may_tilt:
-            break
-        tilted = DynamicRegressor(arm.with_gravity(regressor.arm.gravity + np.eye(3)[axis]))
-        tilts.append(_filtered(grid, tilted.regressor(grid.q, grid.v, grid.vd)[..., :p] - nominal))
+    if arm.motion.base_may_tilt:
+        rest = np.zeros_like(grid.q)
+        for axis in np.eye(3)[:2]:
+            # Efforts are linear in gravity: those at rest under a gravity of one are the derivative.
+            lying = DynamicRegressor(arm.with_gravity([float(g) for g in axis]))
+            tilts.append(_filtered(grid, lying.regressor(grid.q, rest, rest)[..., :p]))
     coordinates = {name: (x, v) for name, x, v in _coordinates(arm, grid)}
     on_grid = np.column_stack([effect.column(*coordinates[effect.coordinate]) for effect in effects])
     rows = np.array([effect_coordinates(arm)[effect.coordinate] for effect in effects])

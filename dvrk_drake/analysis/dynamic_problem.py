@@ -13,6 +13,7 @@ from dvrk_drake.analysis.dynamic_selection import EffectSelection
 from dvrk_drake.analysis.normal_equations import NormalEquations, squared_errors
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.physical_consistency import LinkScale, consistent_parameters
+from dvrk_drake.dynamics.rotor_inertia import rotor_links
 
 #: Deviation of an inertial parameter from the SDF's, as a share of the link's own size; chosen by cross-validation.
 LINK_DEVIATION = 0.3
@@ -24,6 +25,8 @@ EFFECT_DEVIATION = 0.3
 TILT_DEVIATION = 0.05
 #: The SDF says all about directions of the rigid body's parameters that the recording knows this much less of.
 _NEGLIGIBLE = 1e-2
+#: A rotor that the SDF models as a link is balanced: this share of the deviations of other links' first moments.
+_BALANCE = 1e-6
 #: Relative error that weighs the efforts before anything is fitted.
 _FIRST_ERROR = 0.1
 
@@ -76,7 +79,11 @@ class DynamicProblem:
     @cached_property
     def deviation(self) -> NDArray[np.float64]:
         """(p,) by which the truth may differ from it."""
+        balanced = rotor_links(self.regressor.arm)
         links = [LINK_DEVIATION * LinkScale.of(link).deviations for link in self.regressor.links]
+        for link, deviation in zip(self.regressor.links, links, strict=True):
+            if link.link in balanced:
+                deviation[1:4] *= _BALANCE
         rotors = np.maximum(LINK_DEVIATION * self.prior[10 * len(links) :], LEAST_ROTOR_DEVIATION)
         return np.asarray(np.concatenate([*links, rotors]), dtype=float)
 
@@ -102,12 +109,7 @@ class DynamicProblem:
                 there is no tilt.
         """
         V = self._informative
-        columns = []
-        for i in range(len(self.efforts)):
-            blocks = [(self.rigid[:, i] * self.deviation) @ V, self.columns.shapes[i] * self.columns.rows[:, i]]
-            if phi is not None:
-                blocks.append((self.columns.tilts[:, :, i] @ phi).T)
-            columns.append(np.hstack(blocks))
+        columns = (self._reduced_columns(i, phi) for i in range(len(self.efforts)))
         left = self.columns.tau - self.rigid @ self.prior
         tilts = len(self.columns.tilts) if phi is not None else 0
         precision = [np.ones(V.shape[1]), self.effect_precision, np.full(tilts, 1 / (9.81 * TILT_DEVIATION) ** 2)]
@@ -121,6 +123,14 @@ class DynamicProblem:
             independent=self.independent,
             rows=self.num_rows,
         )
+
+    def _reduced_columns(self, i: int, phi: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        """(r, k) columns of one actuator: informative directions, effects, and the tilts about phi."""
+        columns = self.columns
+        blocks = [(self.rigid[:, i] * self.deviation) @ self._informative, columns.shapes[i] * columns.rows[:, i]]
+        if phi is not None:
+            blocks.append((columns.tilts[:, :, i] @ phi).T)
+        return np.hstack(blocks)
 
     def rigid_parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """(p,) phi of a selection's unknowns x (k,)."""

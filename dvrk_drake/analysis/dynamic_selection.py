@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ class EffectSelection:
         rows: number of rows.
     """
 
-    equations: NormalEquations
+    equations: InitVar[NormalEquations]
     efforts: NDArray[np.float64]
     num_rigid: int
     precision: NDArray[np.float64]
@@ -40,11 +40,10 @@ class EffectSelection:
     independent: float
     rows: int
 
-    def __post_init__(self) -> None:
-        self._total = self.equations.total()
-        folds = range(self.equations.folds)
-        self._learnt = [self.equations.without_fold(fold) for fold in folds]
-        self._predicted = [self.equations.of_fold(fold) for fold in folds]
+    def __post_init__(self, equations: NormalEquations) -> None:
+        self._total = equations.total()
+        self._learnt = [equations.without_fold(fold) for fold in range(equations.folds)]
+        self._predicted = [equations.of_fold(fold) for fold in range(equations.folds)]
         self.weights = self._weights(np.full(len(self.efforts), 0.1**2))
 
     def fit(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:

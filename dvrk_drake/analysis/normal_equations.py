@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ class NormalEquations:
     @classmethod
     def of(
         cls,
-        columns: list[NDArray[np.float64]],
+        columns: Iterable[NDArray[np.float64]],
         tau: NDArray[np.float64],
         fold: NDArray[np.int_],
         edge: NDArray[np.bool_],
@@ -39,15 +40,16 @@ class NormalEquations:
         """
         folds = int(fold.max()) + 1
         part = np.where(edge[:, 0], 0, np.where(edge[:, 1], 2, 1)) + 3 * fold
-        k = columns[0].shape[1] + 1
-        products = np.zeros((tau.shape[1], 3 * folds, k, k))
+        products = []
         for i, X in enumerate(columns):
             full = np.column_stack([X, tau[:, i]])
-            some = np.flatnonzero(np.any(full, axis=0))
+            k, some = full.shape[1], np.flatnonzero(np.any(full, axis=0))
+            sums = np.zeros((folds, 3, k, k))
             for b in range(3 * folds):
                 rows = full[part == b][:, some]
-                products[i, b][np.ix_(some, some)] = rows.T @ rows
-        return cls(products.reshape(tau.shape[1], folds, 3, k, k))
+                sums[b // 3, b % 3][np.ix_(some, some)] = rows.T @ rows
+            products.append(sums)
+        return cls(np.array(products))
 
     @property
     def folds(self) -> int:
@@ -66,15 +68,6 @@ class NormalEquations:
         """(n, k + 1, k + 1) over all rows but those of one fold and those of its neighbours that touch it."""
         before, after = (fold - 1) % self.folds, (fold + 1) % self.folds
         return self.total() - self.of_fold(fold) - self.products[:, before, 2] - self.products[:, after, 0]
-
-    def transformed(self, T: NDArray[np.float64]) -> NormalEquations:
-        """Those of other unknowns: [X tau] T instead of [X tau]; T (k + 1, j)."""
-        return NormalEquations(np.einsum("ax,nfpab,by->nfpxy", T, self.products, T, optimize=True))
-
-    def chosen(self, index: NDArray[np.int_]) -> NormalEquations:
-        """Those of some of the columns; the effort's column stays."""
-        index = np.append(index, self.products.shape[-1] - 1)
-        return NormalEquations(self.products[..., index[:, None], index])
 
 
 def squared_errors(products: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:

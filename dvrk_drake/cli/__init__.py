@@ -6,6 +6,7 @@ Verbs import what they need when they run: drake and numba take seconds, `--help
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -13,6 +14,10 @@ from importlib.metadata import version
 from dvrk_drake.cli import check, collect, demo, identify, lcm, model, payload, record, simulate
 from dvrk_drake.cli.support import import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
+
+# Matrices are small here: more threads of BLAS only wait for each other, for minutes where the cores are busy. Said
+# before numpy is imported, which the verbs do.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -11,7 +11,7 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, pseudo_inertia
 from dvrk_drake.errors import IdentificationError
 
-#: Least eigenvalue of a pseudo-inertia [kg, kg m, kg m^2], unless the SDF's own link has less than twice that.
+#: Least eigenvalue of a pseudo-inertia [kg, kg m, kg m^2], unless the SDF's own link has less than four times that.
 LEAST_EIGENVALUE = 1e-9
 #: A link's mass stays within these multiples of the SDF's.
 MASS_RANGE = 0.1, 5.0
@@ -102,8 +102,8 @@ def consistent_parameters(
 
 
 def least_eigenvalue_bound(link: LinkInertia) -> float:
-    """The least eigenvalue that a link's pseudo-inertia may get: `LEAST_EIGENVALUE`, or half the SDF's."""
-    return min(LEAST_EIGENVALUE, 0.5 * float(np.linalg.eigvalsh(link.pseudo_inertia())[0]))
+    """The least eigenvalue that a link's pseudo-inertia may get: `LEAST_EIGENVALUE`, or a quarter of the SDF's."""
+    return min(LEAST_EIGENVALUE, 0.25 * float(np.linalg.eigvalsh(link.pseudo_inertia())[0]))
 
 
 def _constrain_link(program: MathematicalProgram, y: NDArray, scale: NDArray[np.float64], link: LinkInertia) -> None:

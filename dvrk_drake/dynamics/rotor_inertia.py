@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
+from dvrk_drake.dynamics.inertial_parameters import moving_bodies
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import make_arm_plant
 
 
 @dataclass(frozen=True)
@@ -55,3 +57,11 @@ def rotor_inertias(plant: MultibodyPlant, arm: Arm) -> tuple[RotorInertia, ...]:
         if abs(D[i, k]) > 1e-12 * np.abs(D).max()
     ]
     return (*alone, *coupled)
+
+
+def rotor_links(arm: Arm) -> set[str]:
+    """Links of the SDF that are rotors, balanced about their own axis: those that have no frame dh_<name>."""
+    plant = make_arm_plant(arm)
+    frames = [plant.get_frame(i) for i in plant.GetFrameIndices(plant.GetBodyByName("base_link").model_instance())]
+    framed = {frame.body().name() for frame in frames if frame.name().startswith("dh_")}
+    return {body.name() for body in moving_bodies(plant)} - framed

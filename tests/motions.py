@@ -1,0 +1,70 @@
+"""Motions of simulated arms whose dynamics are known, for tests."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dvrk_drake.dynamics.dynamic_model import DynamicModel
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.dynamic_section import (
+    ActuatorEffectEstimate,
+    DynamicSection,
+    LinkEstimate,
+    RotorEstimate,
+    SignalSettings,
+)
+from dvrk_drake.dynamics.inertial_parameters import parameters_from_pseudo_inertia
+from dvrk_drake.dynamics.physical_consistency import LinkScale
+from dvrk_drake.dynamics.rotor_inertia import rotor_links
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.recording import Recording
+
+
+def fourier_motion(arm: Arm, generator: np.random.Generator, period: float, seconds: float, rate: float):
+    """q, v, vd (m, n) and t (m,) of a motion inside the arm's limits that repeats after `period` [s]."""
+    t = np.arange(round(seconds * rate)) / rate
+    center = arm.sample_poses(400, generator, margin=0.2).mean(axis=0)
+    amplitude = 0.5 * (arm.position_upper - arm.position_lower)
+    amplitude = np.minimum(amplitude, arm.per_joint(2.0, 0.1))
+    harmonics = np.arange(1, 6)
+    a, b = generator.normal(size=(2, arm.num_joints, len(harmonics))) / harmonics
+    w = 2 * np.pi * harmonics / period
+    sines, cosines = np.sin(w * t[:, None]), np.cos(w * t[:, None])
+    shape = sines @ a.T + cosines @ b.T
+    size = amplitude / np.abs(shape).max(axis=0)
+    while any(arm.limit_violations(q) for q in (center + size * shape)[::20]):
+        size *= 0.9
+    v = (w * cosines) @ a.T - (w * sines) @ b.T
+    return t, center + size * shape, size * v, size * (-(w**2 * sines) @ a.T - (w**2 * cosines) @ b.T)
+
+
+def true_dynamics(arm: Arm, generator: np.random.Generator, effects: list[ActuatorEffectEstimate]) -> DynamicModel:
+    """An arm like the SDF's with other links: each is sheared and shifted by a share of its own size."""
+    regressor = DynamicRegressor(arm)
+    links = []
+    for link in regressor.links:
+        size = np.array([*[LinkScale.of(link).length] * 3, 1.0])
+        T = np.eye(4) + 0.05 * generator.normal(size=(4, 4)) * np.outer(size, 1 / size)
+        T[3, :3] = 0.0
+        T[:3, 3] *= link.link not in rotor_links(arm)  # a rotor is balanced
+        J = T @ link.pseudo_inertia() @ T.T
+        links.append(LinkEstimate(link.link, [float(x) for x in parameters_from_pseudo_inertia(J)]))
+    rotors = [
+        RotorEstimate(name, float(rotor.value * generator.uniform(0.8, 1.2)))
+        for name, rotor in zip(arm.joint_names, regressor.rotors, strict=False)
+    ]
+    n = arm.num_joints
+    settings = SignalSettings(50.0, [20.0] * n, arm.effort_cut_off, [0.0] * n)
+    return DynamicModel(arm, DynamicSection([float(g) for g in arm.gravity], links, rotors, effects, [], settings))
+
+
+def recorded(
+    model: DynamicModel, motion, noise: float, generator: np.random.Generator, rate: float = 200.0
+) -> Recording:
+    """The motion, sampled at 1 kHz, as it would be recorded at `rate`, with noise of a share of each effort's RMS."""
+    t, q, v, vd = motion
+    J = model.arm.transmission
+    tau = model.effort(q, v, vd)
+    tau = tau + noise * np.sqrt(np.mean(tau**2, axis=0)) * generator.normal(size=tau.shape)
+    every = slice(None, None, round(1000 / rate))
+    return Recording(q=q[every], qd=v[every], tau=J.pull_back_effort(tau)[every], t=t[every], source="simulated")

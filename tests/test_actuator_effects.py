@@ -1,0 +1,58 @@
+"""Effects in the drive: one definition for a batch and for a step, and what each kind must do."""
+
+import numpy as np
+import pytest
+
+from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_coordinates, slides
+from dvrk_drake.models.arm import load_arm
+
+T = np.arange(0, 4, 1e-3)
+X = 0.3 * np.sin(2 * np.pi * 0.7 * T) + 0.1 * np.sin(2 * np.pi * 1.9 * T)
+V = np.gradient(X, 1e-3)
+
+
+@pytest.mark.parametrize("kind", EFFECT_KINDS)
+def test_a_step_in_time_gives_the_column(kind):
+    effect = ActuatorEffect("actuator.pitch", kind, 0.05)
+    state, before, played = 0.0, X[0], []
+    for x, v in zip(X, V, strict=True):
+        state, shape = effect.step(state, x - before, x, v)
+        played.append(shape)
+        before = x
+    np.testing.assert_array_equal(played, effect.column(X, V))
+
+
+@pytest.mark.parametrize("kind", [kind for kind, what in EFFECT_KINDS.items() if what.dissipative])
+def test_friction_takes_energy_over_every_closed_path(kind):
+    column = ActuatorEffect("actuator.pitch", kind, 0.02).column(X, V)
+    # What a spring would still hold at the end is little beside what friction took on the way.
+    work = np.sum(0.5 * (column[1:] + column[:-1]) * np.diff(X))
+    assert work > 0
+    assert np.max(np.abs(column)) <= (np.max(np.abs(V)) if kind == "viscous" else 1.0)
+
+
+def test_a_presliding_element_is_a_spring_until_it_slips_and_remembers():
+    d = 0.1
+    path = np.concatenate([np.linspace(0, 0.05, 50), np.linspace(0.05, 0.5, 50), np.linspace(0.5, 0.45, 50)])
+    shape = ActuatorEffect("actuator.pitch", "presliding", d).column(path, 0 * path)
+    np.testing.assert_allclose(shape[:50], path[:50] / d, atol=1e-12)
+    assert shape[99] == 1.0
+    np.testing.assert_allclose(shape[100:], 1 - (0.5 - path[100:]) / d, atol=1e-12)
+
+
+def test_effects_do_the_same_work_on_actuators_and_along_their_coordinate():
+    for name in ("mtmr", "psm"):
+        arm = load_arm(name)
+        rows = effect_coordinates(arm)
+        generator = np.random.default_rng(0)
+        q = generator.normal(size=arm.num_joints)
+        a = arm.transmission.position(q)
+        for j, joint in enumerate(arm.joint_names):
+            if f"joint.{joint}" in rows:
+                assert rows[f"joint.{joint}"] @ a == pytest.approx(q[j])
+        assert len(rows) > arm.num_joints
+    arm = load_arm("psm")
+    rows = effect_coordinates(arm)
+    a = arm.transmission.position(q)
+    assert rows["finger_1"] @ a == pytest.approx(q[5] - q[6] / 2)
+    assert slides(arm, "actuator.insertion") and not slides(arm, "finger_1")

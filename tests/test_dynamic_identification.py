@@ -1,0 +1,139 @@
+"""Full dynamics of simulated arms whose truth is known, from motion to model file to prediction."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from motions import fourier_motion, recorded, true_dynamics
+
+from dvrk_drake.analysis.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.dynamic_statics import base_parameter_map
+from dvrk_drake.analysis.dynamic_validation import predict_motion, validate_motion
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
+from dvrk_drake.errors import ModelError, RecordingError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.recording import Recording
+
+NOISE = 0.05
+RATE = 1000.0
+
+
+def simulated(name, seed):
+    """An arm with friction at every actuator, and its motion: truth, recording, generator."""
+    arm, generator = load_arm(name), np.random.default_rng(seed)
+    motion = fourier_motion(arm, generator, 10.0, 20.0, RATE)
+    _, q, v, vd = motion
+    without = true_dynamics(arm, np.random.default_rng(seed), [])
+    effort = np.sqrt(np.mean(without.effort(q, v, vd) ** 2, axis=0))
+    speed, travel = arm.transmission.velocity(v).std(axis=0), arm.transmission.position(q).std(axis=0)
+    effects = []
+    for i, joint in enumerate(arm.joint_names):
+        at = f"actuator.{joint}"
+        effects += [
+            ActuatorEffectEstimate(at, "viscous", 0.0, float(0.2 * effort[i] / speed[i])),
+            ActuatorEffectEstimate(at, "coulomb", float(f"{0.1 * speed[i]:.3g}"), float(0.2 * effort[i])),
+            ActuatorEffectEstimate(at, "presliding", float(f"{0.08 * travel[i]:.3g}"), float(0.2 * effort[i])),
+        ]
+    truth = true_dynamics(arm, np.random.default_rng(seed), effects)
+    return arm, truth, recorded(truth, motion, NOISE, generator)
+
+
+@pytest.fixture(scope="module", params=["mtmr", "psm"])
+def case(request):
+    arm, truth, recording = simulated(request.param, 0)
+    return arm, truth, recording, identify_dynamic(recording, arm)
+
+
+def test_another_motion_is_predicted_below_the_noise(case):
+    arm, truth, _, result = case
+    other = recorded(
+        truth, fourier_motion(arm, np.random.default_rng(1), 9.0, 18.0, RATE), 0.0, np.random.default_rng(5)
+    )
+    validation = validate_motion(result.model, other)
+    assert all(a.relative_error < NOISE for a in validation.actuators)
+    assert validation.mean_relative_error < NOISE / 3
+
+
+def test_cross_validation_promises_no_more_than_the_noise_allows(case):
+    _, _, _, result = case
+    for a in result.model.dynamics.actuators:
+        # What the low-pass leaves of white noise, and little more; the fit cannot be below the repeatability floor.
+        assert 0.9 * a.rms_repeatability <= a.rms_fit * np.sqrt(2) and a.rms_fit < 0.03 * a.rms_effort
+        assert a.rms_fit <= a.rms_cross_validation < NOISE * a.rms_effort
+
+
+def test_true_base_parameters_and_rotors_lie_in_their_intervals(case):
+    arm, truth, _, result = case
+    B = base_parameter_map(derive_gravity(arm), truth.regressor)
+    beta = B @ truth.parameters[: B.shape[1]]
+    z = [(p.value - b) / p.standard_error for p, b in zip(result.model.base_parameters, beta, strict=True)]
+    rotors = zip(result.model.dynamics.rotors, truth.section.rotors, strict=True)
+    z += [(e.value - t.value) / e.standard_error for e, t in rotors if t.value > 0]
+    # 95 % intervals of some twenty numbers: at least 90 % inside, none far off.
+    assert np.mean(np.abs(z) < 1.96) >= 0.9 and np.max(np.abs(z)) < 4
+
+
+def test_true_friction_is_found(case):
+    arm, truth, _, result = case
+    _, q, v, _ = fourier_motion(arm, np.random.default_rng(2), 9.0, 9.0, RATE)
+    friction, found = truth.effect_effort(q, v), result.model.dynamic_model.effect_effort(q, v)
+    share = np.sqrt(np.mean((found - friction) ** 2, axis=0) / np.mean(friction**2, axis=0))
+    assert np.all(share < 0.2), "what a spring or weight could also be is told apart by the other phases only"
+
+
+def test_all_links_can_exist_and_no_motion_has_negative_energy(case):
+    arm, _, _, result = case
+    assert min(link.least_eigenvalue for link in result.model.dynamics.links) > 0
+    M = result.model.dynamic_model.mass_matrix(arm.sample_poses(300, np.random.default_rng(3)))
+    np.testing.assert_allclose(M, np.swapaxes(M, 1, 2), atol=1e-12)
+    assert np.min(np.linalg.eigvalsh(M)) > 0
+
+
+def test_the_links_hold_the_arm_as_the_base_parameters_do(case):
+    arm, _, _, result = case
+    model = result.model.dynamic_model
+    q = arm.sample_poses(50, np.random.default_rng(4))
+    level = DynamicRegressor(arm).torque(q, 0 * q, 0 * q, model.parameters)
+    without_effects = dataclasses.replace(result.model, joint_effects=[])
+    np.testing.assert_allclose(without_effects.holding_torque(q), level, atol=1e-9)
+
+
+def test_the_model_file_keeps_all_of_it(case, tmp_path):
+    _, _, recording, result = case
+    result.model.save(tmp_path / "model.yaml")
+    loaded = IdentifiedModel.load(tmp_path / "model.yaml")
+    assert loaded.dynamics == result.model.dynamics
+    np.testing.assert_array_equal(predict_motion(loaded, recording), predict_motion(result.model, recording))
+    text = (tmp_path / "model.yaml").read_text()
+    for old, new, message in (
+        ("kind: viscous", "kind: sticky", "unknown kind; known: offset"),
+        ("coordinate: actuator.", "coordinate: motor.", "unknown coordinate; known: actuator."),
+    ):
+        (tmp_path / "bad.yaml").write_text(text.replace(old, new, 1))
+        with pytest.raises(ModelError, match=message):
+            IdentifiedModel.load(tmp_path / "bad.yaml")
+    heavy = result.model.dynamics.links[0].parameters
+    (tmp_path / "bad.yaml").write_text(text.replace(str(heavy[4]), "-1.0", 1))
+    with pytest.raises(ModelError, match="no body has the inertia of"):
+        IdentifiedModel.load(tmp_path / "bad.yaml")
+
+
+def test_in_actuator_coordinates_it_is_the_same_model(case):
+    arm, _, recording, result = case
+    mirrored = recording.in_actuator_coordinates(arm)
+    a, b = (validate_motion(result.model, r) for r in (recording, mirrored))
+    np.testing.assert_allclose(
+        [x.relative_error for x in a.actuators], [x.relative_error for x in b.actuators], rtol=1e-6
+    )
+
+
+def test_what_is_no_motion_is_refused():
+    arm = load_arm("mtmr")
+    q = np.tile(arm.sample_poses(1, np.random.default_rng(0)), (400, 1))
+    with pytest.raises(RecordingError, match="has no times"):
+        identify_dynamic(Recording(q=q, tau=0 * q), arm)
+    with pytest.raises(RecordingError, match=r"2\.0 s at 200 Hz; a dynamic model needs"):
+        identify_dynamic(Recording(q=q + np.arange(400)[:, None] * 1e-6, tau=0 * q, t=np.arange(400) / 200), arm)
