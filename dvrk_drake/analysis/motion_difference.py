@@ -23,8 +23,9 @@ LONGEST_SHIFT = 5.0
 LEAST_OVERLAP = 5.0
 #: Of the low-pass that the difference is behind [Hz]: what a payload adds is as slow as the motion, the rest is noise.
 CUT_OFF = 5.0
-#: By how much of an actuator's RMS effort torques that depend on its position may change: 0.4 to 9 % (RMS 5.6 %) between
-#: two days of a PSM without payload, actuator by actuator (psm_one and psm_one_no_weight of docs/public_recordings.md).
+#: By how much of an actuator's RMS effort torques that depend on its position may change: 0.4 to 9 % (RMS 5.6 %),
+#: actuator by actuator, between two days of a PSM without payload (psm_one, psm_one_no_weight of
+#: docs/public_recordings.md).
 DRIFT = 0.06
 #: Of the position.
 POWERS = 3
@@ -41,7 +42,7 @@ class MotionDifference:
         rows: (r,) which of its inner rows have a counterpart in the reference.
         period: after which the motion repeats [s], or None.
         shift: the other motion at t is the reference at t + shift [s].
-        tau: (k, n) efforts of the actuators [N m, N], other less reference, behind the filter, less what the arm's model
+        tau: (k, n) efforts of the actuators [N m, N], other less reference, behind the filter, less what the model
             expects since the two motions differ a little.
         changes: (k, n, c) by which the drives may have changed since, actuator by actuator: an offset, dry and viscous
             friction, and torques that depend on the position (cables, springs), as three powers of it.
@@ -69,22 +70,21 @@ def motion_difference(reference: Recording, other: Recording, model: DynamicMode
     """
     signals = model.section.signals
     settings = replace(signals, effort_cut_off=min(CUT_OFF, signals.effort_cut_off))
-    grids = [motion_grid(recording, model.arm, settings) for recording in (reference, other)]
-    period = period_of(grids[1])
-    shift = _shift(*grids, period, other)
-    left = []
-    for recording, grid in zip((reference, other), grids, strict=True):
-        tau = recording.in_actuator_coordinates(model.arm).measured_effort()
-        expected = drive_efforts(model, grid)
-        left.append(grid.behind_filter(tau) - expected.total())
-    grid = grids[1]
-    t, t_reference = grid.row_times[grid.inner] + shift, grids[0].row_times[grids[0].inner]
-    rows = (t >= t_reference[0]) & (t <= t_reference[-1])
+    before, grid = (motion_grid(recording, model.arm, settings) for recording in (reference, other))
+    period = period_of(grid)
+    shift = _shift(before, grid, period, other)
+    expected = drive_efforts(model, grid)
+    left, left_before = (
+        own.behind_filter(recording.in_actuator_coordinates(model.arm).measured_effort()) - efforts.total()
+        for own, recording, efforts in ((grid, other, expected), (before, reference, drive_efforts(model, before)))
+    )
+    t, t_before = grid.row_times[grid.inner] + shift, before.row_times[before.inner]
+    rows = (t >= t_before[0]) & (t <= t_before[-1])
     changes = _changes(model, grid, expected)[rows]
-    size = np.sqrt(np.mean((expected.total() + left[1]) ** 2, axis=0))
+    size = np.sqrt(np.mean((expected.total() + left) ** 2, axis=0))
     deviation = np.full(changes.shape[1:], np.inf)
     deviation[:, -POWERS:] = DRIFT * size[:, None]
-    tau = left[1][rows] - _at(t_reference, left[0], t[rows])
+    tau = left[rows] - _at(t_before, left_before, t[rows])
     return MotionDifference(grid, rows, period, shift, tau, changes, deviation)
 
 

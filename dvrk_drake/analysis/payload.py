@@ -30,15 +30,20 @@ LEAST_LOAD = 1e-6
 
 @dataclass(frozen=True)
 class PayloadActuator:
-    """One actuator: RMS of what changed from the reference, the drive's changes fitted away [N m, N].
+    """One actuator: RMS efforts behind the low-pass [N m, N].
 
-    `rms_left` is what the payload leaves of it; `explained` = 1 - rms_left^2 / rms_difference^2, None where the payload
-    does not load the actuator.
+    Attributes:
+        name: of the joint whose actuator it is.
+        change: what the recordings differ by.
+        payload: what the payload takes of it.
+        left: what neither the payload nor changes of the drive explain.
+        explained: 1 - left^2 / change^2; None where the payload does not load the actuator.
     """
 
     name: str
-    rms_difference: float
-    rms_left: float
+    change: float
+    payload: float
+    left: float
     explained: float | None
 
 
@@ -52,7 +57,7 @@ class Payload:
         mass_error: standard error [kg].
         place_error: (3,) standard errors [m], nan where the motion does not determine the coordinate.
         quantile: so many standard errors either way are the interval of `CONFIDENCE`.
-        p_BP: (3,) the place in the base frame with all joints at 0 [m].
+        place_in_base: (3,) the place in the base frame with all joints at 0 [m].
         left_out: RMS error of phases that are predicted from the others, as a share of the error without a payload;
             geometric mean over the actuators.
         actuators: in the arm's order.
@@ -64,7 +69,7 @@ class Payload:
     mass_error: float
     place_error: NDArray[np.float64]
     quantile: float
-    p_BP: NDArray[np.float64]
+    place_in_base: NDArray[np.float64]
     left_out: float
     actuators: list[PayloadActuator]
     shift: float
@@ -105,8 +110,9 @@ def estimate_payload(
     """The point mass on each of some links that explains best what changed from the reference, best link first.
 
     The efforts' difference is explained, actuator by actuator, by the regressor's ten columns of the link with the
-    parameters of a point mass, and by what may have changed in the drives (`MotionDifference.changes`). A weight is much smaller than its
-    distance from the joints' axes; only then mass and place can be told apart on a link that turns about a fixed point.
+    parameters of a point mass, and by what may have changed in the drives (`MotionDifference.changes`). That a weight
+    is small beside its distance from the joints' axes is what tells mass from place on a link that turns about a fixed
+    point: there only m p and the inertia m p p' show.
 
     The standard errors are a delete-one jackknife over the folds of `phase_folds`: errors that repeat with the motion
     do not average out with its repetitions, as those of independent rows would. They are never less than independent
@@ -154,13 +160,11 @@ def _estimate(link: LinkInertia, columns: NDArray[np.float64], difference: Motio
     jackknife = np.array([[part.mass, *part.place] for part in parts])
     spread = np.sqrt((len(folds) - 1) * np.var(jackknife, axis=0))
     spread = np.maximum(spread, errors)
-    difference_squares, left, loads = problem.squares(body, weights)
-    rows = len(difference.tau)
-    arm = difference.grid.arm
-    loaded = loads > LEAST_LOAD**2 * difference_squares
+    rows, arm = len(difference.tau), difference.grid.arm
+    rms = np.sqrt(np.stack(problem.budget(body, weights)) / rows)
     actuators = [
-        PayloadActuator(name, np.sqrt(d / rows).item(), np.sqrt(e / rows).item(), float(1 - e / d) if ok else None)
-        for name, d, e, ok in zip(arm.joint_names, difference_squares, left, loaded, strict=True)
+        PayloadActuator(name, change, own, left, 1 - (left / change) ** 2 if own > LEAST_LOAD * change else None)
+        for name, (change, own, left) in zip(arm.joint_names, rms.T.tolist(), strict=True)
     ]
     with_it, without = (
         np.maximum(np.sum([problem.fold_errors(fold, weights, start) for fold in folds], axis=0), 1e-30)
@@ -172,7 +176,7 @@ def _estimate(link: LinkInertia, columns: NDArray[np.float64], difference: Motio
         mass_error=float(spread[0]),
         place_error=np.where(body.determined, spread[1:], np.nan),
         quantile=float(student_t.ppf((1 + CONFIDENCE) / 2, len(folds) - 1)),
-        p_BP=_in_base(arm, link.link, body.place),
+        place_in_base=_in_base(arm, link.link, body.place),
         left_out=float(np.exp(np.mean(np.log(with_it / without)) / 2)),
         actuators=actuators,
         shift=difference.shift,

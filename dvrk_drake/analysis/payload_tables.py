@@ -17,12 +17,16 @@ def print_links(console: Console, estimates: Sequence[Payload]) -> None:
     for payload in estimates:
         note = "" if payload not in good else "best" if payload is estimates[0] else "cannot be told from it"
         table.add_row(
-            payload.link, f"{100 * payload.left_out:.1f} %", f"{payload.body.mass:.4f}", f"{payload.mass_error:.4f}", note
+            payload.link,
+            f"{100 * payload.left_out:.1f} %",
+            f"{payload.body.mass:.4f}",
+            f"{payload.mass_error:.4f}",
+            note,
         )
     console.print(table)
     console.print(
-        "* phases of the motion predicted from the others: RMS error as a share of that without payload, geometric mean "
-        "over the actuators\n",
+        "* phases of the motion predicted from the others: RMS error as a share of that without payload, geometric "
+        "mean over the actuators\n",
         style="dim",
     )
 
@@ -30,10 +34,15 @@ def print_links(console: Console, estimates: Sequence[Payload]) -> None:
 def print_payload(console: Console, payload: Payload) -> None:
     """Mass and place with their intervals, then what is explained."""
     table = make_table(
-        f"Payload on {payload.link}", "", "estimate", "standard error", f"{CONFIDENCE:.0%} interval", "base frame, q = 0"
+        f"Payload on {payload.link}",
+        "",
+        "estimate",
+        "standard error",
+        f"{CONFIDENCE:.0%} interval",
+        "base frame, q = 0",
     )
     rows = [("mass [kg]", payload.body.mass, payload.mass_error, "")]
-    for axis, x, error, base in zip("xyz", payload.body.place, payload.place_error, payload.p_BP, strict=True):
+    for axis, x, error, base in zip("xyz", payload.body.place, payload.place_error, payload.place_in_base, strict=True):
         rows.append((f"{axis} [m]", x, error, f"{base:+.4f}"))
     for k, (name, value, error, base) in enumerate(rows):
         if k and not payload.body.determined[k - 1]:
@@ -42,11 +51,13 @@ def print_payload(console: Console, payload: Payload) -> None:
         reach = payload.quantile * error
         table.add_row(name, f"{value:+.4f}", f"{error:.4f}", f"{value - reach:+.4f} .. {value + reach:+.4f}", base)
     console.print(table)
-    table = make_table("Effort [N m; N if prismatic]: RMS of the change", "", "change", "left", "explained")
+    table = make_table("RMS efforts [N m; N if prismatic]", "", "change", "payload", "left*", "explained")
     for actuator in payload.actuators:
         explained = "not loaded" if actuator.explained is None else f"{100 * actuator.explained:.1f} %"
-        table.add_row(actuator.name, f"{actuator.rms_difference:.4f}", f"{actuator.rms_left:.4f}", explained)
+        numbers = (f"{x:.4f}" for x in (actuator.change, actuator.payload, actuator.left))
+        table.add_row(actuator.name, *numbers, explained)
     console.print(table)
+    console.print("* by the payload and by what changed in the drives, see docs/payload.md\n", style="dim")
     if not payload.found:
         console.print(
             f"The mass may be 0: these recordings show no payload on {payload.link}.", style="yellow", soft_wrap=True

@@ -71,8 +71,8 @@ class PointMassProblem:
     def fit(self) -> tuple[PointMass, NDArray[np.float64], NDArray[np.float64]]:
         """The point mass, the actuators' weights (n,), and (4,) the standard errors if all rows' noise were alike.
 
-        Every actuator weighs by the variance that is left. Coordinates that the motion does not determine are set to the
-        link's centre of mass one by one.
+        Every actuator weighs by the variance that is left. Coordinates that the motion does not determine are set to
+        the link's centre of mass, one by one.
         """
         weights = self._count / np.maximum(self._total[:, -1, -1], _TINY)
         determined = np.ones(3, dtype=bool)
@@ -102,21 +102,31 @@ class PointMassProblem:
         phi = np.zeros(_RIGID)
         if start is not None:
             phi = self._refine(self._reduced(others, weights), weights, start).parameters
-        errors = np.empty(len(own))
-        for i, (learnt, predicted) in enumerate(zip(others, own, strict=True)):
-            left = learnt[_RIGID:-1, -1] - learnt[_RIGID:-1, :_RIGID] @ phi
-            x = _pseudo_solve(learnt[_RIGID:-1, _RIGID:-1] + np.diag(self._precision[i] / weights[i]), left)
-            residual = np.concatenate([-phi, -x, [1.0]])
-            errors[i] = max(residual @ predicted @ residual, 0.0)
-        return errors
+        return self._left(others, own, phi, weights)
 
-    def squares(
+    def budget(
         self, body: PointMass, weights: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """(n,) each, nuisances fitted away: sum of squares of the efforts, of what `body` leaves, of what it adds."""
-        reduced, phi = self._reduced(self._total, weights), body.parameters
-        adds = np.einsum("a,nab,b->n", phi, reduced[:, :-1, :-1], phi)
-        return reduced[:, -1, -1], _left_by(reduced, body), adds
+        """(n,) each, sums of squares: of the efforts, of what the body adds to them, of what it and nuisances leave."""
+        phi, total = body.parameters, self._total
+        adds = np.einsum("a,nab,b->n", phi, total[:, :_RIGID, :_RIGID], phi)
+        return total[:, -1, -1], np.maximum(adds, 0.0), self._left(total, total, phi, weights)
+
+    def _left(
+        self,
+        learnt: NDArray[np.float64],
+        predicted: NDArray[np.float64],
+        phi: NDArray[np.float64],
+        weights: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """(n,) sum of squares left of some rows by phi (10,) and nuisances that are fitted to others."""
+        left = np.empty(len(learnt))
+        for i, (H, own) in enumerate(zip(learnt, predicted, strict=True)):
+            right = H[_RIGID:-1, -1] - H[_RIGID:-1, :_RIGID] @ phi
+            x = _pseudo_solve(H[_RIGID:-1, _RIGID:-1] + np.diag(self._precision[i] / weights[i]), right)
+            residual = np.concatenate([-phi, -x, [1.0]])
+            left[i] = max(residual @ own @ residual, 0.0)
+        return left
 
     def _reduced(self, products: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 11, 11) of the link's columns and the effort when each actuator's nuisances are fitted away."""
@@ -137,7 +147,7 @@ class PointMassProblem:
         bodies = []
         for offset in offsets:
             unit = point_mass_parameters(1.0, self.com + offset)
-            mass = float(np.clip((unit @ b) / max(unit @ H @ unit, _TINY), 1e-3, LARGEST_MASS / 2))
+            mass = float(np.clip(float(unit @ b) / max(float(unit @ H @ unit), _TINY), 1e-3, LARGEST_MASS / 2))
             bodies.append(self._refine(reduced, weights, PointMass(mass, self.com + offset, determined)))
         return min(bodies, key=lambda body: float(weights @ _left_by(reduced, body)))
 
@@ -197,7 +207,7 @@ def _pseudo_solve(H: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.
     """H^+ b of a symmetric positive semidefinite H, after its columns are brought to one size."""
     scale = 1 / np.sqrt(np.maximum(np.diag(H), _TINY))
     inverse = np.linalg.pinv(H * np.outer(scale, scale), rcond=_NEGLIGIBLE, hermitian=True)
-    return np.asarray(((inverse * np.outer(scale, scale)) @ b))
+    return np.asarray((inverse * np.outer(scale, scale)) @ b)
 
 
 def _weighted(

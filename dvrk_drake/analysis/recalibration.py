@@ -25,7 +25,7 @@ SCALE_DEVIATION, OFFSET_DEVIATION = 0.5, 0.3
 _RELATIVE_ERROR = 0.1
 #: An actuator must move in both directions for at least this share of the time.
 LEAST_SHARE = 0.1
-#: The recording is of another arm if, on average over the actuators, more than this share of the effort stays unexplained.
+#: A recording that leaves a larger share of the efforts unexplained, on average, is of another arm.
 LARGEST_ERROR = 0.7
 
 
@@ -82,7 +82,6 @@ def recalibrate(model: IdentifiedModel, recording: Recording) -> Recalibration:
         ModelError: the model has no dynamics.
     """
     fit = _Fit(model.dynamic_model, recording)
-    n = len(fit.names)
     excited = fit.excited
     if not np.any(excited):
         raise RecordingError(
@@ -101,18 +100,24 @@ def recalibrate(model: IdentifiedModel, recording: Recording) -> Recalibration:
     first = fit.error(fit.solve(excited, start), ~start)
     if not np.mean(np.minimum(before, after)) < LARGEST_ERROR:
         raise RecordingError(
-            f"{recording.source or 'recording'}: efforts differ from the model's by {np.mean(before):.0%} on average over "
-            f"the actuators, and by {np.mean(after):.0%} with its friction fitted; {LARGEST_ERROR:.0%} is allowed: is it "
-            "of this arm, in these coordinates?"
+            f"{recording.source or 'recording'}: efforts differ from the model's by {np.mean(before):.0%} on average "
+            f"over the actuators, and by {np.mean(after):.0%} with its friction fitted; {LARGEST_ERROR:.0%} is "
+            "allowed: is it of this arm, in these coordinates?"
         )
     x = fit.solve(free, np.ones(len(fit.rows), dtype=bool))
     actuators = []
     for i, name in enumerate(fit.names):
         reason = "" if free[i] else "gains nothing" if excited[i] else "does not move both ways"
-        scales = [fit.scale(x, f"actuator.{name}", part) for part in ("dry", "viscous")]
         actuators.append(
             RecalibratedActuator(
-                name, float(before[i]), float(first[i]), bool(free[i]), reason, *scales, float(x[len(fit.keys) + i])
+                name=name,
+                before=float(before[i]),
+                after=float(first[i]),
+                kept=bool(free[i]),
+                reason=reason,
+                dry=fit.scale(x, f"actuator.{name}", "dry"),
+                viscous=fit.scale(x, f"actuator.{name}", "viscous"),
+                offset=float(x[len(fit.keys) + i]),
             )
         )
     shared = {
@@ -121,7 +126,9 @@ def recalibrate(model: IdentifiedModel, recording: Recording) -> Recalibration:
         if not coordinate.startswith("actuator.")
     }
     section = _section(model.dynamic_model.section, fit, x)
-    return Recalibration(_with_section(model, section, x[len(fit.keys) :], recording), actuators, shared, float(len(fit.rows) / fit.rate))
+    return Recalibration(
+        _with_section(model, section, x[len(fit.keys) :], recording), actuators, shared, float(len(fit.rows) / fit.rate)
+    )
 
 
 class _Fit:

@@ -20,7 +20,8 @@ def print_recalibration(console: Console, result: Recalibration) -> None:
     table.add_row("mean", f"{100 * before:.1f} %", f"{100 * after:.1f} %", "", "", "", "")
     console.print(table)
     console.print(
-        "* actuators: |tau_f - tau_hat| / |tau_f| behind the model's low-pass; refit to what comes before it\n", style="dim"
+        "* actuators: |tau_f - tau_hat| / |tau_f| behind the model's low-pass; refit to what comes before it\n",
+        style="dim",
     )
     shared = [f"{name} x {scale:.2f}" for name, scale in result.shared.items()]
     if shared:

@@ -14,7 +14,9 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("reference", metavar="REFERENCE", help="recording of the motion without the payload")
     verb.add_argument("loaded", metavar="LOADED", help="recording of the same motion with it")
     source = verb.add_mutually_exclusive_group(required=True)
-    source.add_argument("--arm", help="the arm: mtml, mtmr, psm, or a YAML file; its model is identified from REFERENCE")
+    source.add_argument(
+        "--arm", help="the arm: mtml, mtmr, psm, or a YAML file; its model is identified from REFERENCE"
+    )
     source.add_argument("--model", metavar="MODEL.yaml", help="its model, identified from a motion")
     verb.add_argument("--link", help="the link of the SDF that carries it; default: tries all")
     verb.add_argument(
