@@ -1,0 +1,72 @@
+"""The verb `payload`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from dvrk_drake.cli.support import ProgressBar, add_gravity, check_output, mounted, print_notes
+
+
+def add_verbs(verbs: argparse._SubParsersAction) -> None:
+    """Adds the verb and its options."""
+    verb = verbs.add_parser("payload", help="say what was added to an arm between two recordings of one motion")
+    verb.add_argument("reference", metavar="REFERENCE", help="recording of the motion without the payload")
+    verb.add_argument("loaded", metavar="LOADED", help="recording of the same motion with it")
+    source = verb.add_mutually_exclusive_group(required=True)
+    source.add_argument(
+        "--arm", help="the arm: mtml, mtmr, psm, or a YAML file; its model is identified from REFERENCE"
+    )
+    source.add_argument("--model", metavar="MODEL.yaml", help="its model, identified from a motion")
+    verb.add_argument("--link", help="the link of the SDF that carries it; default: tries all")
+    verb.add_argument(
+        "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
+    )
+    verb.add_argument("--json", metavar="FILE", help="write the estimates as JSON")
+    add_gravity(verb)
+    verb.set_defaults(run=_payload)
+
+
+def _payload(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.dynamic_identification import identify_dynamic
+    from dvrk_drake.analysis.payload import estimate_payload
+    from dvrk_drake.analysis.payload_tables import print_links, print_payload
+    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.errors import ModelError
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.recording import read_recording
+
+    model = None if options.model is None else IdentifiedModel.load(options.model)
+    if model is not None and options.gravity is not None:
+        raise ModelError(f"{options.model}: states its gravity; --gravity is for --arm")
+    arm = mounted(load_arm(options.arm), options.gravity) if model is None else model.load_arm()
+    if options.json is not None:
+        check_output(options.json, options.reference, options.loaded)
+    recordings = []
+    for path in (options.reference, options.loaded):
+        recordings.append(read_recording(path, arm, options.coordinates))
+        print_notes(path, recordings[-1].notes)
+    reference, loaded = recordings
+    with ProgressBar("estimating") as (progress, task):
+        if model is None:
+            share = 50.0
+            model = identify_dynamic(reference, arm, lambda done: progress.update(task, completed=50 * done)).model
+        else:
+            share = 0.0
+        estimates = estimate_payload(
+            reference,
+            loaded,
+            model.dynamic_model,
+            None if options.link is None else [options.link],
+            lambda done: progress.update(task, completed=share + (100 - share) * done),
+        )
+    console = make_console()
+    if options.link is None:
+        print_links(console, estimates)
+    print_payload(console, estimates[0])
+    if options.json is not None:
+        with atomic_write(options.json) as stream:
+            json.dump([payload.as_dict() for payload in estimates], stream, indent=2)
+            stream.write("\n")

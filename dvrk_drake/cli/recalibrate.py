@@ -1,0 +1,34 @@
+"""The verb `recalibrate`."""
+
+from __future__ import annotations
+
+import argparse
+
+from dvrk_drake.cli.support import add_recording, check_output, print_notes
+
+
+def add_verbs(verbs: argparse._SubParsersAction) -> None:
+    """Adds the verb and its options."""
+    verb = verbs.add_parser("recalibrate", help="refit a model's friction and offsets to a short motion of another day")
+    verb.add_argument("model", metavar="MODEL.yaml", help="a model that was identified from a motion")
+    add_recording(verb)
+    verb.add_argument("--output", required=True, metavar="NEW.yaml", help="the model file to write")
+    verb.set_defaults(run=_recalibrate)
+
+
+def _recalibrate(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.recalibration import recalibrate
+    from dvrk_drake.analysis.recalibration_tables import print_recalibration
+    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.models.recording import read_recording
+
+    model = IdentifiedModel.load(options.model)
+    recording = read_recording(options.recording, model.load_arm(), options.coordinates)
+    print_notes(options.recording, recording.notes)
+    check_output(options.output, options.recording, options.model)
+    result = recalibrate(model, recording)
+    console = make_console()
+    print_recalibration(console, result)
+    result.model.save(options.output)
+    console.print(f"model: {options.output}")
