@@ -296,8 +296,9 @@ def test_collision_shapes_are_there_when_something_can_be_touched():
 
 
 def test_errors_say_what_to_do():
-    with pytest.raises(StationError, match="plant_arm and modify_plant are of a simulation"):
-        ArmStation(ARM, hardware=True, plant_arm=ARM)
+    for of_a_simulation in ({"plant_arm": ARM}, {"closure": "ball"}, {"time_step": 2e-3}):
+        with pytest.raises(StationError, match="plant_arm and modify_plant are of a simulation"):
+            ArmStation(ARM, hardware=True, **of_a_simulation)
     with pytest.raises(StationError, match="driver and lcm are of hardware"):
         ArmStation(ARM, driver=DvrkDriver())
     with pytest.raises(StationError, match=r"time_step must be above 0 and at most 0.01 s"):

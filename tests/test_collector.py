@@ -75,7 +75,7 @@ def test_it_ends_when_the_arm_takes_over(tmp_path):
     sticky.off = True
     lead(collector, controller, sticky, 0.1)
     collector.close()
-    assert collector.finished and "MTML took over and holds" in str(collector.problem)
+    assert collector.finished and "MTML took over and holds: its " in str(collector.problem)
     assert len(read_recording(tmp_path / "o.csv")) == 1
 
 

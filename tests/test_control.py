@@ -236,3 +236,14 @@ def test_statuses_of_the_past_are_not_heard_as_the_present(replays):
             link.next_status(0.1)
     hear(1, SESSION + 1)  # restarted: the controller is to know
     assert link.next_status(0.1).session_id == SESSION + 1
+
+
+def test_an_arm_that_lets_no_command_act_is_given_up_with_the_reason(controller, monkeypatch):
+    monkeypatch.setattr("dvrk_drake.processes.control._PATIENCE", 0.3)
+    link = GuardedArm()
+    link.status.gravity_compensation = True
+    link.status.effort_measured = list(2 * LIMIT)  # more than commands may use
+    with pytest.raises(
+        ControllerError, match=r"lets no command act for 0.3 s; the last refusal is: .*: switch that off"
+    ):
+        control(link, controller, lambda: False, lambda status: None)

@@ -10,9 +10,11 @@ import pytest
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, StationError
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes import pace
 from dvrk_drake.processes.lcm_network import open_lcm
+from dvrk_drake.processes.live_status import takeover_reason
 from dvrk_drake.processes.simulated_arm import load_driver, start_pose
 
 
@@ -148,3 +150,12 @@ def test_a_model_of_another_arm_is_refused(tmp_path, capfd):
     IdentifiedModel.from_arm(load_arm("mtmr")).save(path)
     assert main(["run", "--arm", "mtml", "--model", str(path)]) == 2
     assert "model.yaml: is of MTMR, not of MTML" in capfd.readouterr().err
+
+
+def test_why_an_arm_took_over():
+    status = lcmt_dvrk_status()
+    status.num_expired, status.guard_state = 3, lcmt_dvrk_status.STATE_OFF
+    assert takeover_reason(status, 2) == "commands came too late for it (use --realtime)"
+    assert takeover_reason(status, 3) == "its state is off"
+    status.refusal_code = lcmt_dvrk_status.REFUSAL_START_FAR
+    assert "starting too far" in takeover_reason(status, 3)

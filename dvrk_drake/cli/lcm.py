@@ -76,7 +76,11 @@ def _run(options: argparse.Namespace) -> None:
     controller, url, period = ready_controller(options, options.mode, reset=options.reset)
     arm = controller.arm
     stopped = stop_on_signals()
-    print(f"{options.mode} of {arm.name} at {1 / period:.0f} Hz; Ctrl-C leaves it to its own hold", flush=True)
+    print(
+        f"{options.mode} of {arm.name} at {1 / period:.0f} Hz as sender {controller.sender_id}; "
+        "Ctrl-C leaves it to its own hold",
+        flush=True,
+    )
     line, told = LiveLine(sys.stderr), [("", "")]
 
     def tell(status: LiveStatus) -> None:

@@ -14,6 +14,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.collection_file import CollectionFile
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.leg import Leg, beside
+from dvrk_drake.processes.live_status import takeover_reason
 from dvrk_drake.processes.rest_detector import RestDetector
 
 #: The way goes on by no more than this between two statuses [s]: after a pause of the computer it does not jump.
@@ -96,7 +97,7 @@ class Collector:
         span = arm.position_upper - arm.position_lower
         self._speed, self._astray = span / settings.traverse_time, _ASTRAY * span
         self._approach = _APPROACH * arm.effort_limits / np.asarray(arm.gains.kp)
-        self._time, self._heard = 0.0, 0.0
+        self._time, self._heard, self._num_expired = 0.0, 0.0, 0
         self._q = self._tau = np.zeros(arm.num_joints)
         self._desired = np.zeros(2 * arm.num_joints)
         self._leg_end = 0.0
@@ -138,9 +139,8 @@ class Collector:
 
     def _check(self, status: lcmt_dvrk_status) -> None:
         if not self._controller.acting:
-            raise CollectionError(
-                f"{self._arm.name} took over and holds: commands came too late for it (use --realtime)"
-            )
+            raise CollectionError(f"{self._arm.name} took over and holds: {takeover_reason(status, self._num_expired)}")
+        self._num_expired = status.num_expired
         n = self._arm.num_joints
         away = np.abs(self._q - self._desired[:n]) / self._astray
         if away.max() > 1:

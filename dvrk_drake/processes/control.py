@@ -13,7 +13,15 @@ from pydrake.common.value import AbstractValue
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import command_channel, decode, describe_state, is_old, is_status_of, status_channel
+from dvrk_drake.models.lcm_messages import (
+    command_channel,
+    decode,
+    describe_refusal,
+    describe_state,
+    is_old,
+    is_status_of,
+    status_channel,
+)
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
@@ -33,6 +41,9 @@ _RELEASE = 1.0
 
 #: The longest time for which a guard may remember a sender that is silent, and a little [s].
 _FORGOTTEN = 1.1
+
+#: How long commands may be refused, or watched, without one that acts [s]; the start guard takes a quarter of a second.
+_PATIENCE = 10.0
 
 #: How often `tell` hears the live status [s].
 _TELL = 0.2
@@ -187,17 +198,24 @@ def control(
         lead: where to, asked once a status.
 
     Raises:
-        ControllerError: the arm fell silent, faulted or was restarted.
+        ControllerError: the arm fell silent, faulted, was restarted, or lets no command act.
     """
     start = time.monotonic()
     first = link.next_status(_SILENCE)
-    live, tell_at = LiveStatusMaker(controller.sender_id, first), _TELL
+    live, tell_at, acted = LiveStatusMaker(controller.sender_id, first), _TELL, 0.0
     while not stopped():
         status = link.next_status(_SILENCE)
         _check(status, link.arm.name, first.session_id)
         now = time.monotonic() - start
         link.send(controller.answer(status, now, lead(status, now)))
         live.answer(status, now)
+        if controller.acting:
+            acted = now
+        elif now > acted + _PATIENCE:
+            why = f"the last refusal is: {describe_refusal(status.refusal_code)}"
+            if status.gravity_compensation:
+                why += "; it adds gravity compensation of its own: switch that off"
+            raise ControllerError(f"{link.arm.name} lets no command act for {_PATIENCE:g} s; {why}")
         if now >= tell_at:
             tell(live.make(status, now, link.lost))
             tell_at = now + _TELL

@@ -56,3 +56,12 @@ class LiveStatusMaker:
         self._before, self._told_at, self._answered = status, time, 0
         pace = f"{rate:.0f} Hz, {trip}, {lost} statuses lost"
         return LiveStatus(describe_state(status.guard_state), pace, ", ".join(problem))
+
+
+def takeover_reason(status: lcmt_dvrk_status, num_expired: int) -> str:
+    """Why an arm obeys no longer, if `num_expired` commands had expired while it did."""
+    if status.num_expired > num_expired:
+        return "commands came too late for it (use --realtime)"
+    if status.refusal_code != lcmt_dvrk_status.REFUSAL_NONE:
+        return f"its last refusal is {describe_refusal(status.refusal_code)}"
+    return f"its state is {describe_state(status.guard_state)}"

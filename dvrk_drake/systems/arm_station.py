@@ -102,8 +102,10 @@ class ArmStation(Diagram):
         self._plant: MultibodyPlant | None = None
         builder = DiagramBuilder()
         if hardware:
-            if meshcat is not None or plant_arm is not None or modify_plant is not None:
-                raise StationError("meshcat, plant_arm and modify_plant are of a simulation: use hardware=False")
+            if (time_step, meshcat, closure, plant_arm, modify_plant) != (1e-3, None, "mimic", None, None):
+                raise StationError(
+                    "time_step, meshcat, closure, plant_arm and modify_plant are of a simulation: use hardware=False"
+                )
             self._connect_hardware(builder, driver or DvrkDriver(), lcm)
         else:
             if driver is not None or lcm is not None:

@@ -37,13 +37,13 @@ class DvrkDriver:
         """Checks the values; whoever sets them one by one, as yaml_load_typed does, calls it again.
 
         Raises:
-            StationError: an unknown control mode, a period that is not positive or above 10 ms, or a guard's setting.
+            StationError: an unknown control mode, a period below 0.5 ms or above 10 ms, or a guard's setting.
         """
         self.guard.check()
         if any(mode not in _MODES for mode in self.control_modes):
             raise StationError(f"control_modes must be a list of {', '.join(_MODES)}; got {list(self.control_modes)}")
-        if not 0 < self.status_period <= 0.01:
-            raise StationError(f"status_period must be above 0 and at most 0.01 s; got {self.status_period}")
+        if not 0.0005 <= self.status_period <= 0.01:
+            raise StationError(f"status_period must be from 0.0005 to 0.01 s; got {self.status_period}")
 
     def accepted_modes(self) -> tuple[int, ...]:
         """`control_modes` as values of lcmt_dvrk_command.control_mode."""
