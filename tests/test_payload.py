@@ -110,7 +110,9 @@ def test_refusals():
     with pytest.raises(ModelError, match='unknown link "arm"; links of PSM that move: yaw_link, back_crank_link'):
         estimate_payload(reference, loaded, model, ["arm"])
     backwards = Recording(loaded.q[::-1], loaded.tau[::-1], -loaded.qd[::-1], loaded.t, source="other.csv")
-    with pytest.raises(RecordingError, match=r"other.csv: is not the motion of the reference: .* at most 10% is allowed"):
+    with pytest.raises(
+        RecordingError, match=r"other.csv: is not the motion of the reference: .* at most 10% is allowed"
+    ):
         estimate_payload(reference, backwards, model, ["end_link"])
 
 
