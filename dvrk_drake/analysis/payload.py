@@ -191,12 +191,11 @@ def _problem(link: LinkInertia, columns: NDArray[np.float64], difference: Motion
     fold, edge = phase_folds(grid, difference.period)
     both = [np.hstack([filtered[:, i], difference.changes[:, i]]) for i in range(n)]
     equations = NormalEquations.of(both, difference.tau, fold[rows], edge[rows])
-    # A low-passed effort has two independent values a period of the cut-off; repetitions say the same again.
-    duration = len(difference.tau) / grid.rate
-    independent = 2 * grid.settings.effort_cut_off * min(duration, difference.period or duration)
+    # A low-passed effort has two independent values a period of the cut-off. What repeats with the motion has fewer: the
+    # jackknife over its phases sees to that.
+    independent = 2 * grid.settings.effort_cut_off / grid.rate
     com = link.parameters[1:4] / link.parameters[0]
-    share = min(independent / len(difference.tau), 1.0)
-    return PointMassProblem(equations, share, com, difference.deviation)
+    return PointMassProblem(equations, min(independent, 1.0), com, difference.deviation)
 
 
 def _in_base(arm: Arm, link: str, place: NDArray[np.float64]) -> NDArray[np.float64]:
