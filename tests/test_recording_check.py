@@ -366,7 +366,8 @@ def test_lcm_log(tmp_path):
 def test_command_prints_findings_and_writes_json(tmp_path, capsys):
     path, output = tmp_path / "motion.csv", tmp_path / "check.json"
     write_recording(changed(clean_motion(), "qd", 4, lambda x: 1.1 * x), path)
-    assert main(["check", str(path), "--arm", "psm", "--json", str(output)]) == 0
+    assert main(["check", str(path), "--arm", "psm", "--json", str(output), "--plots", str(tmp_path / "p")]) == 0
+    assert (tmp_path / "p" / "spectra.png").stat().st_size > 10_000
     text = capsys.readouterr().out
     assert "warning: wrist_pitch: qd5 is 1.1 times dq/dt" in text
     report = json.loads(output.read_text())

@@ -167,7 +167,7 @@ def plot_positions(
 
 
 def save_figure(figure: plt.Figure, path: Path) -> None:
-    """Writes a PNG at once or not at all, and forgets the figure."""
+    """Writes a PNG at once or not at all, and closes the figure."""
     with atomic_write(path, "wb") as stream:
         figure.savefig(stream, dpi=110, format="png")
     plt.close(figure)

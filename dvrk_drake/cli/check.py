@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from dvrk_drake.cli.support import add_recording, check_output
+from dvrk_drake.cli.support import add_recording, check_output, made_folder
 from dvrk_drake.errors import RecordingError
 
 
@@ -17,11 +17,13 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     add_recording(verb)
     verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, psm, or a YAML file")
     verb.add_argument("--json", metavar="FILE", help="write the findings and numbers as JSON")
+    verb.add_argument("--plots", metavar="DIR", help="of a motion: write spectra of its efforts into this folder")
     verb.set_defaults(run=_check)
 
 
 def _check(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.recording_check import check_recording
+    from dvrk_drake.analysis.recording_plots import plot_report
     from dvrk_drake.analysis.recording_tables import print_report
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.models.arm import load_arm
@@ -31,11 +33,15 @@ def _check(options: argparse.Namespace) -> None:
     arm = load_arm(options.arm)
     if options.json is not None:
         check_output(options.json, options.recording)
-    report = check_recording(read_recording(options.recording, arm, options.coordinates), arm)
+    plots = None if options.plots is None else made_folder(options.plots)
+    recording = read_recording(options.recording, arm, options.coordinates)
+    report = check_recording(recording, arm)
     print_report(make_console(), report)
     if options.json is not None:
         with atomic_write(options.json) as stream:
             json.dump(report.as_dict(), stream, indent=2)
             stream.write("\n")
+    if plots is not None:
+        plot_report(plots, report, recording, arm)
     if count := len(report.refusals):
         raise RecordingError(f"{options.recording}: refused for {count} reason{'s' * (count > 1)}: see above")
