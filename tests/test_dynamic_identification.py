@@ -109,8 +109,8 @@ def test_the_model_file_keeps_all_of_it(case, tmp_path):
     np.testing.assert_array_equal(predict_motion(loaded, recording), predict_motion(result.model, recording))
     text = (tmp_path / "model.yaml").read_text()
     for old, new, message in (
-        ("kind: viscous", "kind: sticky", "unknown kind; known: offset"),
-        ("coordinate: actuator.", "coordinate: motor.", "unknown coordinate; known: actuator."),
+        ("kind: viscous", "kind: sticky", 'kind is "sticky"; allowed: offset'),
+        ("coordinate: actuator.", "coordinate: motor.", "allowed: actuator."),
     ):
         (tmp_path / "bad.yaml").write_text(text.replace(old, new, 1))
         with pytest.raises(ModelError, match=message):

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 import sympy
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 
-from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, derive_gravity
 from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
