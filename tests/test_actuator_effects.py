@@ -25,7 +25,7 @@ def test_a_step_in_time_gives_the_column(kind):
 @pytest.mark.parametrize("kind", [kind for kind, what in EFFECT_KINDS.items() if what.dissipative])
 def test_friction_takes_energy_over_every_closed_path(kind):
     column = ActuatorEffect("actuator.pitch", kind, 0.02).column(X, V)
-    # From 1 s on the motion and, after so many reversals, the element's state have the period of 10/7 and 10/19 s: 10 s.
+    # What a spring would still hold at the end is little beside what friction took on the way.
     work = np.sum(0.5 * (column[1:] + column[:-1]) * np.diff(X))
     assert work > 0
     assert np.max(np.abs(column)) <= (np.max(np.abs(V)) if kind == "viscous" else 1.0)
