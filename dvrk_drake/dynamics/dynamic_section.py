@@ -77,8 +77,8 @@ class SignalSettings:
 class DynamicSection:
     """tau_actuator = J'^-1 Y(q, v, vd) phi + effects: an arm's identified dynamics.
 
-    `gravity` [m/s^2] is gravity in the base frame as the motion shows it, the model's; `gravity_expected` is what it was
-    taken for before, from which it differs where the base was not quite level.
+    `gravity` [m/s^2] is gravity in the base frame as the motion shows it, the model's; `gravity_expected` is what it
+    was taken for before, from which it differs where the base was not quite level.
     """
 
     gravity: list[float] = field(default_factory=list)

@@ -124,8 +124,8 @@ def compensation_from_model(
 
     The ten columns span the gravity of an upright MTM whose last link is balanced about its axis, so they follow from
     the base parameters exactly. A joint's offset is its constant, the shoulder's cable the first two columns; an
-    effect elsewhere has no exact place and gets the best polynomial over the joint's range. Torque limits are the range that
-    is needed over the joint box and a tenth more, at most the arm's effort limits; joint 7 gets none.
+    effect elsewhere has no exact place and gets the best polynomial over the joint's range. Torque limits are the range
+    that is needed over the joint box and a tenth more, at most the arm's effort limits; joint 7 gets none.
 
     Raises:
         ModelError: not the model of an MTM, options of the wrong length, or an error above `options.tolerance`.

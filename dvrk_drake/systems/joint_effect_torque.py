@@ -15,7 +15,7 @@ from dvrk_drake.models.arm import Arm
 
 
 class JointEffectTorque(LeafSystem):
-    """Plays the effects of position that identification looks for: the same formulas, so that what is put in can be found.
+    """Plays the effects of position that identification looks for: the same formulas, so what is put in can be found.
 
     .. pydrake_system::
 
@@ -34,7 +34,8 @@ class JointEffectTorque(LeafSystem):
         """Of the `effects` with one coefficient each, in the unit of their kind.
 
         Raises:
-            StationError: an effect that the arm cannot have, or that has to do with velocity; or not one finite coefficient for each effect.
+            StationError: an effect that the arm cannot have or that depends on velocity, or not one finite coefficient
+                for each effect.
         """
         super().__init__()
         coefficients = np.asarray(coefficients, float)
