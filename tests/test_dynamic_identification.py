@@ -64,7 +64,7 @@ def test_cross_validation_promises_no_more_than_the_noise_allows(case):
 
 
 def test_true_base_parameters_and_rotors_lie_in_their_intervals(case):
-    arm, truth, _, result = case
+    _, truth, _, result = case
     mounted = result.model.load_arm()
     B = base_parameter_map(derive_gravity(mounted), DynamicRegressor(mounted))
     beta = B @ truth.parameters[: B.shape[1]]

@@ -232,7 +232,7 @@ def test_model_file_round_trip_and_refusals(arm, tmp_path):
         (text.replace("arm: mtmr", "arm: psm9"), 'unknown arm "psm9"'),
         (
             text.replace("kind: cable sine", "kind: viscous"),
-            'effects[0]: kind is "viscous"; allowed: offset, spring, cable sine',
+            'kind is "viscous"; allowed: offset, spring, cable sine, cable cosine',
         ),
         (text.replace("model 2", "model 1"), 'model 1", this version reads "dvrk_drake identified model 2"'),
         (text.replace("trust: 1.0", "trust: 2.0"), "trust between 0 and 1"),
