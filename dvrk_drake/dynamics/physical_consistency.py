@@ -88,11 +88,12 @@ def consistent_parameters(
     for name in ("tol_gap_abs", "tol_gap_rel", "tol_feas"):
         options.SetOption(ClarabelSolver.id(), name, _TOLERANCE)
     result = ClarabelSolver().Solve(program, None, options)
-    if not result.is_success():
-        status = result.get_solver_details().status
+    details = result.get_solver_details()
+    # Drake counts what Clarabel calls AlmostSolved, at a reduced accuracy, as a success.
+    if not result.is_success() or details.status != "Solved":
         raise IdentificationError(
-            f"the program for physically consistent parameters did not converge: Clarabel says {status}, after "
-            f"{result.get_solver_details().iterations} iterations; are efforts and positions this arm's?"
+            f"the program for physically consistent parameters did not converge: Clarabel says {details.status} after "
+            f"{details.iterations} iterations; are efforts and positions this arm's?"
         )
     x = np.asarray(result.GetSolution(y), dtype=float) * scale
     # Interior-point solutions keep their inequalities to the tolerance; these are kept exactly.
