@@ -109,13 +109,12 @@ def test_no_effect_runs_away_outside_of_what_was_recorded():
 def test_coordinates_that_move_alike_are_asked_for_once(name):
     arm = load_arm(name)
     rows = {c: joint_row(arm, c) for c in effect_coordinates(arm)}
-    for first in ("joint", "actuator"):
-        kept = distinct_coordinates(arm, first)
-        assert {f"{first}.{joint}" for joint in arm.joint_names} <= set(kept)
-        unit = np.array([rows[c] / np.linalg.norm(rows[c]) for c in kept])
-        assert np.abs(unit @ unit.T - np.eye(len(kept))).max() < 1 - 1e-6
-        for c, row in rows.items():
-            assert np.abs(unit @ row / np.linalg.norm(row)).max() > 1 - 1e-9, f"{c} is lost"
+    kept = distinct_coordinates(arm)
+    assert {f"actuator.{joint}" for joint in arm.joint_names} <= set(kept)
+    unit = np.array([rows[c] / np.linalg.norm(rows[c]) for c in kept])
+    assert np.abs(unit @ unit.T - np.eye(len(kept))).max() < 1 - 1e-6
+    for c, row in rows.items():
+        assert np.abs(unit @ row / np.linalg.norm(row)).max() > 1 - 1e-9, f"{c} is lost"
     assert [c for c in rows if slides(arm, c)] == [f"{kind}.insertion" for kind in ("actuator", "joint")] * (
         name == "psm"
     )

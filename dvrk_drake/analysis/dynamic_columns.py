@@ -128,7 +128,7 @@ def _filtered(grid: MotionGrid, Y: NDArray[np.float64]) -> NDArray[np.float64]:
 def _coordinates(arm: Arm, grid: MotionGrid) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
     """(name, x, v) of every coordinate of the drive."""
     rows, a_dot = effect_coordinates(arm), arm.transmission.velocity(grid.v)
-    names = distinct_coordinates(arm, "actuator")
+    names = distinct_coordinates(arm)
     return [(name, position_along(arm, name, grid.q), a_dot @ rows[name]) for name in names]
 
 

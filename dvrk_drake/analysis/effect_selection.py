@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.linear_fit import RobustFit, robust_fit
 from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
-    distinct_coordinates,
     joint_row,
     position_along,
     slides,
@@ -24,15 +23,16 @@ BASE_PRIOR = 0.25
 #: Prior standard deviation of an effect, as a share of the effort that the limits of the joints allow along its
 #: coordinate. Offsets are kept small: over a narrow range a large one would take the place of gravity, and mislead
 #: outside of it.
-EFFECT_PRIOR = {"offset": 0.03, "cable sine": 0.3}
+EFFECT_PRIOR = {"offset": 0.03, "cable sine": 0.3, "cable cosine": 0.3}
 #: Least standard deviation of a torque measurement, as a share of the effort limit.
 SIGMA_FLOOR = 2e-3
 #: An effect must lower the sum of squared left-out residuals (in sigma) by this much a coefficient: about log(poses).
 LEAST_GAIN = 4.0
 #: And by this many of its own standard errors over poses.
 LEAST_SIGNIFICANCE = 1.5
-#: A position-dependent effect is considered if its coordinate moved by this much [rad]; else it would fit servo error.
-LEAST_SPAN = 0.25
+#: A cable is considered if its joint moved by this much [rad]: less, and a sine would fit servo error, a cosine be an
+#: offset.
+LEAST_SPAN = {"cable sine": 0.25, "cable cosine": 1.5}
 
 
 class StaticProblem:
@@ -72,18 +72,21 @@ class StaticProblem:
 
 
 def candidate_effects(problem: StaticProblem) -> list[list[ActuatorEffect]]:
-    """What may act along each coordinate of the drive that the poses say something of."""
+    """What may act at each joint that the poses say something of.
+
+    Coordinates of the transmission gain nothing here: they predict other recordings of the MTM a little worse.
+    """
     arm, groups = problem.arm, []
-    for name in distinct_coordinates(arm, "joint"):
+    for name in (f"joint.{joint}" for joint in arm.joint_names):
         effects = [ActuatorEffect(name, "offset")]
-        if not slides(arm, name) and np.ptp(position_along(arm, name, problem.q)) >= LEAST_SPAN:
-            effects.append(ActuatorEffect(name, "cable sine", 1.0))
+        span = 0.0 if slides(arm, name) else np.ptp(position_along(arm, name, problem.q))
+        effects += [ActuatorEffect(name, kind, 1.0) for kind, least in LEAST_SPAN.items() if span >= least]
         groups.append([e for e in effects if not _is_gravity_too(problem.base_model, e)])
     return groups
 
 
 def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
-    """Adds the effect (or all along one coordinate) that lowers the leave-one-out error most, until none clearly does.
+    """Adds the effect (or all of one joint's) that lowers the leave-one-out error most, until none clearly does.
 
     "Clearly": by more than `LEAST_GAIN` per coefficient and by more than 1.5 of the gain's own standard errors over
     poses. Squared errors are capped at nine variances so that no single pose decides.

@@ -166,16 +166,11 @@ def effect_coordinates(arm: Arm) -> dict[str, NDArray[np.float64]]:
     return rows
 
 
-def distinct_coordinates(arm: Arm, first: str) -> list[str]:
-    """The coordinates that move each in its own way; of those that move alike the ones called `first`.* come first.
-
-    Args:
-        arm: whose drive it is.
-        first: "actuator" or "joint".
-    """
+def distinct_coordinates(arm: Arm) -> list[str]:
+    """The coordinates that move each in its own way: the first of those that move alike, so all actuators."""
     rows = effect_coordinates(arm)
     kept: list[str] = []
-    for name in sorted(rows, key=lambda name: not name.startswith(f"{first}.")):
+    for name in rows:
         h = rows[name] / np.linalg.norm(rows[name])
         if not any(abs(h @ rows[k]) > (1 - 1e-9) * np.linalg.norm(rows[k]) for k in kept):
             kept.append(name)
