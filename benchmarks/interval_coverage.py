@@ -13,12 +13,15 @@ import sys
 import numpy as np
 
 from dvrk_drake.analysis.static_identification import identify_static
-from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import Recording
 
-TRUE_EFFECTS = {("wrist_platform", "spring"): 0.05, ("wrist_pitch", "spring"): -0.05}
+TRUE_EFFECTS = {
+    ActuatorEffect("joint.wrist_platform", "cable sine", 1.0): 0.05,
+    ActuatorEffect("joint.wrist_pitch", "cable sine", 1.0): -0.05,
+}
 
 
 def main() -> int:
@@ -28,7 +31,7 @@ def main() -> int:
     parser.add_argument("--noise", type=float, default=0.02)
     options = parser.parse_args()
     arm = load_arm("mtmr")
-    truth = compile_static_model(arm, tuple(JointEffect(*key) for key in TRUE_EFFECTS))
+    truth = compile_static_model(arm, tuple(TRUE_EFFECTS))
     beta = truth.gravity.base_values
     base, effects, spurious = [], [], 0
     for seed in range(options.recordings):
@@ -39,8 +42,8 @@ def main() -> int:
         model = identify_static(Recording(q=q, tau=tau, source=f"seed {seed}"), arm).model
         for estimate, value in zip(model.base_parameters, beta, strict=True):
             base.append(abs(estimate.value - value) < 1.96 * estimate.standard_error)
-        for e in model.joint_effects:
-            value = TRUE_EFFECTS.get((e.joint, e.kind))
+        for e in model.effects:
+            value = TRUE_EFFECTS.get(e.effect)
             spurious += value is None
             effects.append(abs(e.value - (value or 0.0)) < 1.96 * e.standard_error)
     print(f"{options.recordings} recordings of {options.poses} poses, noise {options.noise:g} of the effort limit")

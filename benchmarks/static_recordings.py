@@ -75,7 +75,7 @@ def main() -> int:
             table.add_row("", "paper", *(f"{j.rms_error_undoubted:.4f}" for j in by_paper))
             table.add_row("", "ours", *(f"{j.rms_error_undoubted:.4f}" for j in by_ours))
         console.print(table)
-        effects = ", ".join(f"{e.joint} {e.kind} {e.value:+.3f}" for e in ours.model.joint_effects)
+        effects = ", ".join(f"{e.effect} {e.value:+.3f}" for e in ours.model.effects)
         trusts = ", ".join(f"{j.name} {j.trust:.2f}" for j in ours.model.joints if j.trust < 1)
         console.print(f"effects chosen: {effects or 'none'}; trust below 1: {trusts or 'none'}\n")
     return 0

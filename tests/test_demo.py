@@ -6,8 +6,8 @@ import pytest
 from dvrk_drake.analysis import demo
 from dvrk_drake.analysis.collection import visiting_trajectory
 from dvrk_drake.analysis.true_arm import make_true_arm
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.models.recording import read_recording
@@ -56,9 +56,9 @@ def test_demo_beats_zero_torque_and_the_paper_on_fresh_poses(result):
 
 def test_demo_finds_the_springs_that_it_put_in(result):
     _, outcome, _ = result
-    found = {(e.joint, e.kind): e.value for e in outcome.identification.model.joint_effects}
-    assert found["wrist_platform", "spring"] == pytest.approx(0.05, abs=0.01)
-    assert found["wrist_pitch", "spring"] == pytest.approx(-0.03, abs=0.003)
+    found = {(e.coordinate, e.kind): e.value for e in outcome.identification.model.effects}
+    assert found["joint.wrist_platform", "cable sine"] == pytest.approx(0.05, abs=0.01)
+    assert found["joint.wrist_pitch", "cable sine"] == pytest.approx(-0.03, abs=0.003)
 
 
 def test_demo_drifts_less_than_with_the_nominal_model_and_comes_to_rest(result):
@@ -91,12 +91,11 @@ def test_trajectory_rests_at_each_pose_and_stays_inside_the_limits():
 
 def test_joint_effect_torque_is_minus_what_identification_calls_the_effect():
     arm = load_arm("mtml")
-    system = JointEffectTorque(
-        arm, [JointEffect("wrist_pitch", "spring"), JointEffect("outer_yaw", "offset")], [0.2, 0.1]
-    )
+    effects = [ActuatorEffect("joint.wrist_pitch", "cable sine", 1.0), ActuatorEffect("actuator.elbow_pitch", "offset")]
+    system = JointEffectTorque(arm, effects, [0.2, 0.1])
     context = system.CreateDefaultContext()
     q = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
     system.get_input_port().FixValue(context, np.concatenate([q, np.ones(7)]))
     np.testing.assert_allclose(
-        system.get_output_port().Eval(context), [-0.1, 0, 0, 0, -0.2 * np.sin(0.5), 0, 0], atol=1e-16
+        system.get_output_port().Eval(context), [0, -0.1, -0.1, 0, -0.2 * np.sin(0.5), 0, 0], atol=1e-16
     )

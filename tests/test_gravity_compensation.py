@@ -19,7 +19,7 @@ from dvrk_drake.dynamics.gravity_compensation import (
     dry_friction,
     unclipped_torque,
 )
-from dvrk_drake.dynamics.identified_model import EffectEstimate, IdentifiedModel
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
@@ -102,10 +102,12 @@ def balanced(name="mtml"):
 @pytest.mark.parametrize("name", ["mtml", "mtmr"])
 def test_the_controller_computes_the_models_torque_from_the_file(name, tmp_path):
     model = balanced(name)
-    model.joint_effects = [
-        EffectEstimate("outer_yaw", "offset", 0.03),
-        EffectEstimate("shoulder_pitch", "spring", -0.1),
-        EffectEstimate("wrist_pitch", "offset", -0.01),
+    model.effects = [
+        ActuatorEffectEstimate("joint.outer_yaw", "offset", 0.0, 0.03),
+        ActuatorEffectEstimate("joint.shoulder_pitch", "cable sine", 1.0, -0.1),
+        ActuatorEffectEstimate("joint.shoulder_pitch", "cable cosine", 1.0, 0.04),
+        ActuatorEffectEstimate("actuator.wrist_platform", "offset", 0.0, -0.01),
+        ActuatorEffectEstimate("joint.wrist_pitch", "spring", 4.0, 0.02),
     ]
     arm = model.load_arm()
     path = tmp_path / "gc.json"
@@ -186,7 +188,7 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
     # The line names a tolerance that is enough.
     compensation_from_model(eccentric, CompensationOptions(tolerance=0.0025))
     spring = balanced()
-    spring.joint_effects = [EffectEstimate("wrist_pitch", "spring", 0.05)]
+    spring.effects = [ActuatorEffectEstimate("joint.wrist_pitch", "cable sine", 1.0, 0.05)]
     with pytest.raises(ModelError, match="wrist_pitch"):
         compensation_from_model(spring)
     # A quartic over +-2.44 rad misses 0.05 sin(q) by a few hundredths of it, not more.

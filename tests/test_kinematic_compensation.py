@@ -7,7 +7,8 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.identified_model import EffectEstimate, IdentifiedModel
+from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematic_compensation import kinematic_compensation
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import load_arm
@@ -85,7 +86,7 @@ def test_the_chain_is_the_arm(tmp_path):
 
 def test_what_the_file_cannot_hold_is_refused():
     model = other_psm()
-    model.joint_effects = [EffectEstimate("pitch", "offset", 0.1)]
+    model.effects = [ActuatorEffectEstimate("joint.pitch", "offset", 0.0, 0.1)]
     with pytest.raises(ModelError, match=r"off by up to pitch 0\.1 .*no joint effects"):
         kinematic_compensation(model)
     heavy = other_psm()

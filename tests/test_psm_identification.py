@@ -9,8 +9,9 @@ from dvrk_drake.analysis.collection import collect_static_poses
 from dvrk_drake.analysis.static_identification import identify_static
 from dvrk_drake.analysis.true_arm import make_true_arm
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.identified_model import EffectEstimate, IdentifiedModel
-from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
+from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
@@ -26,7 +27,7 @@ def arm():
 
 @pytest.fixture(scope="module")
 def true_arm(arm):
-    effects = (JointEffect("yaw", "offset"), JointEffect("roll", "spring"))
+    effects = (ActuatorEffect("joint.yaw", "offset"), ActuatorEffect("joint.roll", "cable sine", 1.0))
     return make_true_arm(arm, np.random.default_rng(5), effects, (0.05, 0.03), closure="ball")
 
 
@@ -67,9 +68,10 @@ def test_the_true_torque_is_found_through_the_closed_linkage(arm, true_arm, reco
     truth = true_torque(arm, true_arm, fresh)
     error = np.sqrt(np.mean((model.holding_torque(fresh) - truth) ** 2, axis=0))
     assert np.all(error < np.maximum(0.03 * np.sqrt(np.mean(truth**2, axis=0)), 1e-3 * arm.effort_limits))
-    assert {(e.joint, e.kind) for e in model.joint_effects} >= {("yaw", "offset"), ("roll", "spring")}
+    found = {str(e.effect) for e in model.effects}
+    assert found >= {"joint.yaw offset", "joint.roll cable sine 1"}
     # At a yaw joint a spring and lifted weight are the same torque; only one of them may be asked for.
-    assert ("yaw", "spring") not in {(e.joint, e.kind) for e in model.joint_effects}
+    assert "joint.yaw cable sine 1" not in found
 
 
 def test_the_verbs_take_a_psm(arm, recording, tmp_path, capsys):
@@ -121,6 +123,6 @@ def test_an_instrument_that_does_not_exist_is_refused_in_one_line(tmp_path, caps
 
 def test_a_joint_that_slides_has_no_spring_in_an_angle(arm):
     model = IdentifiedModel.from_arm(arm)
-    model.joint_effects = [EffectEstimate("insertion", "spring", 1.0)]
-    with pytest.raises(ModelError, match="insertion cannot have a joint effect spring; kinds: offset"):
+    model.effects = [ActuatorEffectEstimate("joint.insertion", "cable sine", 1.0, 1.0)]
+    with pytest.raises(ModelError, match=r"effects\[0\]: kind cable sine is of an angle, and joint.insertion slides"):
         model.check()

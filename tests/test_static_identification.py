@@ -10,8 +10,8 @@ from dvrk_drake.analysis.doubts import find_doubts
 from dvrk_drake.analysis.linear_fit import robust_fit, weighted_fit
 from dvrk_drake.analysis.static_identification import identify_static
 from dvrk_drake.analysis.validation import predict, validate
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import IdentificationError, ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
@@ -46,12 +46,12 @@ def test_least_squares_recovers_exact_parameters(arm):
 
 
 def test_robust_method_recovers_parameters_and_finds_the_effects(arm):
-    effects = (JointEffect("wrist_platform", "spring"), JointEffect("wrist_pitch", "spring"))
+    effects = tuple(ActuatorEffect(f"joint.wrist_{which}", "cable sine", 1.0) for which in ("platform", "pitch"))
     recording, _ = simulated(arm, noise=0.005, effects=effects, coefficients=(0.05, -0.05), seed=4)
     model = identify_static(recording, arm).model
-    found = {(e.joint, e.kind): e.value for e in model.joint_effects}
-    assert found["wrist_platform", "spring"] == pytest.approx(0.05, abs=0.004)
-    assert found["wrist_pitch", "spring"] == pytest.approx(-0.05, abs=0.002)
+    found = {e.effect: e.value for e in model.effects}
+    assert found[effects[0]] == pytest.approx(0.05, abs=0.004)
+    assert found[effects[1]] == pytest.approx(-0.05, abs=0.002)
     fresh, _ = simulated(arm, poses=200, seed=9, effects=effects, coefficients=(0.05, -0.05))
     errors = validate(model, fresh).joints
     for error, limit in zip(errors[1:6], arm.effort_limits[1:6], strict=True):
@@ -220,7 +220,8 @@ def test_moving_recording_is_refused(arm):
 
 
 def test_model_file_round_trip_and_refusals(arm, tmp_path):
-    recording, _ = simulated(arm, noise=0.002, effects=(JointEffect("wrist_pitch", "spring"),), coefficients=(-0.05,))
+    spring = ActuatorEffect("joint.wrist_pitch", "cable sine", 1.0)
+    recording, _ = simulated(arm, noise=0.002, effects=(spring,), coefficients=(-0.05,))
     model = identify_static(recording, arm).model
     model.save(tmp_path / "m.yaml")
     again = IdentifiedModel.load(tmp_path / "m.yaml")
@@ -230,9 +231,10 @@ def test_model_file_round_trip_and_refusals(arm, tmp_path):
     for bad, message in (
         (text.replace("arm: mtmr", "arm: psm9"), 'unknown arm "psm9"'),
         (
-            text.replace("kind: spring", "kind: sprung"),
-            "wrist_pitch cannot have a joint effect sprung; kinds: offset, spring",
+            text.replace("kind: cable sine", "kind: viscous"),
+            'kind is "viscous"; allowed: offset, spring, cable sine, cable cosine',
         ),
+        (text.replace("model 2", "model 1"), 'model 1", this version reads "dvrk_drake identified model 2"'),
         (text.replace("trust: 1.0", "trust: 2.0"), "trust between 0 and 1"),
         (text.replace("arm: mtmr", "arms: mtmr"), "not a model file"),
         ("]", "not a model file"),

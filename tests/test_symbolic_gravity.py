@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import sympy
 
-from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, derive_gravity
 from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
@@ -233,7 +233,7 @@ def test_base_set_is_complete_when_masses_change(any_arm, random_q):
 
 
 def test_joint_effects_add_their_own_torque(arm):
-    effects = (JointEffect("wrist_platform", "spring"), JointEffect("outer_yaw", "offset"))
+    effects = (ActuatorEffect("joint.wrist_platform", "cable sine", 1.0), ActuatorEffect("joint.outer_yaw", "offset"))
     plain, model = compile_static_model(arm), compile_static_model(arm, effects)
     q = np.random.default_rng(0).normal(size=(5, 7))
     beta = plain.gravity.base_values

@@ -18,8 +18,8 @@ from dvrk_drake.analysis.plots import plot_identification, plot_positions, plot_
 from dvrk_drake.analysis.static_identification import StaticIdentification, identify_static
 from dvrk_drake.analysis.true_arm import TrueArm, make_true_arm
 from dvrk_drake.analysis.validation import Validation, validate
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.atomic_file import atomic_write
@@ -52,7 +52,7 @@ class DemoPlan:
         closure: how the loops of the true arm's linkage are held, see `add_arm`.
     """
 
-    effects: tuple[JointEffect, ...]
+    effects: tuple[ActuatorEffect, ...]
     coefficients: tuple[float, ...]
     release: tuple[float, ...]
     step: tuple[float, ...]
@@ -63,9 +63,9 @@ class DemoPlan:
 
 MTM_PLAN = DemoPlan(
     effects=(
-        JointEffect("wrist_platform", "offset"),
-        JointEffect("wrist_platform", "spring"),
-        JointEffect("wrist_pitch", "spring"),
+        ActuatorEffect("joint.wrist_platform", "offset"),
+        ActuatorEffect("joint.wrist_platform", "cable sine", 1.0),
+        ActuatorEffect("joint.wrist_pitch", "cable sine", 1.0),
     ),
     coefficients=(0.02, 0.05, -0.03),
     release=(0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5),
@@ -78,7 +78,11 @@ PLANS = {
     "mtml": MTM_PLAN,
     "mtmr": MTM_PLAN,
     "psm": DemoPlan(
-        effects=(JointEffect("yaw", "offset"), JointEffect("roll", "spring"), JointEffect("wrist_pitch", "offset")),
+        effects=(
+            ActuatorEffect("joint.yaw", "offset"),
+            ActuatorEffect("joint.roll", "cable sine", 1.0),
+            ActuatorEffect("joint.wrist_pitch", "offset"),
+        ),
         coefficients=(0.05, 0.03, 0.01),
         release=(0.4, 0.3, 0.15, 0.6, 0.5, -0.3, 0.5),
         step=(0.5, -0.4, 0.2, -0.8, 0.6, 0.4, 0.8),

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.motion_grid import MotionGrid
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates, slides
+from dvrk_drake.dynamics.actuator_effects import (
+    ActuatorEffect,
+    distinct_coordinates,
+    effect_coordinates,
+    position_along,
+    slides,
+)
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.arm import Arm
 
@@ -62,11 +68,12 @@ def friction_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
 def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
     """What some drives have beside friction: springs, cables, friction that differs by direction."""
     effects = []
-    for name, _, v in _coordinates(arm, grid):
+    for name, x, v in _coordinates(arm, grid):
         if v.std() == 0:
             continue
         width = _rounded(0.1 * v.std())
-        effects += [ActuatorEffect(name, "coulomb forward", width), ActuatorEffect(name, "spring")]
+        travel = _rounded(np.abs(x).max() * 1.01)
+        effects += [ActuatorEffect(name, "coulomb forward", width), ActuatorEffect(name, "spring", travel)]
         if not slides(arm, name):
             effects += [
                 ActuatorEffect(name, kind, float(periods))
@@ -120,8 +127,9 @@ def _filtered(grid: MotionGrid, Y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _coordinates(arm: Arm, grid: MotionGrid) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
     """(name, x, v) of every coordinate of the drive."""
-    a, a_dot = arm.transmission.position(grid.q), arm.transmission.velocity(grid.v)
-    return [(name, a @ h, a_dot @ h) for name, h in effect_coordinates(arm).items()]
+    rows, a_dot = effect_coordinates(arm), arm.transmission.velocity(grid.v)
+    names = distinct_coordinates(arm)
+    return [(name, position_along(arm, name, grid.q), a_dot @ rows[name]) for name in names]
 
 
 def _rounded(x: float) -> float:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic_columns import dynamic_columns, friction_effects, optional_effects
 from dvrk_drake.analysis.dynamic_problem import ConsistentFit, DynamicProblem
-from dvrk_drake.analysis.dynamic_statics import static_part
+from dvrk_drake.analysis.dynamic_statics import base_parameter_estimates
 from dvrk_drake.analysis.motion_grid import MotionGrid, default_settings, motion_grid
 from dvrk_drake.analysis.phase_folds import period_of, phase_folds
 from dvrk_drake.analysis.repetition import repeatability_floor
@@ -37,7 +37,7 @@ class DynamicIdentification:
     """A model with what a report of it needs.
 
     Attributes:
-        model: with `dynamics`; its base parameters and joint effects are those of the links and the drive at rest.
+        model: with `dynamics`; its base parameters are those of the links there.
         grid: the motion.
         period: after which the motion repeats [s], or None.
         measured, predicted: (r, n) efforts of the actuators behind the filter, ends left out [N m, N].
@@ -178,14 +178,16 @@ def _section(
     ]
     gravity = problem.regressor.arm.gravity + np.append(problem.tilt, 0.0)
     gravity *= np.linalg.norm(problem.regressor.arm.gravity) / np.linalg.norm(gravity)
-    return DynamicSection([float(g) for g in gravity], links, rotors, effects, actuators, grid.settings)
+    expected = [float(g) for g in arm.gravity]
+    return DynamicSection([float(g) for g in gravity], links, rotors, effects, actuators, grid.settings, expected)
 
 
 def _model(
     recording: Recording, arm: Arm, section: DynamicSection, problem: DynamicProblem, fit: ConsistentFit
 ) -> IdentifiedModel:
     in_joints = recording.in_joint_coordinates(arm)
-    base_parameters, joint_effects = static_part(arm, section, problem.regressor, fit.covariance, in_joints.q)
+    as_mounted = arm.with_gravity(section.gravity)
+    base_parameters = base_parameter_estimates(as_mounted, section, DynamicRegressor(as_mounted), fit.covariance)
     joints = []
     for j, name in enumerate(arm.joint_names):
         lower, upper = float(in_joints.q[:, j].min()), float(in_joints.q[:, j].max())
@@ -193,9 +195,8 @@ def _model(
         joints.append(JointStatistics(name=name, position_lower=lower, position_upper=upper, coverage=coverage))
     return IdentifiedModel(
         arm=arm.source,
-        gravity=[float(g) for g in arm.gravity],
+        gravity=section.gravity,
         base_parameters=base_parameters,
-        joint_effects=joint_effects,
         joints=joints,
         provenance=Provenance(
             recording=recording.source,

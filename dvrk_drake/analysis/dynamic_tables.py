@@ -22,11 +22,11 @@ def print_dynamics(console: Console, model: IdentifiedModel) -> None:
         table.add_row(link.link, f"{m:.4f}", com, f"{link.least_eigenvalue:.1e}")
     console.print(table)
     _print_drive(console, section)
-    tilt = np.degrees(_angle(np.array(section.gravity), np.array(model.gravity)))
+    tilt = np.degrees(_angle(np.array(section.gravity), np.array(section.gravity_expected)))
     if tilt > 0.1:
         console.print(
             f"gravity in the base frame: {', '.join(f'{x:.3f}' for x in section.gravity)} m/s^2, {tilt:.1f} deg from "
-            "what the arm's file says: the base leans, or was not levelled\n",
+            "what was expected: the base leans, or was not levelled\n",
             soft_wrap=True,
         )
     title = f"Efforts of the actuators behind {section.signals.effort_cut_off:g} Hz [N m; N]"

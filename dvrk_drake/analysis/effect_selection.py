@@ -6,31 +6,37 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-import sympy
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.linear_fit import RobustFit, robust_fit
-from dvrk_drake.dynamics.joint_effects import EFFECT_KINDS, JointEffect, kinds_of
+from dvrk_drake.dynamics.actuator_effects import (
+    ActuatorEffect,
+    joint_row,
+    position_along,
+    slides,
+)
 from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
 from dvrk_drake.models.arm import Arm
 
 #: Prior standard deviation of a base parameter, as a share of what would use up some joint's effort limit by itself.
 BASE_PRIOR = 0.25
-#: Prior standard deviation of a joint effect, as a share of the joint's effort limit. Offsets are kept small: over a
-#: narrow range a large one would take the place of gravity, and mislead outside of it.
-EFFECT_PRIOR = {"offset": 0.03, "spring": 0.3}
+#: Prior standard deviation of an effect, as a share of the effort that the limits of the joints allow along its
+#: coordinate. Offsets are kept small: over a narrow range a large one would take the place of gravity, and mislead
+#: outside of it.
+EFFECT_PRIOR = {"offset": 0.03, "cable sine": 0.3, "cable cosine": 0.3}
 #: Least standard deviation of a torque measurement, as a share of the effort limit.
 SIGMA_FLOOR = 2e-3
 #: An effect must lower the sum of squared left-out residuals (in sigma) by this much a coefficient: about log(poses).
 LEAST_GAIN = 4.0
 #: And by this many of its own standard errors over poses.
 LEAST_SIGNIFICANCE = 1.5
-#: A position-dependent effect is considered if the joint moved by this much [rad]; else it would fit servo error.
-LEAST_SPAN = 0.25
+#: A cable is considered if its joint moved by this much [rad]: less, and a sine would fit servo error, a cosine be an
+#: offset.
+LEAST_SPAN = {"cable sine": 0.25, "cable cosine": 1.5}
 
 
 class StaticProblem:
-    """The regression of one recording's torques on base parameters and any choice of joint effects."""
+    """The regression of one recording's torques on base parameters and any choice of effects."""
 
     def __init__(self, arm: Arm, q: NDArray[np.float64], tau: NDArray[np.float64], usable: NDArray[np.bool_]):
         """Of poses q (m, n) and torques tau (m, n) with `usable` (m, n) False where a measurement is doubted."""
@@ -43,49 +49,58 @@ class StaticProblem:
         """The problem of some of the poses."""
         return StaticProblem(self.arm, self.q[rows], self.tau[rows], self.usable[rows])
 
-    def regressor(self, effects: Sequence[JointEffect]) -> NDArray[np.float64]:
+    def regressor(self, effects: Sequence[ActuatorEffect]) -> NDArray[np.float64]:
         """X (m, n, b + e)."""
         X = np.zeros((*self.tau.shape, self._Y.shape[2] + len(effects)))
         X[..., : self._Y.shape[2]] = self._Y
         for column, effect in enumerate(effects, start=self._Y.shape[2]):
-            joint = self.arm.joint_names.index(effect.joint)
-            X[:, joint, column] = _numeric(effect.kind)(self.q[:, joint])
+            X[..., column] = effect_column(self.arm, effect, self.q)
         return X
 
-    def prior_precision(self, effects: Sequence[JointEffect]) -> NDArray[np.float64]:
+    def prior_precision(self, effects: Sequence[ActuatorEffect]) -> NDArray[np.float64]:
         """(b + e,) inverse prior variances about zero."""
-        limit = dict(zip(self.arm.joint_names, self.arm.effort_limits, strict=True))
-        effect_sd = [EFFECT_PRIOR[effect.kind] * limit[effect.joint] for effect in effects]
+        effect_sd = [EFFECT_PRIOR[effect.kind] * _effort_limit(self.arm, effect.coordinate) for effect in effects]
         sd = np.concatenate([BASE_PRIOR * _largest_base_parameters(self.base_model), effect_sd])
         return 1 / sd**2
 
     def fit(
-        self, effects: Sequence[JointEffect], iterations: int = 12, start: NDArray[np.float64] | None = None
+        self, effects: Sequence[ActuatorEffect], iterations: int = 12, start: NDArray[np.float64] | None = None
     ) -> RobustFit:
         """Robust, shrunk fit with the given effects; `start` (n,) as in `robust_fit`."""
         X, prior = self.regressor(effects), self.prior_precision(effects)
         return robust_fit(X, self.tau, self.usable, prior, self.sigma_floor, iterations, start)
 
 
-def select_effects(problem: StaticProblem) -> tuple[JointEffect, ...]:
+def candidate_effects(problem: StaticProblem) -> list[list[ActuatorEffect]]:
+    """What may act at each joint that the poses say something of.
+
+    Coordinates of the transmission gain nothing here: they predict other recordings of the MTM a little worse.
+    """
+    arm, groups = problem.arm, []
+    for name in (f"joint.{joint}" for joint in arm.joint_names):
+        effects = [ActuatorEffect(name, "offset")]
+        span = 0.0 if slides(arm, name) else np.ptp(position_along(arm, name, problem.q))
+        effects += [ActuatorEffect(name, kind, 1.0) for kind, least in LEAST_SPAN.items() if span >= least]
+        groups.append([e for e in effects if not _is_gravity_too(problem.base_model, e)])
+    return groups
+
+
+def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
     """Adds the effect (or all of one joint's) that lowers the leave-one-out error most, until none clearly does.
 
     "Clearly": by more than `LEAST_GAIN` per coefficient and by more than 1.5 of the gain's own standard errors over
     poses. Squared errors are capped at nine variances so that no single pose decides.
     """
-    chosen: tuple[JointEffect, ...] = ()
+    chosen: tuple[ActuatorEffect, ...] = ()
     current = problem.fit(chosen)
-    span = np.ptp(problem.q, axis=0)
+    groups = candidate_effects(problem)
     while True:
         loss = _loss(problem, current, current.sigma)
         best_gain = 0.0
-        best: tuple[JointEffect, ...] = ()
-        for joint, name in enumerate(problem.arm.joint_names):
-            possible = kinds_of(bool(problem.arm.prismatic[joint]))
-            kinds = [k for k in possible if k == "offset" or span[joint] >= LEAST_SPAN]
-            possible_effects = (JointEffect(name, k) for k in kinds)
-            new = [e for e in possible_effects if e not in chosen and not _is_gravity_too(problem.base_model, e)]
-            candidates: list[tuple[JointEffect, ...]] = [(e,) for e in new] + ([tuple(new)] if len(new) > 1 else [])
+        best: tuple[ActuatorEffect, ...] = ()
+        for group in groups:
+            new = [e for e in group if e not in chosen]
+            candidates: list[tuple[ActuatorEffect, ...]] = [(e,) for e in new] + ([tuple(new)] if len(new) > 1 else [])
             for candidate in candidates:
                 trial = problem.fit((*chosen, *candidate), iterations=3, start=current.sigma)
                 gains = loss - _loss(problem, trial, current.sigma)
@@ -96,8 +111,7 @@ def select_effects(problem: StaticProblem) -> tuple[JointEffect, ...]:
                 if clear and gain > best_gain:
                     best_gain, best = gain, candidate
         if not best:
-            order = {name: i for i, name in enumerate(problem.arm.joint_names)}
-            return tuple(sorted(chosen, key=lambda e: (order[e.joint], e.kind)))
+            return tuple(effect for group in groups for effect in group if effect in chosen)
         chosen = (*chosen, *best)
         current = problem.fit(chosen)
 
@@ -118,20 +132,23 @@ def _largest_base_parameters(model: StaticModel) -> NDArray[np.float64]:
 
 
 @cache
-def _is_gravity_too(model: StaticModel, effect: JointEffect) -> bool:
+def _is_gravity_too(model: StaticModel, effect: ActuatorEffect) -> bool:
     """Whether no measurement could tell the effect from gravity, as a spring at a yaw joint that lifts weight."""
     arm = model.gravity.arm
     poses = arm.sample_poses(100, np.random.default_rng(0))
     Y = model.regressor(poses).reshape(-1, len(model.gravity.base.names))
-    joint = arm.joint_names.index(effect.joint)
-    column = np.zeros((len(poses), arm.num_joints))
-    column[:, joint] = _numeric(effect.kind)(poses[:, joint])
+    column = effect_column(arm, effect, poses)
     rest = column.ravel() - Y @ np.linalg.lstsq(Y, column.ravel(), rcond=None)[0]
     return bool(np.linalg.norm(rest) < 1e-9 * np.linalg.norm(column))
 
 
-@cache
-def _numeric(kind: str):
-    q = sympy.Symbol("q")
-    function = sympy.lambdify(q, EFFECT_KINDS[kind](q), modules="numpy")
-    return lambda values: np.broadcast_to(function(values), values.shape)
+def effect_column(arm: Arm, effect: ActuatorEffect, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(m, n) torque of an effect of position on the joints at poses q (m, n), per unit of its coefficient."""
+    x = position_along(arm, effect.coordinate, q)
+    return effect.column(x, 0 * x)[:, None] * joint_row(arm, effect.coordinate)
+
+
+def _effort_limit(arm: Arm, coordinate: str) -> float:
+    """Largest effort along the coordinate that no joint's limit is below."""
+    row = np.abs(joint_row(arm, coordinate))
+    return float(np.min(arm.effort_limits[row > 1e-9] / row[row > 1e-9]))

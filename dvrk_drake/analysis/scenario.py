@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
+from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.joint_effects import kinds_of
 from dvrk_drake.errors import ScenarioError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
@@ -48,11 +48,17 @@ class Target:
 
 @dataclass
 class TrueEffect:
-    """A joint effect of the simulated arm, see dvrk_drake.dynamics.joint_effects; coefficient in N m, or N."""
+    """An effect in the simulated arm's drive, see dvrk_drake.dynamics.actuator_effects; coefficient in its unit."""
 
-    joint: str = ""
+    coordinate: str = ""
     kind: str = ""
+    scale: float = 0.0
     coefficient: float = 0.0
+
+    @property
+    def effect(self) -> ActuatorEffect:
+        """What it is the coefficient of."""
+        return ActuatorEffect(self.coordinate, self.kind, self.scale)
 
 
 @dataclass
@@ -69,7 +75,7 @@ class Scenario:
         controller: what drives the arm.
         start: pose at the start, at rest; zero, or the nearest pose inside the limits, if left out.
         targets: where the arm shall be when; before, between and after them it is at rest at each. Mode "hold" only.
-        effects: at the joints of the simulated arm; the controller does not know them.
+        effects: in the drive of the simulated arm; the controller does not know them.
         effort_noise: standard deviation of recorded efforts, as a share of the effort limits.
         seed: of the noise.
     """
@@ -138,9 +144,8 @@ class Scenario:
         if self.targets and self.controller.mode != "hold":
             raise ScenarioError(f'targets need controller.mode "hold"; it is "{self.controller.mode}"')
         for i, effect in enumerate(self.effects):
-            _check_choice(f"effects[{i}].joint", effect.joint, arm.joint_names)
-            slides = bool(arm.prismatic[arm.joint_names.index(effect.joint)])
-            _check_choice(f"effects[{i}].kind", effect.kind, kinds_of(slides))
+            if fault := effect_fault(arm, effect.effect, POSITION_KINDS):
+                raise ScenarioError(f"effects[{i}].{fault}")
             _check_number(f"effects[{i}].coefficient", effect.coefficient, -1e3, 1e3)
         if self.model.load_arm().joint_names != arm.joint_names:
             raise ScenarioError(f"controller.model {self.controller.model} is of {self.model.arm}, not of {self.arm}")

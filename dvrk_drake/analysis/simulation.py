@@ -15,7 +15,6 @@ from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.analysis.scenario import Scenario
-from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.models.plant import Closure
 from dvrk_drake.models.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
@@ -110,5 +109,5 @@ def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration
 def _effect_torque(scenario: Scenario) -> JointEffectTorque | None:
     if not scenario.effects:
         return None
-    effects = [JointEffect(effect.joint, effect.kind) for effect in scenario.effects]
+    effects = [effect.effect for effect in scenario.effects]
     return JointEffectTorque(scenario.mounted_arm, effects, [effect.coefficient for effect in scenario.effects])

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.doubts import Doubt, check_effort_unit, find_doubts, outlier_doubts, usable_measurements
 from dvrk_drake.analysis.effect_selection import StaticProblem, select_effects
 from dvrk_drake.analysis.linear_fit import LinearFit, rms, weighted_fit
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
+from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import (
     BaseParameterEstimate,
-    EffectEstimate,
     IdentifiedModel,
     JointStatistics,
     Provenance,
 )
-from dvrk_drake.dynamics.joint_effects import JointEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
@@ -65,7 +65,7 @@ def identify_static(
     """Identifies the static model of `arm` from a recording of poses at rest.
 
     "paper": unweighted least squares on the base parameters, eq. 9-10 of the paper.
-    "robust" (default): each joint weighted by its own spread, measurements on a stop or far off left out, joint effects
+    "robust" (default): each joint weighted by its own spread, measurements on a stop or far off left out, effects
     chosen by leave-one-out, every parameter shrunk toward zero by a prior derived from the effort limits, and a joint's
     torque scaled down where leave-one-out says that the model is no better than zero torque, or where the joint hardly
     moved. Samples of one pose are averaged first: left out one at a time they would vouch for each other.
@@ -96,7 +96,7 @@ def identify_static(
     if measured is None:
         measured = np.ones(tau.shape, dtype=bool)
     usable = usable_measurements(tau.shape, doubts) & measured
-    effects: tuple[JointEffect, ...] = ()
+    effects: tuple[ActuatorEffect, ...] = ()
     trust = np.ones(arm.num_joints)
     validated = np.full_like(tau, np.nan)
     if method == "paper":
@@ -128,8 +128,8 @@ def identify_static(
             BaseParameterEstimate(name, *_estimate(value, error))
             for name, value, error in zip(gravity_model.gravity.base.names, fit.theta, sd, strict=False)
         ],
-        joint_effects=[
-            EffectEstimate(effect.joint, effect.kind, *_estimate(value, error))
+        effects=[
+            ActuatorEffectEstimate(effect.coordinate, effect.kind, effect.scale, float(value), float(error))
             for effect, value, error in zip(effects, fit.theta[Y.shape[2] :], sd[Y.shape[2] :], strict=True)
         ],
         joints=_statistics(recording, arm, fit, validated, measured, usable, trust),

@@ -53,11 +53,11 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
         zero = "" if p.distinguishable else "zero?"
         table.add_row(escape(p.name), f"{p.value:+.5f}", f"{p.standard_error:.5f}", unit, zero)
     console.print(table)
-    if model.joint_effects:
-        table = make_table("Joint effects [N m; N if prismatic]", "", "value", "standard error", "|value| < 2 se")
-        for e in model.joint_effects:
-            name = f"{e.joint} {e.kind}"
-            table.add_row(name, f"{e.value:+.5f}", f"{e.standard_error:.5f}", "" if e.distinguishable else "zero?")
+    if model.effects:
+        table = make_table("Effects [N m; N if prismatic]", "", "value", "standard error", "|value| < 2 se")
+        for e in model.effects:
+            numbers = (f"{e.value:+.5f}", f"{e.standard_error:.5f}", "" if e.distinguishable else "zero?")
+            table.add_row(str(e.effect), *numbers)
         console.print(table)
     rows = [
         (

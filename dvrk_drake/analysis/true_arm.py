@@ -12,7 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context
 
-from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import Closure, add_arm, set_joint_damping
 from dvrk_drake.systems.arm_station import ArmStation
@@ -26,14 +26,14 @@ class TrueArm:
     Attributes:
         arm: its description.
         inertias: link -> true spatial inertia about the link's origin.
-        effects, coefficients: true joint effects [N m; N if prismatic].
+        effects, coefficients: true effects in its drive [N m; N if prismatic].
         damping: (n,) viscous friction of the joints [N m s/rad; N s/m if prismatic].
         closure: how the loops of its linkage are held, see `add_arm`.
     """
 
     arm: Arm
     inertias: dict[str, SpatialInertia]
-    effects: tuple[JointEffect, ...]
+    effects: tuple[ActuatorEffect, ...]
     coefficients: tuple[float, ...]
     damping: NDArray[np.float64]
     closure: Closure
@@ -47,7 +47,7 @@ class TrueArm:
         station.set_link_inertias(context, self.inertias)
 
     def effect_torque(self) -> JointEffectTorque:
-        """A new system that plays the joint effects."""
+        """A new system that plays the effects."""
         return JointEffectTorque(self.arm, self.effects, self.coefficients)
 
     def _damp(self, plant: MultibodyPlant) -> None:
@@ -57,7 +57,7 @@ class TrueArm:
 def make_true_arm(
     arm: Arm,
     generator: np.random.Generator,
-    effects: Sequence[JointEffect] = (),
+    effects: Sequence[ActuatorEffect] = (),
     coefficients: Sequence[float] = (),
     closure: Closure = "mimic",
 ) -> TrueArm:

@@ -2,16 +2,20 @@
 
 An effect acts along a coordinate x of the drive (see `effect_coordinates`): an actuator, a joint that actuators share,
 or a place where parts rub. The effort that the motors must add is coefficient * shape(x, v, state), pulled back to the
-actuators. A shape is written once, as a step; a batch runs the step over a motion, a simulation runs it in time.
+actuators. A shape is written once: one of position alone as an expression, which serves the torque that holds an arm
+as well as its motion; one of velocity or with memory as a step, which a batch runs over a motion, a simulation in time.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import cache
 
 import numba
 import numpy as np
+import sympy
 from numpy.typing import NDArray
 
 from dvrk_drake.models.arm import Arm
@@ -22,33 +26,47 @@ class EffectKind:
     """One kind of effect.
 
     Attributes:
-        code: what the compiled step calls it.
+        unit: of the coefficient, of a coordinate that turns (N for N m and m for rad of one that slides).
+        scale: what `ActuatorEffect.scale` is of this kind; "" if it has none.
         dissipative: it takes energy in all motions, so its coefficient is not negative.
         revolute: only of a coordinate that turns.
-        unit: of the coefficient, of a coordinate that turns (N for N m and m for rad of one that slides).
+        code: what the compiled step calls it, if it depends on velocity or has a state.
+        of_position: (x, scale) -> the shape, if position is all that it depends on; such effects act at rest too.
     """
 
-    code: int
-    dissipative: bool
-    revolute: bool
     unit: str
+    scale: str = ""
+    dissipative: bool = False
+    revolute: bool = False
+    code: int = 0
+    of_position: Callable[[sympy.Expr, sympy.Expr], sympy.Expr] | None = None
 
 
+_WIDTH = "speed at which the smoothed sign is 0.76 [rad/s, m/s]"
 EFFECT_KINDS: dict[str, EffectKind] = {
-    "offset": EffectKind(0, False, False, "N m"),
-    "viscous": EffectKind(1, True, False, "N m s/rad"),
-    "coulomb": EffectKind(2, True, False, "N m"),
-    "coulomb forward": EffectKind(3, False, False, "N m"),
-    "stribeck": EffectKind(4, False, False, "N m"),
-    "presliding": EffectKind(5, True, False, "N m"),
-    "spring": EffectKind(6, False, False, "N m/rad"),
-    "cable sine": EffectKind(7, False, True, "N m"),
-    "cable cosine": EffectKind(8, False, True, "N m"),
+    # Cable preload, current offset.
+    "offset": EffectKind("N m", of_position=lambda x, scale: sympy.Integer(1)),
+    "viscous": EffectKind("N m s/rad", dissipative=True, code=1),
+    "coulomb": EffectKind("N m", _WIDTH, dissipative=True, code=2),
+    "coulomb forward": EffectKind("N m", _WIDTH, code=3),
+    "stribeck": EffectKind("N m", _WIDTH, code=4),
+    "presliding": EffectKind("N m", "travel until it slips [rad, m]", dissipative=True, code=5),
+    # It pulls no more than at the travel that a recording covered: a straight line runs away outside of it.
+    "spring": EffectKind(
+        "N m/rad",
+        "largest |x| to which it is a straight line [rad, m]",
+        of_position=lambda x, scale: sympy.Max(-scale, sympy.Min(scale, x)),
+    ),
+    # One period a turn: a spring or a cable hooked on off the axis. More: a pulley that is not round, a cable's lay.
+    "cable sine": EffectKind("N m", "periods a turn", revolute=True, of_position=lambda x, s: sympy.sin(s * x)),
+    "cable cosine": EffectKind("N m", "periods a turn", revolute=True, of_position=lambda x, s: sympy.cos(s * x)),
 }
+#: Kinds that act at rest as well; friction holds either way and is left to the arm.
+POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.of_position is not None)
 
 
 @numba.njit(cache=True)
-def _step(code: int, z: float, dx: float, x: float, v: float, scale: float) -> tuple[float, float]:
+def _step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float, float]:
     """The next state and the shape of the kind with this code."""
     if code == 1:
         return z, v
@@ -66,13 +84,7 @@ def _step(code: int, z: float, dx: float, x: float, v: float, scale: float) -> t
         # parallel are a generalised Maxwell slip model, which has the hysteresis of dry friction before it slides.
         z = min(max(z + dx / scale, -1.0), 1.0)
         return z, z
-    if code == 6:
-        return z, x
-    if code == 7:
-        return z, math.sin(scale * x)
-    if code == 8:
-        return z, math.cos(scale * x)
-    return z, 1.0
+    return z, math.nan
 
 
 @dataclass(frozen=True)
@@ -82,8 +94,7 @@ class ActuatorEffect:
     Attributes:
         coordinate: a key of `effect_coordinates(arm)`.
         kind: a key of `EFFECT_KINDS`.
-        scale: width of the smoothed sign [rad/s, m/s], travel until an element slips [rad, m], or the number of periods
-            in a turn; 0 for kinds that have none.
+        scale: see `EffectKind.scale`; 0 for kinds that have none.
     """
 
     coordinate: str
@@ -98,6 +109,12 @@ class ActuatorEffect:
         """Whether its coefficient must not be negative."""
         return EFFECT_KINDS[self.kind].dissipative
 
+    def of_position(self, x: sympy.Expr) -> sympy.Expr:
+        """The shape at position x [rad, m] of the coordinate, of a kind in `POSITION_KINDS`."""
+        shape = EFFECT_KINDS[self.kind].of_position
+        assert shape is not None, f"{self} depends on more than position"
+        return shape(x, sympy.Integer(int(self.scale)) if self.scale.is_integer() else sympy.Float(self.scale))
+
     def step(self, state: float, dx: float, x: float, v: float) -> tuple[float, float]:
         """The next state, and the shape there: for a simulation.
 
@@ -106,11 +123,24 @@ class ActuatorEffect:
             dx: travel of the coordinate since the last step [rad, m].
             x, v: its position [rad, m] and velocity now.
         """
-        return _step(EFFECT_KINDS[self.kind].code, state, dx, x, v, self.scale)
+        if self.kind in POSITION_KINDS:
+            return state, float(_numeric(self.kind)(x, self.scale))
+        return _step(EFFECT_KINDS[self.kind].code, state, dx, v, self.scale)
 
     def column(self, x: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
         """The shape (m,) over a motion of the coordinate, x and v (m,), from state 0."""
+        if self.kind in POSITION_KINDS:
+            return np.array(np.broadcast_to(_numeric(self.kind)(x, self.scale), x.shape))
         return _run(EFFECT_KINDS[self.kind].code, np.ascontiguousarray(x), np.ascontiguousarray(v), self.scale)
+
+
+@cache
+def _numeric(kind: str) -> Callable:
+    """The shape of a kind of position alone as a function (x, scale) of numbers or arrays."""
+    x, scale = sympy.symbols("x scale", real=True)
+    shape = EFFECT_KINDS[kind].of_position
+    assert shape is not None
+    return sympy.lambdify((x, scale), shape(x, scale), "numpy")
 
 
 @numba.njit(cache=True)
@@ -118,7 +148,7 @@ def _run(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale: float
     out = np.empty(len(x))
     state, before = 0.0, x[0]
     for i in range(len(x)):
-        state, out[i] = _step(code, state, x[i] - before, x[i], v[i], scale)
+        state, out[i] = _step(code, state, x[i] - before, v[i], scale)
         before = x[i]
     return out
 
@@ -126,18 +156,58 @@ def _run(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale: float
 def effect_coordinates(arm: Arm) -> dict[str, NDArray[np.float64]]:
     """The coordinates that effects can act along: name -> row h (n,) with x = h a of the actuators' positions a.
 
-    "actuator.<name>" for every actuator, "joint.<name>" for every joint that more than its own actuator moves, and the
-    arm's own `friction_coordinates`. The actuators' efforts for an effort f along x are h' f.
+    "actuator.<name>", "joint.<name>" and the arm's own `friction_coordinates`. The actuators' efforts for an effort f
+    along x are h' f.
     """
     J_inverse = arm.transmission.inverse().matrix
     rows = {f"actuator.{name}": unit for name, unit in zip(arm.joint_names, np.eye(arm.num_joints), strict=True)}
-    for name, row in zip(arm.joint_names, J_inverse, strict=True):
-        if np.count_nonzero(np.abs(row) > 1e-12) > 1:
-            rows[f"joint.{name}"] = row
+    rows.update({f"joint.{name}": row for name, row in zip(arm.joint_names, J_inverse, strict=True)})
     rows.update({name: row @ J_inverse for name, row in arm.friction_coordinates.items()})
     return rows
+
+
+def distinct_coordinates(arm: Arm) -> list[str]:
+    """The coordinates that move each in its own way: the first of those that move alike, so all actuators."""
+    rows = effect_coordinates(arm)
+    kept: list[str] = []
+    for name in rows:
+        h = rows[name] / np.linalg.norm(rows[name])
+        if not any(abs(h @ rows[k]) > (1 - 1e-9) * np.linalg.norm(rows[k]) for k in kept):
+            kept.append(name)
+    return kept
 
 
 def slides(arm: Arm, coordinate: str) -> bool:
     """Whether a coordinate is a length [m] rather than an angle: of the actuator or joint that slides itself."""
     return any(p and coordinate.endswith(f".{n}") for p, n in zip(arm.prismatic, arm.joint_names, strict=True))
+
+
+def joint_row(arm: Arm, coordinate: str) -> NDArray[np.float64]:
+    """(n,) what a coordinate of the drive moves by per joint; an effort f along it is row f on the joints."""
+    return np.asarray(effect_coordinates(arm)[coordinate] @ arm.transmission.matrix)
+
+
+def position_along(arm: Arm, coordinate: str, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(m,) position x of a coordinate of the drive at poses q (m, n) of the joints [rad, m]."""
+    return np.asarray(arm.transmission.position(q) @ effect_coordinates(arm)[coordinate])
+
+
+def effect_fault(arm: Arm, effect: ActuatorEffect, kinds: Collection[str] = EFFECT_KINDS) -> str:
+    """Why an arm cannot have this effect, with what it can have; "" if it can.
+
+    Args:
+        arm: whose effect it shall be.
+        effect: of any coordinate and kind.
+        kinds: that are allowed here.
+    """
+    coordinates = effect_coordinates(arm)
+    if effect.coordinate not in coordinates:
+        return f'coordinate is "{effect.coordinate}"; allowed: {", ".join(coordinates)}'
+    if effect.kind not in kinds:
+        return f'kind is "{effect.kind}"; allowed: {", ".join(kinds)}'
+    kind = EFFECT_KINDS[effect.kind]
+    if kind.revolute and slides(arm, effect.coordinate):
+        return f"kind {effect.kind} is of an angle, and {effect.coordinate} slides"
+    if not (0 < effect.scale < math.inf if kind.scale else effect.scale == 0):
+        return f"scale is {effect.scale:g}; of kind {effect.kind} it is {kind.scale or 'always 0'}"
+    return ""

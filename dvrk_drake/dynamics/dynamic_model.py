@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_coordinates, slides
+from dvrk_drake.dynamics.actuator_effects import effect_coordinates, effect_fault
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES, LinkInertia, pseudo_inertia
@@ -40,7 +40,7 @@ class DynamicModel:
         phi = [x for link in section.links for x in link.parameters] + [rotor.value for rotor in section.rotors]
         # Columns that couple two rotors belong to no motor, see `rotor_inertias`.
         self.parameters = np.concatenate([phi, np.zeros(len(self.regressor.values) - len(phi))])
-        self.effects = tuple(ActuatorEffect(e.coordinate, e.kind, e.scale) for e in section.effects)
+        self.effects = tuple(e.effect for e in section.effects)
         self.coefficients = np.array([e.value for e in section.effects])
 
     @cached_property
@@ -103,15 +103,9 @@ def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
 
 
 def _check_effects(arm: Arm, section: DynamicSection) -> None:
-    coordinates = effect_coordinates(arm)
-    for effect in section.effects:
-        where = f"dynamics: effect {effect.coordinate} {effect.kind}"
-        if effect.coordinate not in coordinates:
-            raise ModelError(f"{where}: unknown coordinate; known: {', '.join(coordinates)}")
-        if effect.kind not in EFFECT_KINDS:
-            raise ModelError(f"{where}: unknown kind; known: {', '.join(EFFECT_KINDS)}")
-        kind = EFFECT_KINDS[effect.kind]
-        if kind.revolute and slides(arm, effect.coordinate):
-            raise ModelError(f"{where}: is of an angle, and this slides")
-        if not np.isfinite(effect.value) or not effect.scale >= 0 or (kind.dissipative and effect.value < 0):
-            raise ModelError(f"{where}: value {effect.value:g}, scale {effect.scale:g}; friction must be 0 or more")
+    for i, estimate in enumerate(section.effects):
+        where = f"dynamics.effects[{i}]"
+        if fault := effect_fault(arm, estimate.effect):
+            raise ModelError(f"{where}: {fault}")
+        if not np.isfinite(estimate.value) or (estimate.effect.dissipative and estimate.value < 0):
+            raise ModelError(f"{where}: value is {estimate.value:g}; a finite number, of friction 0 or more")

@@ -3,6 +3,8 @@
 # No postponed annotations here: yaml_load_typed reads the types at run time.
 from dataclasses import dataclass, field
 
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
+
 
 @dataclass
 class LinkEstimate:
@@ -35,6 +37,16 @@ class ActuatorEffectEstimate:
     value: float = 0.0
     standard_error: float = 0.0
 
+    @property
+    def effect(self) -> ActuatorEffect:
+        """What it is the coefficient of."""
+        return ActuatorEffect(self.coordinate, self.kind, self.scale)
+
+    @property
+    def distinguishable(self) -> bool:
+        """Whether its size exceeds two standard errors."""
+        return abs(self.value) > 2 * self.standard_error
+
 
 @dataclass
 class ActuatorStatistics:
@@ -65,8 +77,8 @@ class SignalSettings:
 class DynamicSection:
     """tau_actuator = J'^-1 Y(q, v, vd) phi + effects: an arm's identified dynamics.
 
-    `gravity` [m/s^2] is the direction of gravity in the base frame that the motion shows; it differs from the model's
-    where the base was not quite level.
+    `gravity` [m/s^2] is gravity in the base frame as the motion shows it, the model's; `gravity_expected` is what it
+    was taken for before, from which it differs where the base was not quite level.
     """
 
     gravity: list[float] = field(default_factory=list)
@@ -75,3 +87,4 @@ class DynamicSection:
     effects: list[ActuatorEffectEstimate] = field(default_factory=list)
     actuators: list[ActuatorStatistics] = field(default_factory=list)
     signals: SignalSettings = field(default_factory=SignalSettings)
+    gravity_expected: list[float] = field(default_factory=list)

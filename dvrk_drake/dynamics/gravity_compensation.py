@@ -8,9 +8,8 @@ import numpy as np
 from numpy.polynomial import Polynomial, chebyshev
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.dynamics.actuator_effects import effect_coordinates
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates, joint_row, position_along
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.joint_effects import EFFECT_KINDS
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.gravity_compensation_file import NUM_JOINTS, NUM_PARAMETERS, GravityCompensationFile
@@ -21,6 +20,8 @@ DRY_KINDS = ("coulomb", "presliding")
 CONTROLLER_GRAVITY = 9.81
 NUM_GRAVITY = 10
 ORDER = 4
+#: What the first two columns are at the shoulder.
+_FIRST = ("cable sine", "cable cosine")
 MTM_JOINTS = (
     "outer_yaw",
     "shoulder_pitch",
@@ -122,9 +123,9 @@ def compensation_from_model(
     """The controller's file that says what the model says.
 
     The ten columns span the gravity of an upright MTM whose last link is balanced about its axis, so they follow from
-    the base parameters exactly. A joint's offset is its constant, the shoulder's spring the first column; a spring
-    elsewhere has no exact place and gets the best polynomial over the joint's range. Torque limits are the range that
-    is needed over the joint box and a tenth more, at most the arm's effort limits; joint 7 gets none.
+    the base parameters exactly. A joint's offset is its constant, the shoulder's cable the first two columns; an
+    effect elsewhere has no exact place and gets the best polynomial over the joint's range. Torque limits are the range
+    that is needed over the joint box and a tenth more, at most the arm's effort limits; joint 7 gets none.
 
     Raises:
         ModelError: not the model of an MTM, options of the wrong length, or an error above `options.tolerance`.
@@ -186,30 +187,30 @@ def _gravity_parameters(model: IdentifiedModel) -> NDArray[np.float64]:
 
 def _effect_parameters(model: IdentifiedModel, arm: Arm) -> NDArray[np.float64]:
     parameters = np.zeros(NUM_PARAMETERS)
-    for effect in model.joint_effects:
-        joint = arm.joint_names.index(effect.joint)
-        value = float(model.trust[joint] * effect.value)
-        if joint == NUM_JOINTS - 1:
-            continue  # the file has nothing for the last joint: _refuse_errors measures what that costs
-        if effect.kind == "offset":
-            parameters[polynomial_columns(joint).start] += value
-        elif effect.kind == "spring" and effect.joint == "shoulder_pitch":
-            parameters[0] += value / CONTROLLER_GRAVITY
-        else:
-            parameters[polynomial_columns(joint)] += value * _best_polynomial(
-                effect.kind, arm.position_lower[joint], arm.position_upper[joint]
-            )
+    for estimate in model.holding_effects:
+        row = joint_row(arm, estimate.coordinate)
+        # The file has nothing for the last joint, nor for what moves with two: _refuse_errors measures what that costs.
+        for joint in map(int, np.flatnonzero(row[:-1])):
+            value = float(model.trust[joint] * estimate.value * row[joint])
+            if estimate.kind == "offset":
+                parameters[polynomial_columns(joint).start] += value
+            elif np.count_nonzero(row) > 1:
+                continue
+            elif joint == 1 and estimate.scale == 1.0 and estimate.kind in _FIRST:
+                parameters[_FIRST.index(estimate.kind)] += value / CONTROLLER_GRAVITY
+            else:
+                parameters[polynomial_columns(joint)] += value * _best_polynomial(estimate.effect, arm, joint)
     return parameters
 
 
-def _best_polynomial(kind: str, lower: float, upper: float) -> NDArray[np.float64]:
+def _best_polynomial(effect: ActuatorEffect, arm: Arm, joint: int) -> NDArray[np.float64]:
     """(5,) coefficients of 1 .. q^4 near an effect over a joint's range (Chebyshev: nearly the least maximum error)."""
-    import sympy
+    lower, upper = arm.position_lower[joint], arm.position_upper[joint]
 
-    symbol = sympy.Symbol("q")
-    function = sympy.lambdify(symbol, EFFECT_KINDS[kind](symbol), "numpy")
     middle, half = (lower + upper) / 2, (upper - lower) / 2
-    series = chebyshev.chebinterpolate(lambda x: function(middle + half * x), ORDER)
+    x = chebyshev.chebpts1(ORDER + 1)
+    along = position_along(arm, effect.coordinate, (middle + half * x)[:, None] * np.eye(NUM_JOINTS)[joint])
+    series = chebyshev.chebfit(x, effect.column(along, 0 * along), ORDER)
     polynomial = Polynomial(chebyshev.cheb2poly(series))(Polynomial([-middle / half, 1 / half]))
     return np.resize(np.append(polynomial.coef, np.zeros(ORDER + 1)), ORDER + 1)
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
+from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, effect_fault
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
-from dvrk_drake.dynamics.dynamic_section import DynamicSection
-from dvrk_drake.dynamics.joint_effects import JointEffect, kinds_of
+from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
 from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ArmError, ModelError
@@ -24,17 +24,6 @@ class BaseParameterEstimate:
     """A base parameter [kg m, or kg of a mass]; `distinguishable`: its size exceeds two standard errors."""
 
     name: str = ""
-    value: float = 0.0
-    standard_error: float = 0.0
-    distinguishable: bool = False
-
-
-@dataclass
-class EffectEstimate:
-    """The coefficient of a joint effect [N m, or N on a prismatic joint]."""
-
-    joint: str = ""
-    kind: str = ""
     value: float = 0.0
     standard_error: float = 0.0
     distinguishable: bool = False
@@ -81,24 +70,25 @@ class Provenance:
 
 @dataclass
 class IdentifiedModel:
-    """A static model of one arm: tau = trust o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
+    """What holds an arm: tau = trust o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
 
-    `gravity` [m/s^2] is the gravity vector in the base frame that the base parameters were identified with. A model
-    identified from a motion also has `dynamics`; its base parameters are those of the links there.
+    `gravity` [m/s^2] is the gravity vector in the base frame that the base parameters were identified with. `effects`
+    are those of a model identified from poses, of position alone. One identified from a motion has `dynamics`, with
+    effects of all kinds; its base parameters are those of the links there.
     """
 
-    format: str = "dvrk_drake identified model 1"
+    format: str = "dvrk_drake identified model 2"
     arm: str = ""
     gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81])
     base_parameters: list[BaseParameterEstimate] = field(default_factory=list)
-    joint_effects: list[EffectEstimate] = field(default_factory=list)
+    effects: list[ActuatorEffectEstimate] = field(default_factory=list)
     joints: list[JointStatistics] = field(default_factory=list)
     provenance: Provenance = field(default_factory=Provenance)
     dynamics: DynamicSection | None = None
 
     @classmethod
     def from_arm(cls, arm: Arm) -> "IdentifiedModel":
-        """The model that the arm's SDF states: its own inertias, no joint effects."""
+        """The model that the arm's SDF states: its own inertias, no effects."""
         gravity = derive_gravity(arm)
         return cls(
             arm=arm.source,
@@ -151,27 +141,31 @@ class IdentifiedModel:
             raise ModelError(f"base parameters must be, in this order: {'; '.join(names)}")
         if tuple(joint.name for joint in self.joints) != arm.joint_names:
             raise ModelError(f"joints must be, in this order: {', '.join(arm.joint_names)}")
-        for effect in self.joint_effects:
-            if effect.joint not in arm.joint_names:
-                raise ModelError(
-                    f"joint effect of an unknown joint {effect.joint}; joints: {', '.join(arm.joint_names)}"
-                )
-            kinds = kinds_of(bool(arm.prismatic[arm.joint_names.index(effect.joint)]))
-            if effect.kind not in kinds:
-                raise ModelError(f"{effect.joint} cannot have a joint effect {effect.kind}; kinds: {', '.join(kinds)}")
+        for i, effect in enumerate(self.effects):
+            if fault := effect_fault(arm, effect.effect, POSITION_KINDS):
+                raise ModelError(f"effects[{i}]: {fault}")
         if not np.all(np.isfinite(self.theta)) or not np.all((self.trust >= 0) & (self.trust <= 1)):
             raise ModelError("parameters must be finite numbers and trust between 0 and 1")
         if self.dynamics is not None:
             DynamicModel(arm, self.dynamics)
+            if self.effects or self.dynamics.gravity != self.gravity:
+                raise ModelError("a model with dynamics has effects only there, and the gravity that stands there")
 
     def load_arm(self) -> Arm:
         """The arm that this model is of, mounted as it was when identified."""
         return _arm_with_gravity(self.arm, tuple(self.gravity))
 
     @property
+    def holding_effects(self) -> list[ActuatorEffectEstimate]:
+        """The effects that act at rest as they do in motion: those of position alone."""
+        if self.dynamics is None:
+            return self.effects
+        return [e for e in self.dynamics.effects if e.kind in POSITION_KINDS]
+
+    @property
     def theta(self) -> NDArray[np.float64]:
-        """(b + e,) base parameters, then coefficients of the joint effects, as `StaticModel` wants them."""
-        return np.array([p.value for p in self.base_parameters] + [e.value for e in self.joint_effects])
+        """(b + e,) base parameters, then coefficients of `holding_effects`, as `StaticModel` wants them."""
+        return np.array([p.value for p in self.base_parameters] + [e.value for e in self.holding_effects])
 
     @property
     def trust(self) -> NDArray[np.float64]:
@@ -181,7 +175,7 @@ class IdentifiedModel:
     @cached_property
     def static_model(self) -> StaticModel:
         """The compiled structure that `theta` belongs to."""
-        return compile_static_model(self.load_arm(), tuple(JointEffect(e.joint, e.kind) for e in self.joint_effects))
+        return compile_static_model(self.load_arm(), tuple(e.effect for e in self.holding_effects))
 
     @cached_property
     def dynamic_model(self) -> DynamicModel:

@@ -55,8 +55,8 @@ def model_bodies(model: IdentifiedModel) -> ModelBodies:
 
 def _static_effects(model: IdentifiedModel) -> list[str]:
     remarks = []
-    if effects := [f"{e.joint} {e.kind} {e.value:+.4g}" for e in model.joint_effects if abs(e.value) > 1e-12]:
-        remarks.append(f"joint effects [N m; N if prismatic]: {', '.join(effects)}")
+    if effects := [f"{e.effect} {e.value:+.4g}" for e in model.effects]:
+        remarks.append(f"effects [N m; N if prismatic]: {', '.join(effects)}")
     if doubted := [f"{j.name} {j.trust:g}" for j in model.joints if j.trust != 1.0]:
         remarks.append(f"trust below 1: {', '.join(doubted)}")
     return remarks

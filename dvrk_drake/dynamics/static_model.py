@@ -1,4 +1,4 @@
-"""The static torque model tau = trust o (Y(q) beta + effects(q)): compiled, for any arm and choice of effects."""
+"""The torque that holds an arm, tau = trust o (Y(q) beta + effects(q)): compiled, for any arm and choice of effects."""
 
 from __future__ import annotations
 
@@ -11,25 +11,26 @@ import sympy
 from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.dynamics import codegen
-from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates, joint_row
 from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, SymbolicGravity, derive_gravity
 from dvrk_drake.models.arm import Arm
 
 
 @dataclass(frozen=True, eq=False)
 class StaticModel:
-    """Compiled regressor and torque of one structure (arm and joint effects); the parameters stay arguments.
+    """Compiled regressor and torque of one structure (arm and effects); the parameters stay arguments.
 
-    Parameters theta are the b base parameters [kg m, kg], then one coefficient per effect [N m; N if prismatic].
+    Parameters theta are the b base parameters [kg m, kg], then one coefficient per effect, in the
+    unit of its kind.
 
     Attributes:
         gravity: the symbolic derivation.
-        effects: the joint effects, in the order of theta.
+        effects: of kinds in `POSITION_KINDS`, in the order of theta.
         torque_into: compiled f(q, theta, out), float64 C-contiguous (n,), (b + e,), (n,); for control loops.
     """
 
     gravity: SymbolicGravity
-    effects: tuple[JointEffect, ...]
+    effects: tuple[ActuatorEffect, ...]
     torque_into: Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None]
     _regressor_batch: Callable[..., NDArray[np.float64]]
     _torque_batch: Callable[..., NDArray[np.float64]]
@@ -51,19 +52,24 @@ class StaticModel:
         return self._torque_batch(q, theta) if q.ndim == 2 else self._torque_batch(q[None], theta)[0]
 
 
-def symbolic_regressor(gravity: SymbolicGravity, effects: tuple[JointEffect, ...]) -> sympy.Matrix:
+def symbolic_regressor(gravity: SymbolicGravity, effects: tuple[ActuatorEffect, ...]) -> sympy.Matrix:
     """The regressor (n, b + e) as sympy, with the number of |gravity| put in."""
     columns = [sympy.Matrix(gravity.regressor).subs(GRAVITY, sympy.Float(gravity.gravity_magnitude))]
     for effect in effects:
-        column = sympy.zeros(gravity.arm.num_joints, 1)
-        j = gravity.arm.joint_names.index(effect.joint)
-        column[j] = effect.expression(gravity.q[j])
-        columns.append(column)
+        row = [_number(r) for r in joint_row(gravity.arm, effect.coordinate).tolist()]
+        offset = effect_coordinates(gravity.arm)[effect.coordinate] @ gravity.arm.transmission.offset
+        x = sum((r * q for r, q in zip(row, gravity.q, strict=True)), _number(float(offset)))
+        columns.append(sympy.Matrix(row) * effect.of_position(x))
     return sympy.Matrix.hstack(*columns)
 
 
+def _number(x: float) -> sympy.Expr:
+    # Exact where it is whole: 1.0 x is a multiplication, x is none.
+    return sympy.Integer(round(x)) if abs(x - round(x)) < 1e-12 else sympy.Float(x)
+
+
 @cache
-def compile_static_model(arm: Arm, effects: tuple[JointEffect, ...] = ()) -> StaticModel:
+def compile_static_model(arm: Arm, effects: tuple[ActuatorEffect, ...] = ()) -> StaticModel:
     """Derives and compiles the model; takes about two seconds the first time, nothing afterwards."""
     gravity = derive_gravity(arm)
     Y = symbolic_regressor(gravity, effects)

@@ -1,4 +1,4 @@
-"""The joint effects of an arm as torques that act on its simulation."""
+"""Effects in an arm's drive as torques that act on the joints of its simulation."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from dvrk_drake.dynamics.joint_effects import JointEffect
+from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 
 
 class JointEffectTorque(LeafSystem):
-    """Plays the joint effects that identification looks for: the same formulas, so that what is put in can be found.
+    """Plays the effects of position that identification looks for: the same formulas, so what is put in can be found.
 
     .. pydrake_system::
 
@@ -30,11 +30,12 @@ class JointEffectTorque(LeafSystem):
       effort that motors need to hold against it, so this is minus their sum.
     """
 
-    def __init__(self, arm: Arm, effects: Sequence[JointEffect], coefficients: ArrayLike) -> None:
-        """Of the `effects` with one coefficient each [N m; N on a prismatic joint].
+    def __init__(self, arm: Arm, effects: Sequence[ActuatorEffect], coefficients: ArrayLike) -> None:
+        """Of the `effects` with one coefficient each, in the unit of their kind.
 
         Raises:
-            StationError: an effect of no joint of the arm, or not one finite coefficient for each effect.
+            StationError: an effect that the arm cannot have or that depends on velocity, or not one finite coefficient
+                for each effect.
         """
         super().__init__()
         coefficients = np.asarray(coefficients, float)
@@ -42,8 +43,9 @@ class JointEffectTorque(LeafSystem):
             raise StationError(
                 f"needs one finite coefficient for each of {len(effects)} effects; got {coefficients.tolist()}"
             )
-        if unknown := {effect.joint for effect in effects} - set(arm.joint_names):
-            raise StationError(f"unknown joint {', '.join(sorted(unknown))}; joints: {', '.join(arm.joint_names)}")
+        for i, effect in enumerate(effects):
+            if fault := effect_fault(arm, effect, POSITION_KINDS):
+                raise StationError(f"effects[{i}]: {fault}")
         n = arm.num_joints
         model = compile_static_model(arm, tuple(effects))
         gravity_free = np.zeros(model.num_parameters)

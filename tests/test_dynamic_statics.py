@@ -1,0 +1,128 @@
+"""What holds an arm is its dynamics at rest: one definition of the effects, from the drive to the controller."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from motions import true_dynamics
+
+from dvrk_drake.analysis.dynamic_statics import base_parameter_estimates
+from dvrk_drake.analysis.effect_selection import effect_column
+from dvrk_drake.dynamics.actuator_effects import (
+    POSITION_KINDS,
+    ActuatorEffect,
+    distinct_coordinates,
+    effect_coordinates,
+    effect_fault,
+    joint_row,
+    position_along,
+    slides,
+)
+from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
+from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics
+from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.errors import ModelError
+from dvrk_drake.models.arm import load_arm
+
+SCALES = {"offset": 0.0, "spring": 0.4, "cable sine": 2.0, "cable cosine": 1.5}
+
+
+def all_effects(arm):
+    """Every kind that position alone decides, along every coordinate that can have it."""
+    effects = (ActuatorEffect(c, kind, SCALES[kind]) for c in effect_coordinates(arm) for kind in POSITION_KINDS)
+    return tuple(e for e in effects if not effect_fault(arm, e))
+
+
+def model_of_all_effects(name, tilt):
+    """A model of links that exist, with friction and all effects of position, and its DynamicModel."""
+    generator = np.random.default_rng(3)
+    arm = load_arm(name)
+    arm = arm.with_gravity([float(g) for g in arm.gravity + tilt])
+    estimates = [
+        ActuatorEffectEstimate(e.coordinate, e.kind, e.scale, float(generator.normal()), 0.1) for e in all_effects(arm)
+    ]
+    friction = ActuatorEffectEstimate(f"actuator.{arm.joint_names[0]}", "coulomb", 0.1, 0.3)
+    dynamics = true_dynamics(arm, generator, [friction, *estimates])
+    section = dataclasses.replace(dynamics.section, gravity_expected=dynamics.section.gravity)
+    covariance = np.eye(10 * len(section.links)) * 1e-6
+    model = IdentifiedModel(
+        arm=arm.source,
+        gravity=section.gravity,
+        base_parameters=base_parameter_estimates(arm, section, dynamics.regressor, covariance),
+        joints=[JointStatistics(name=joint) for joint in arm.joint_names],
+        dynamics=section,
+    )
+    return arm, model, dynamics
+
+
+@pytest.fixture(scope="module", params=[("mtmr", (0.4, 0.2, 0.0)), ("psm", (0.0, 0.0, 0.0))], ids=lambda p: p[0])
+def case(request):
+    name, tilt = request.param
+    return model_of_all_effects(name, np.array(tilt))
+
+
+def test_the_holding_torque_is_the_dynamics_at_rest(case):
+    arm, model, dynamics = case
+    q = arm.sample_poses(200, np.random.default_rng(0))
+    at_rest = arm.transmission.pull_back_effort(dynamics.effort(q, 0 * q, 0 * q))
+    assert np.ptp(dynamics.effect_effort(q, 0 * q), axis=0).min() > 0.1  # there is something to compare
+    np.testing.assert_allclose(model.holding_torque(q), at_rest, rtol=0, atol=1e-10)
+
+
+def test_of_a_loaded_file_too_and_what_contradicts_itself_is_refused(case, tmp_path):
+    arm, model, _ = case
+    model.save(tmp_path / "model.yaml")
+    q = arm.sample_poses(20, np.random.default_rng(1))
+    loaded = IdentifiedModel.load(tmp_path / "model.yaml")
+    np.testing.assert_array_equal(loaded.holding_torque(q), model.holding_torque(q))
+    assert all(e.value != 0 and e.standard_error > 0 for e in model.holding_effects)
+    with pytest.raises(ModelError, match="has effects only there"):
+        dataclasses.replace(model, effects=model.holding_effects[:1]).check()
+    with pytest.raises(ModelError, match="the gravity that stands there"):
+        dynamics = dataclasses.replace(model.dynamics, gravity=[float(-g) for g in model.gravity])
+        dataclasses.replace(model, dynamics=dynamics).check()
+
+
+def test_poses_are_fitted_with_the_columns_that_a_motion_is_fitted_with(case):
+    arm = case[0]
+    effects = all_effects(arm)
+    q = arm.sample_poses(50, np.random.default_rng(2))
+    compiled = compile_static_model(arm, effects).regressor(q)[:, :, -len(effects) :]
+    for effect, column in zip(effects, np.moveaxis(compiled, 2, 0), strict=True):
+        np.testing.assert_allclose(column, effect_column(arm, effect, q), atol=1e-12, err_msg=str(effect))
+        a = arm.transmission.position(q)
+        x = a @ effect_coordinates(arm)[effect.coordinate]
+        in_motion = effect.column(x, 0 * x)[:, None] * effect_coordinates(arm)[effect.coordinate]
+        np.testing.assert_allclose(column, arm.transmission.pull_back_effort(in_motion), atol=1e-12)
+
+
+def test_no_effect_runs_away_outside_of_what_was_recorded():
+    x = np.linspace(-50, 50, 2001)
+    for kind in POSITION_KINDS:
+        assert np.abs(ActuatorEffect("joint.yaw", kind, 0.7).column(x, 0 * x)).max() <= 1.0
+    inside = np.abs(x) <= 0.7
+    spring = ActuatorEffect("joint.yaw", "spring", 0.7).column(x, 0 * x)
+    np.testing.assert_array_equal(spring[inside], x[inside])
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_coordinates_that_move_alike_are_asked_for_once(name):
+    arm = load_arm(name)
+    rows = {c: joint_row(arm, c) for c in effect_coordinates(arm)}
+    kept = distinct_coordinates(arm)
+    assert {f"actuator.{joint}" for joint in arm.joint_names} <= set(kept)
+    unit = np.array([rows[c] / np.linalg.norm(rows[c]) for c in kept])
+    assert np.abs(unit @ unit.T - np.eye(len(kept))).max() < 1 - 1e-6
+    for c, row in rows.items():
+        assert np.abs(unit @ row / np.linalg.norm(row)).max() > 1 - 1e-9, f"{c} is lost"
+    assert [c for c in rows if slides(arm, c)] == [f"{kind}.insertion" for kind in ("actuator", "joint")] * (
+        name == "psm"
+    )
+
+
+def test_the_work_along_a_coordinate_is_that_on_the_joints():
+    arm, generator = load_arm("psm"), np.random.default_rng(5)
+    q, dq = generator.normal(size=(2, 1, arm.num_joints))
+    for coordinate in effect_coordinates(arm):
+        dx = position_along(arm, coordinate, q + dq) - position_along(arm, coordinate, q)
+        assert dx[0] == pytest.approx(float(dq[0] @ joint_row(arm, coordinate)), abs=1e-12)
