@@ -13,7 +13,7 @@ from dvrk_drake.analysis.motion_grid import MotionGrid, motion_grid
 from dvrk_drake.dynamics.actuator_effects import effect_coordinates
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
-from dvrk_drake.dynamics.identified_model import EffectEstimate, IdentifiedModel
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.recording import REST_SPEED, Recording
 
@@ -126,9 +126,7 @@ def recalibrate(model: IdentifiedModel, recording: Recording) -> Recalibration:
         if not coordinate.startswith("actuator.")
     }
     section = _section(model.dynamic_model.section, fit, x)
-    return Recalibration(
-        _with_section(model, section, x[len(fit.keys) :], recording), actuators, shared, float(len(fit.rows) / fit.rate)
-    )
+    return Recalibration(_with_section(model, section, recording), actuators, shared, float(len(fit.rows) / fit.rate))
 
 
 class _Fit:
@@ -206,23 +204,8 @@ def _section(section: DynamicSection, fit: _Fit, x: NDArray[np.float64]) -> Dyna
     return replace(section, effects=effects)
 
 
-def _with_section(
-    model: IdentifiedModel, section: DynamicSection, offsets: NDArray[np.float64], recording: Recording
-) -> IdentifiedModel:
-    """The model with the section, and with the offsets' changes (n,) in its joint effects as well."""
-    arm = model.load_arm()
-    changes = arm.transmission.pull_back_effort(offsets)
-    joint_effects = list(model.joint_effects)
-    for name, change in zip(arm.joint_names, changes, strict=True):
-        if not change:
-            continue
-        known = [k for k, effect in enumerate(joint_effects) if (effect.joint, effect.kind) == (name, "offset")]
-        if known:
-            effect = joint_effects[known[0]]
-            joint_effects[known[0]] = replace(effect, value=effect.value + float(change))
-        else:
-            joint_effects.append(EffectEstimate(name, "offset", float(change), 0.0, True))
+def _with_section(model: IdentifiedModel, section: DynamicSection, recording: Recording) -> IdentifiedModel:
     provenance = replace(
         model.provenance, method=f"{model.provenance.method}, recalibrated on {recording.source or 'a recording'}"
     )
-    return replace(model, dynamics=section, joint_effects=joint_effects, provenance=provenance)
+    return replace(model, dynamics=section, provenance=provenance)
