@@ -43,9 +43,7 @@ def main() -> int:
             inside += list(np.abs(difference) < payload.quantile * spread)
             sizes.append(payload.mass_error)
         rms = ", ".join(f"{x:.2f}" for x in np.sqrt(np.mean(np.square(errors), axis=0)))
-        print(
-            f"{name} {link}, {1000 * mass:.0f} g: +- {1000 * np.median(sizes):.1f} g; errors in standard errors, RMS: {rms}"
-        )
+        print(f"{name} {link}, {mass:.2f} kg: +- {np.median(sizes):.4f}; RMS errors in standard errors: {rms}")
     print(f"95 % intervals that hold the truth: {np.mean(inside):.1%} of {len(inside)}")
     return 0
 
