@@ -19,7 +19,7 @@ LEAST_ROWS, LEAST_JOINTS = 100, 2
 #: The recorded times are kept unless they leave this many times the variance that made ones leave.
 WORSE = 3.0
 #: Slower than this the recorded times are right [Hz].
-DRIFT = 1.0
+DRIFT = 0.3
 #: Shortest interval between two different rows, as a share of the mean.
 SHORTEST = 0.02
 _ITERATIONS = 8
