@@ -63,8 +63,8 @@ def print_payload(console: Console, payload: Payload) -> None:
     console.print("* by the payload and by what changed in the drives: offsets, friction\n", style="dim")
     if not payload.found:
         console.print(
-            f"The interval of the mass on {payload.link} includes 0: these recordings do not tell it from no payload there, or "
-            "tell only mass times distance.",
+            f"The interval of the mass on {payload.link} includes 0: these recordings do not tell it from "
+            "no payload there, or tell only mass times distance.",
             style="yellow",
             soft_wrap=True,
         )
