@@ -234,7 +234,10 @@ def test_model_file_round_trip_and_refusals(arm, tmp_path):
             text.replace("kind: cable sine", "kind: viscous"),
             'kind is "viscous"; allowed: offset, spring, cable sine, cable cosine',
         ),
-        (text.replace("model 2", "model 1"), 'model 1", this version reads "dvrk_drake identified model 2"'),
+        (
+            text.replace("model 2", "model 1").replace("\neffects:", "\njoint_effects:"),
+            'model 1", this version reads "dvrk_drake identified model 2"; identify anew',
+        ),
         (text.replace("trust: 1.0", "trust: 2.0"), "trust between 0 and 1"),
         (text.replace("arm: mtmr", "arms: mtmr"), "not a model file"),
         ("]", "not a model file"),

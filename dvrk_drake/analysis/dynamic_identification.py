@@ -186,17 +186,14 @@ def _model(
     recording: Recording, arm: Arm, section: DynamicSection, problem: DynamicProblem, fit: ConsistentFit
 ) -> IdentifiedModel:
     in_joints = recording.in_joint_coordinates(arm)
-    as_mounted = arm.with_gravity(section.gravity)
-    base_parameters = base_parameter_estimates(as_mounted, section, DynamicRegressor(as_mounted), fit.covariance)
     joints = []
     for j, name in enumerate(arm.joint_names):
         lower, upper = float(in_joints.q[:, j].min()), float(in_joints.q[:, j].max())
         coverage = (upper - lower) / float(arm.position_upper[j] - arm.position_lower[j])
         joints.append(JointStatistics(name=name, position_lower=lower, position_upper=upper, coverage=coverage))
-    return IdentifiedModel(
+    model = IdentifiedModel(
         arm=arm.source,
         gravity=section.gravity,
-        base_parameters=base_parameters,
         joints=joints,
         provenance=Provenance(
             recording=recording.source,
@@ -207,3 +204,8 @@ def _model(
         ),
         dynamics=section,
     )
+    # The model's own arm, whose gravity is derived once for all.
+    as_mounted = model.load_arm()
+    regressor = DynamicRegressor(as_mounted)
+    model.base_parameters = base_parameter_estimates(as_mounted, section, regressor, fit.covariance)
+    return model

@@ -191,7 +191,7 @@ def _problem(link: LinkInertia, columns: NDArray[np.float64], difference: Motion
     fold, edge = phase_folds(grid, difference.period)
     both = [np.hstack([filtered[:, i], difference.changes[:, i]]) for i in range(n)]
     equations = NormalEquations.of(both, difference.tau, fold[rows], edge[rows])
-    # A low-passed effort has two independent values a period of the cut-off; what repeats with the motion has fewer:
+    # A low-passed effort has two independent values a period of the cut-off. What repeats with the motion has fewer:
     # the jackknife over its phases sees to that.
     independent = 2 * grid.settings.effort_cut_off / grid.rate
     com = link.parameters[1:4] / link.parameters[0]

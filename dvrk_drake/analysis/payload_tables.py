@@ -30,6 +30,12 @@ def print_links(console: Console, estimates: Sequence[Payload]) -> None:
         "mean over the actuators\n",
         style="dim",
     )
+    if len(good) > 1:
+        console.print(
+            "These recordings cannot tell which of the best links it is: name the one that carries it with --link.\n",
+            style="yellow",
+            soft_wrap=True,
+        )
 
 
 def print_payload(console: Console, payload: Payload) -> None:

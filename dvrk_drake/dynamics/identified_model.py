@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, effect_fault
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
@@ -114,6 +114,7 @@ class IdentifiedModel:
             model = yaml_load_typed(schema=cls, filename=str(path))
         except Exception as error:
             # yaml_load_typed raises many types, from YAML's to AssertionError.
+            _check_format(path)
             raise ModelError(f"{path}: not a model file: {error}") from error
         try:
             model.check()
@@ -191,6 +192,17 @@ class IdentifiedModel:
     def holding_torque(self, q: ArrayLike) -> NDArray[np.float64]:
         """Torque [N m, N] on the joints that holds the arm: (n,) for q (n,), (m, n) for q (m, n)."""
         return self.trust * self.static_model.torque(q, self.theta)
+
+
+def _check_format(path: str | Path) -> None:
+    """Raises ModelError if that is all that is known of the file: it is a model of another version."""
+    try:
+        content = yaml_load(filename=str(path))
+    except Exception:
+        return  # no YAML at all, which the caller says
+    version = content.get("format") if isinstance(content, dict) else None
+    if version and version != IdentifiedModel.format:
+        raise ModelError(f'{path}: format is "{version}", this version reads "{IdentifiedModel.format}"; identify anew')
 
 
 _ARMS: dict[tuple[str, tuple[float, ...]], Arm] = {}

@@ -1,0 +1,52 @@
+"""How often the 95 % intervals of `payload` hold the truth, on simulated arms whose drives changed between two days.
+
+    python benchmarks/payload_coverage.py [--seeds 40]
+
+Every arm has links, friction, springs and cables of its own (tests/loaded_arm.py says how large).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from dvrk_drake.analysis.payload import estimate_payload
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+from loaded_arm import two_days
+
+CASES = [
+    ("psm", "end_link", 0.2, [0.02, 0.02, 0.39]),
+    ("psm", "bottom_bar_link", 0.1, [0.03, 0.165, 0.056]),
+    ("psm", "insertion_link", 0.05, [0.02, -0.02, 0.40]),
+    ("mtmr", "forearm_link", 0.15, [0.02, -0.2, 0.03]),
+]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=40)
+    options = parser.parse_args()
+    inside = []
+    for name, link, mass, place in CASES:
+        errors, sizes = [], []
+        for seed in range(options.seeds):
+            model, reference, loaded = two_days(name, link, mass, place, seed)
+            (payload,) = estimate_payload(reference, loaded, model, [link])
+            known = np.append(True, payload.body.determined)
+            difference = np.append(payload.body.mass - mass, payload.body.place - place)[known]
+            spread = np.append(payload.mass_error, payload.place_error)[known]
+            errors.append(difference / spread)
+            inside += list(np.abs(difference) < payload.quantile * spread)
+            sizes.append(payload.mass_error)
+        rms = ", ".join(f"{x:.2f}" for x in np.sqrt(np.mean(np.square(errors), axis=0)))
+        print(f"{name} {link}, {mass:.2f} kg: +- {np.median(sizes):.4f}; RMS errors in standard errors: {rms}")
+    print(f"95 % intervals that hold the truth: {np.mean(inside):.1%} of {len(inside)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,98 @@
+"""The known weights of the public PSM recordings as `payload` finds them, and how short a recalibration may be.
+
+    python benchmarks/payload_recordings.py FOLDER
+
+FOLDER holds psm_one.csv, psm_one_no_weight.csv, psm_one_105g_parallel.csv and psm_one_205g_insertion.csv in actuator
+coordinates, with a header and times (docs/public_recordings.md says where they come from).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from dvrk_drake.analysis.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.dynamic_validation import validate_motion
+from dvrk_drake.analysis.motion_grid import default_settings, motion_grid
+from dvrk_drake.analysis.payload import Payload, estimate_payload
+from dvrk_drake.analysis.point_mass import point_mass_parameters
+from dvrk_drake.analysis.recalibration import recalibrate
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.recording import Recording, read_recording
+
+#: File, link, mass [kg], place in the link's frame [m]; docs/payload.md says how the places are read.
+WEIGHTS = [
+    ("psm_one_105g_parallel", "bottom_bar_link", 0.105, [0.0, 0.165, 0.0563]),
+    ("psm_one_205g_insertion", "end_link", 0.205, [0.0, 0.023, 0.3913]),
+]
+SECONDS = (5.5, 6.0, 7.0, 8.0, 10.0)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    options = parser.parse_args()
+    arm = load_arm("psm")
+
+    def read(name: str) -> Recording:
+        return read_recording(options.folder / f"{name}.csv", arm, "actuator")
+
+    models = {name: identify_dynamic(read(name), arm).model for name in ("psm_one_no_weight", "psm_one")}
+    for reference, model in models.items():
+        for name, link, mass, place in WEIGHTS:
+            (payload,) = estimate_payload(read(reference), read(name), model.dynamic_model, [link])
+            _print_payload(arm, read(name), reference, name, payload, mass, np.array(place))
+    _print_seconds(models["psm_one"], read("psm_one_no_weight"))
+    return 0
+
+
+def _print_payload(
+    arm: Arm, recording: Recording, reference: str, name: str, payload: Payload, mass: float, place: np.ndarray
+) -> None:
+    body, offset = payload.body, payload.place_in_base - payload.body.place
+    print(f"{name} against {reference}, {payload.link}")
+    print(f"  mass {1000 * body.mass:.0f} +- {1000 * payload.mass_error:.0f} g (true {1000 * mass:.0f})")
+    for axis in range(3):
+        estimate = "not determined"
+        if body.determined[axis]:
+            estimate = f"{100 * payload.place_in_base[axis]:+.1f} +- {100 * payload.place_error[axis]:.1f} cm"
+        print(f"  {'xyz'[axis]} from the remote centre: {estimate} (true {100 * (place + offset)[axis]:+.1f})")
+    regressor = DynamicRegressor(arm)
+    grid = motion_grid(recording, arm, default_settings(arm))
+    k = [link.link for link in regressor.links].index(payload.link)
+    Y = regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
+    # Without their means, which no recording tells from an offset of the drive.
+    ours, true = (tau - np.mean(tau, axis=0) for tau in (Y @ body.parameters, Y @ point_mass_parameters(mass, place)))
+    share = np.sum(ours * true, axis=0)[:2] / np.sum(true**2, axis=0)[:2]
+    print(f"  its torque along the true one: yaw {share[0]:.0%}, pitch {share[1]:.0%}")
+
+
+def _print_seconds(model: IdentifiedModel, whole: Recording) -> None:
+    """Errors on the last two thirds after recalibration on the first seconds."""
+    rest = _rows(whole, slice(len(whole) // 3, None))
+
+    def percent(which: IdentifiedModel) -> str:
+        validation = validate_motion(which, rest)
+        return "  ".join(f"{100 * (a.relative_error or 0):5.1f}" for a in validation.actuators)
+
+    print(f"before    {percent(model)}")
+    for seconds in SECONDS:
+        assert whole.t is not None
+        result = recalibrate(model, _rows(whole, slice(0, int(np.searchsorted(whole.t, seconds)))))
+        left = [a.name for a in result.actuators if not a.kept]
+        print(f"{seconds:5.1f} s   {percent(result.model)}   left alone: {', '.join(left) or 'none'}")
+
+
+def _rows(recording: Recording, rows: slice) -> Recording:
+    fields = {name: getattr(recording, name) for name in ("q", "qd", "tau", "t")}
+    return dataclasses.replace(recording, lines=None, **{name: x[rows] for name, x in fields.items() if x is not None})
+
+
+if __name__ == "__main__":
+    sys.exit(main())
