@@ -1,9 +1,11 @@
 # make demo | make test | make lint | make benchmark: each sets itself up in .venv first. PYTHON=python3.12 picks another.
 PYTHON ?= python3
 VENV ?= .venv
+# Which tests test-fast runs, as pytest's -m: TESTS='not slow'.
+TESTS ?=
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-fast test-udp lint benchmark clean
+.PHONY: demo test test-fast test-udp test-collect lint benchmark clean
 
 demo: $(VENV)/.installed
 	$(BIN)/dvrk-drake demo --output demo_output
@@ -11,11 +13,15 @@ demo: $(VENV)/.installed
 test: test-fast test-udp
 
 test-fast: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -n 2 --dist loadfile --ignore-glob='*_udp.py'
+	$(BIN)/python -m pytest -n 2 --dist loadfile --ignore-glob='*_udp.py' -m '$(TESTS)'
 
 # One after the other: each runs several processes at 1 kHz, and wants the cores for itself.
 test-udp: $(VENV)/.installed-test
-	$(BIN)/python -m pytest tests/*_udp.py
+	$(BIN)/python -m pytest tests/test_lcm_udp.py tests/test_record_udp.py
+
+# Collections of both arms over UDP, from the first pose to the release: three minutes that CI takes.
+test-collect: $(VENV)/.installed-test
+	$(BIN)/python -m pytest tests/test_collect_udp.py tests/test_collect_psm_udp.py
 
 lint: $(VENV)/.installed-lint
 	$(BIN)/ruff check .

@@ -49,6 +49,7 @@ from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 ARM = load_arm("mtml")
 ARMS = ("standing", "simulated")
+SCHEDULINGS = {"normal": False, "real-time": True}
 CONDITIONS = ("quiet", "Meshcat client", "cores busy")
 RUN = ["-m", "dvrk_drake.cli", "run", "--arm", ARM.name.lower(), "--mode", "hold"]
 
@@ -260,6 +261,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="for each line of the table")
     parser.add_argument("--arm", choices=ARMS, help="only with this arm")
     parser.add_argument("--condition", choices=CONDITIONS, help="only this one")
+    parser.add_argument("--scheduling", choices=SCHEDULINGS, help="only this one")
     parser.add_argument("--echo", action="store_true", help="be the echo")
     parser.add_argument("--realtime", action="store_true", help="of the echo")
     parser.add_argument("--watch", type=int, metavar="PORT", help="be the Meshcat client")
@@ -279,8 +281,8 @@ def table(options: argparse.Namespace) -> None:
     print("|---|---|---|---|---|---|")
     for arm in ARMS if options.arm is None else [options.arm]:
         for condition in CONDITIONS if options.condition is None else [options.condition]:
-            for realtime in (False, True):
-                name = f"{arm} arm, {condition}{', real-time' if realtime else ''}"
+            for scheduling in SCHEDULINGS if options.scheduling is None else [options.scheduling]:
+                name, realtime = f"{arm} arm, {condition}, {scheduling}", SCHEDULINGS[scheduling]
                 simulated = arm == "simulated"
                 raw = report(
                     f"{name}: echo", measure([__file__, "--echo"], simulated, condition, options.seconds, realtime)

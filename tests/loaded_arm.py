@@ -53,7 +53,7 @@ def other_day(model: DynamicModel, q, v, vd, generator: np.random.Generator) -> 
         offset, spring = DRIVE_CHANGE * effort[i] * generator.normal(size=2)
         spring /= np.std(a[:, i])
         effects.append(
-            ActuatorEffectEstimate(f"actuator.{joint}", "spring", float(np.max(np.abs(a[:, i]))), float(spring))
+            ActuatorEffectEstimate(f"actuator.{joint}", "spring", float(2 * np.max(np.abs(a[:, i]))), float(spring))
         )
         effects.append(
             ActuatorEffectEstimate(f"actuator.{joint}", "offset", 0.0, float(offset - spring * np.mean(a[:, i])))

@@ -16,6 +16,8 @@ from dvrk_drake.cli import main
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import write_recording
 
+pytestmark = pytest.mark.slow
+
 PUBLISHED = {
     "mtmr": [8.18, 16.31, 19.06, 20.90, 26.30, 23.48, 33.96],
     "psm": [10.28, 18.28, 19.76, 13.44, 23.99, 21.11, 26.62],

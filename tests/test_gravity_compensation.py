@@ -24,6 +24,8 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
 
+pytestmark = pytest.mark.slow
+
 
 def dvrk_controller(path, q, qd):
     """tau (7) as the dVRK computes it from the file's text: one pose, plain numbers, nothing of ours."""

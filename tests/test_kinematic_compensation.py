@@ -13,6 +13,8 @@ from dvrk_drake.dynamics.kinematic_compensation import kinematic_compensation
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import load_arm
 
+pytestmark = pytest.mark.slow
+
 
 def dvrk_controller(path, q, gravity):
     """[yaw, pitch, insertion]: Newton-Euler from the last link to the first of the file's chain, standing still."""

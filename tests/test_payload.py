@@ -18,6 +18,8 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.models.recording import Recording, read_recording, write_recording
 
+pytestmark = pytest.mark.slow
+
 CASES = {
     "end": ("psm", "end_link", 0.2, [0.02, 0.02, 0.39]),
     "bar": ("psm", "bottom_bar_link", 0.1, [0.03, 0.165, 0.056]),
@@ -127,7 +129,8 @@ def test_from_the_command_line(tmp_path, capsys):
     (payload,) = json.loads(written.read_text())
     reach = 1.5 * payload["quantile"] * payload["mass_standard_error"]
     assert abs(payload["mass"] - mass) < reach
-    assert f"Payload on {link}" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"Payload on {link}" in printed and "mass [kg]" in printed and "x [m]" in printed
     assert main(["payload", *paths, "--arm", name, "--link", "nose"]) == 2
     assert main(["payload", *paths, "--arm", name, "--json", paths[0]]) == 2
     assert main(["payload", paths[0], str(tmp_path / "none.csv"), "--arm", name]) == 2

@@ -18,6 +18,8 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import Recording, read_recording, write_recording
 
+pytestmark = pytest.mark.slow
+
 NOISE = 0.02
 
 
@@ -140,6 +142,11 @@ def test_from_the_command_line(tmp_path, capsys):
     assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], "--output", paths["model.yaml"]]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2 and "has no dynamics" in lines[0] and "is an input" in lines[1]
+    spiked = read_recording(paths["short.csv"], load_arm("psm"))
+    spiked.tau[500, 1] = 500.0
+    write_recording(spiked, paths["short.csv"])
+    assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], "--output", paths["new.yaml"]]) == 2
+    assert "above its limit" in capsys.readouterr().out
 
 
 def test_another_day_of_a_real_arm(shared_data):

@@ -5,19 +5,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 from synthetic_motion import EFFORT_NOISE, PERIOD, RATE, clean_motion
 
 from dvrk_drake.analysis.convert import read_wpi_csv, wpi_in_joint_coordinates
 from dvrk_drake.analysis.low_pass import low_pass
+from dvrk_drake.analysis.poses import find_poses
 from dvrk_drake.analysis.recording_check import check_recording
+from dvrk_drake.analysis.tables import make_table
 from dvrk_drake.analysis.true_time import true_time
 from dvrk_drake.cli import main
+from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.lcm_log import LcmEvent, event_bytes
 from dvrk_drake.models.lcm_messages import status_channel
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 from dvrk_drake.models.recording import Recording, read_recording, write_recording
+
+pytestmark = pytest.mark.slow
 
 ARMS = "psm", "mtmr"
 
@@ -455,9 +461,33 @@ def test_real_insertion_has_noise_between_5_and_17_hz_and_a_late_effort(real, na
 
 
 @pytest.mark.parametrize("name", ["mtm_one", "psm_one"])
-@pytest.mark.parametrize("joint", range(7))
+@pytest.mark.parametrize("joint", [0, 2, 4, 6])
 def test_real_motor_with_the_wrong_sign_is_refused(real_motion, name, joint):
     arm = real_arm(name)
     motors = changed(real_motion(name).in_actuator_coordinates(arm), "tau", joint, lambda x: -x)
     refusals = check_recording(motors, arm).refusals
     assert [(f.kind, f.joints) for f in refusals] == [("effort sign", (joint,))]
+
+
+def test_spikes_of_an_effort_are_refused_in_a_motion():
+    def spike(tau):
+        tau = tau.copy()
+        tau[[300, 700]] = 500.0
+        return tau
+
+    finding = found(changed(clean_motion(), "tau", 1, spike))["above effort limit"][0]
+    assert finding.severity == "refusal" and "2 rows" in finding.what
+
+
+@pytest.mark.parametrize("rows", [np.random.default_rng(0).permutation(1000), np.r_[0:500, 499:999]])
+def test_a_motion_whose_times_go_back_is_not_taken_for_poses(rows):
+    motion = clean_motion()
+    shuffled = Recording(q=motion.q[rows], tau=motion.tau[rows], qd=motion.qd[rows], t=motion.t[rows])
+    with pytest.raises(RecordingError, match="t does not increase"):
+        find_poses(shuffled, load_arm("psm"))
+
+
+def test_units_in_the_headings_of_tables_are_printed():
+    console = Console(record=True, width=120)
+    console.print(make_table("title [kg]", "", "mass [kg]"))
+    assert "mass [kg]" in console.export_text()

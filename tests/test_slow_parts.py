@@ -16,6 +16,8 @@ from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import Recording, read_recording
 
+pytestmark = pytest.mark.slow
+
 RATE = 200.0
 
 

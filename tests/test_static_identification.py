@@ -17,6 +17,8 @@ from dvrk_drake.errors import IdentificationError, ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import Recording, read_recording
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def arm():

@@ -38,10 +38,13 @@ def print_dynamics(console: Console, model: IdentifiedModel) -> None:
     table.add_row("mean", "", "", "", *(_mean_percent(section.actuators, w) for w in _MEANS))
     console.print(table)
     console.print(
-        "* phases of the motion predicted from the other phases (stretches, if it does not repeat)", style="dim"
+        "* phases of the motion predicted from the other phases (stretches, if it does not repeat); which effects "
+        "there are was chosen with all of them: expect more error on another motion",
+        style="dim",
+        soft_wrap=True,
     )
     console.print(
-        "** what differs from period to period: no model of q, v and vd is better on all periods\n", style="dim"
+        "** what differs from period to period; a fit is below it where the executed motion differs too\n", style="dim"
     )
 
 

@@ -27,7 +27,7 @@ class ActuatorError:
     `relative_error` = rms_error / rms_effort, None where nothing was measured. The rest of it splits rms_error^2 into
     shares: `bias` is its mean, `friction_like` what viscous and Coulomb friction in the actuator would explain of it
     then, `position_dependent` what two harmonics over its travel would explain of what is left, `other` the remainder.
-    `repeatability`: the relative error that no model of q, v and vd is below, None where the motion does not repeat.
+    `repeatability`: what differs from period to period, relative; None where the motion does not repeat.
     """
 
     name: str

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rich.console import Console
+from rich.markup import escape
 
 from dvrk_drake.analysis.payload import CONFIDENCE, Payload, as_good
 from dvrk_drake.analysis.tables import make_table
@@ -52,10 +53,12 @@ def print_payload(console: Console, payload: Payload) -> None:
         rows.append((f"{axis} [m]", x, error, f"{base:+.4f}"))
     for k, (name, value, error, base) in enumerate(rows):
         if k and not payload.body.determined[k - 1]:
-            table.add_row(name, "not determined by this motion", "", "", "")
+            table.add_row(escape(name), "not determined by this motion", "", "", "")
             continue
         reach = payload.quantile * error
-        table.add_row(name, f"{value:+.4f}", f"{error:.4f}", f"{value - reach:+.4f} .. {value + reach:+.4f}", base)
+        table.add_row(
+            escape(name), f"{value:+.4f}", f"{error:.4f}", f"{value - reach:+.4f} .. {value + reach:+.4f}", base
+        )
     console.print(table)
     table = make_table("RMS efforts [N m; N if prismatic]", "", "change", "payload", "left*", "explained")
     for actuator in payload.actuators:
@@ -63,8 +66,11 @@ def print_payload(console: Console, payload: Payload) -> None:
         numbers = (f"{x:.4f}" for x in (actuator.change, actuator.payload, actuator.left))
         table.add_row(actuator.name, *numbers, explained)
     console.print(table)
-    console.print("* by the payload and by what changed in the drives, see docs/payload.md\n", style="dim")
+    console.print("* by the payload and by what changed in the drives: offsets, friction\n", style="dim")
     if not payload.found:
         console.print(
-            f"The mass may be 0: these recordings show no payload on {payload.link}.", style="yellow", soft_wrap=True
+            f"The interval of the mass on {payload.link} includes 0: these recordings do not tell it from "
+            "no payload there, or tell only mass times distance.",
+            style="yellow",
+            soft_wrap=True,
         )

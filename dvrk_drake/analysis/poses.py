@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.rests import rest_poses
+from dvrk_drake.analysis.rests import LEAST_ROWS, LONGEST_PERIOD, rest_poses
 from dvrk_drake.analysis.slow_parts import slow_parts
 from dvrk_drake.analysis.static_identification import LEAST_POSES
+from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
 
@@ -45,13 +46,27 @@ def find_poses(recording: Recording, arm: Arm, take_slow_parts: bool = False) ->
         take_slow_parts: of a motion without enough rests, see `slow_parts`.
 
     Raises:
-        RecordingError: the recording does not fit the arm, or has no efforts.
+        RecordingError: the recording does not fit the arm, has no efforts, or is a motion whose times go back.
         IdentificationError: no slow parts, where they are wanted.
     """
     recording.check_fits(arm)
+    _check_times(recording, arm)
     rests = rest_poses(recording, arm)
     if rests is not None and len(rests) >= LEAST_POSES:
         return Poses(rests, None, f"{len(rests)} poses at which the arm rests are taken; {len(recording)} rows")
     if take_slow_parts:
         return Poses(*slow_parts(recording, arm), note=SLOW_PARTS_NOTE)
     return Poses(recording, None, "", moves=rests is not None and bool(recording.motion(arm)))
+
+
+def _check_times(recording: Recording, arm: Arm) -> None:
+    """Refuses a motion whose times do not increase: it would be taken for poses."""
+    t = recording.t
+    if t is None or len(t) < LEAST_ROWS or np.all(np.diff(t) > 0):
+        return
+    if np.median(np.abs(np.diff(t))) < LONGEST_PERIOD or recording.motion(arm):
+        row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
+        raise RecordingError(
+            f"{recording.where(row)}: time t does not increase; rows of a motion must follow in time: sort them, and "
+            "write one clock's times [s]"
+        )

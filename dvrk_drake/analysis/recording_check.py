@@ -22,6 +22,8 @@ LEAST_RANGE = 0.02, 0.002
 LEAST_COVERAGE = 0.1
 #: Beyond its limits by more than this, a pose is worth a line [rad], [m].
 LIMIT_MARGIN = 0.005, 0.0005
+#: A motion's effort beyond its limit by this factor is a spike of the measurement, whatever the limit's own error.
+IMPOSSIBLE_EFFORT = 5.0
 #: Fewest rows in a flat top, and share of all rows that make it one: an effort that stays at its extreme is clipped.
 FLAT_ROWS, FLAT_SHARE = 5, 0.002
 #: Times that q and qd contradict by more than this factor are in another unit or at another rate.
@@ -54,7 +56,7 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
         return replace(report, findings=(refusal, *findings))
     numbers = _joint_signals(joints, arm)
     findings += _positions(joints, arm, numbers)
-    findings += _efforts(recording.in_actuator_coordinates(arm), tau, arm)
+    findings += _efforts(recording.in_actuator_coordinates(arm), tau, arm, report.kind)
     time = _time(recording, report.kind)
     findings += time
     report = replace(report, joints=numbers)
@@ -115,7 +117,7 @@ def _positions(joints: Recording, arm: Arm, numbers: tuple[JointSignals, ...]) -
     return findings
 
 
-def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm) -> list[Finding]:
+def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str) -> list[Finding]:
     findings = []
     for j, name in enumerate(arm.joint_names):
         if not np.any(tau[:, j]):
@@ -127,7 +129,14 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm) -> list[F
             most = float(np.max(np.abs(tau[:, j])) / arm.effort_limits[j])
             what = f"effort above its limit of {arm.effort_limits[j]:.3g} in {exceeds} rows, up to {most:.0%}"
             advice = "such peaks may be clipped or spikes of the current's measurement"
-            findings.append(Finding("note", "above effort limit", name, what, advice, (j,), most))
+            severity: Severity = "note"
+            if kind == "motion" and most > IMPOSSIBLE_EFFORT:
+                # A pose may press on a stop, and is doubted later; in a motion a few such rows spoil the whole fit.
+                severity = "refusal"
+                advice = (
+                    "no motor of this arm does that; mend or remove the spikes, or correct the limit in the arm's file"
+                )
+            findings.append(Finding(severity, "above effort limit", name, what, advice, (j,), most))
         measured = actuators.measured_effort()[:, j]
         for extreme in (np.max(measured), np.min(measured)):
             share = _flat_share(measured, float(extreme))

@@ -234,5 +234,6 @@ def make_table(title: str, *columns: str) -> Table:
     table = Table(title=text, title_justify="left", box=None, pad_edge=False, expand=False)
     for i, column in enumerate(columns):
         # The name of a base parameter may be long; numbers are never cut.
-        table.add_column(column, justify="left" if i == 0 else "right", no_wrap=i > 0, overflow="fold")
+        # Units in brackets are no markup.
+        table.add_column(escape(column), justify="left" if i == 0 else "right", no_wrap=i > 0, overflow="fold")
     return table

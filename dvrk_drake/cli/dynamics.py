@@ -11,9 +11,27 @@ from dvrk_drake.cli.support import ProgressBar
 from dvrk_drake.errors import RecordingError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.recording import Recording
+
+
+def refuse_unusable(console: Console, recording: Recording, arm: Arm, warn: bool = False) -> None:
+    """Prints what `check` refuses in a recording, and its warnings if wanted.
+
+    Raises:
+        RecordingError: it refuses anything.
+    """
+    from dvrk_drake.analysis.recording_check import check_recording
+
+    report = check_recording(recording, arm)
+    for finding in report.findings:
+        if finding.severity == "refusal" or (warn and finding.severity == "warning"):
+            console.print(str(finding), style="yellow", markup=False, soft_wrap=True)
+    if report.refusals:
+        raise RecordingError(f"{recording.source or 'recording'}: refused, see above and dvrk-drake check")
 
 
 def identify_motion(options: argparse.Namespace, recording: Recording, arm: Arm, plots: Path | None) -> None:
@@ -21,16 +39,10 @@ def identify_motion(options: argparse.Namespace, recording: Recording, arm: Arm,
     from dvrk_drake.analysis.dynamic_identification import identify_dynamic
     from dvrk_drake.analysis.dynamic_tables import print_dynamics
     from dvrk_drake.analysis.dynamic_validation import validate_motion
-    from dvrk_drake.analysis.recording_check import check_recording
     from dvrk_drake.analysis.tables import make_console
 
     console = make_console()
-    report = check_recording(recording, arm)
-    for finding in report.findings:
-        if finding.severity != "note":
-            console.print(str(finding), style="yellow", markup=False, soft_wrap=True)
-    if report.refusals:
-        raise RecordingError(f"{options.recording}: refused, see above and dvrk-drake check")
+    refuse_unusable(console, recording, arm, warn=True)
     with ProgressBar("identifying") as (progress, task):
         result = identify_dynamic(recording, arm, lambda share: progress.update(task, completed=100 * share))
     print_dynamics(console, result.model)

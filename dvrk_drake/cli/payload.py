@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
+from dvrk_drake.cli.dynamics import refuse_unusable
 from dvrk_drake.cli.support import ProgressBar, add_gravity, check_output, mounted, print_notes
 
 
@@ -44,10 +45,12 @@ def _payload(options: argparse.Namespace) -> None:
     arm = mounted(load_arm(options.arm), options.gravity) if model is None else model.load_arm()
     if options.json is not None:
         check_output(options.json, options.reference, options.loaded)
+    console = make_console()
     recordings = []
     for path in (options.reference, options.loaded):
         recordings.append(read_recording(path, arm, options.coordinates))
         print_notes(path, recordings[-1].notes)
+        refuse_unusable(console, recordings[-1], arm)
     reference, loaded = recordings
     with ProgressBar("estimating") as (progress, task):
         if model is None:
@@ -62,7 +65,6 @@ def _payload(options: argparse.Namespace) -> None:
             None if options.link is None else [options.link],
             lambda done: progress.update(task, completed=share + (100 - share) * done),
         )
-    console = make_console()
     if options.link is None:
         print_links(console, estimates)
     print_payload(console, estimates[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from dvrk_drake.cli.dynamics import refuse_unusable
 from dvrk_drake.cli.support import add_recording, check_output, print_notes
 
 
@@ -27,8 +28,9 @@ def _recalibrate(options: argparse.Namespace) -> None:
     recording = read_recording(options.recording, model.load_arm(), options.coordinates)
     print_notes(options.recording, recording.notes)
     check_output(options.output, options.recording, options.model)
-    result = recalibrate(model, recording)
     console = make_console()
+    refuse_unusable(console, recording, model.load_arm())
+    result = recalibrate(model, recording)
     print_recalibration(console, result)
     result.model.save(options.output)
     console.print(f"model: {options.output}")
