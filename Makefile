@@ -5,7 +5,7 @@ VENV ?= .venv
 TESTS ?=
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-fast test-udp test-collect lint benchmark clean
+.PHONY: demo test test-fast test-udp test-recordings lint benchmark clean
 
 demo: $(VENV)/.installed
 	$(BIN)/dvrk-drake demo --output demo_output
@@ -17,11 +17,11 @@ test-fast: $(VENV)/.installed-test
 
 # One after the other: each runs several processes at 1 kHz, and wants the cores for itself.
 test-udp: $(VENV)/.installed-test
-	$(BIN)/python -m pytest tests/test_lcm_udp.py tests/test_record_udp.py
+	$(BIN)/python -m pytest tests/test_lcm_udp.py
 
-# Collections of both arms over UDP, from the first pose to the release: three minutes that CI takes.
-test-collect: $(VENV)/.installed-test
-	$(BIN)/python -m pytest tests/test_collect_udp.py tests/test_collect_psm_udp.py
+# Recordings over UDP, and collections of both arms from the first pose to the release: minutes that CI takes.
+test-recordings: $(VENV)/.installed-test
+	$(BIN)/python -m pytest tests/test_record_udp.py tests/test_collect_udp.py tests/test_collect_psm_udp.py
 
 lint: $(VENV)/.installed-lint
 	$(BIN)/ruff check .

@@ -74,23 +74,24 @@ def identify_dynamic(
     tau = recording.in_actuator_coordinates(arm).measured_effort()
     progress(0.05)
     period = period_of(grid)
-    problem = _problem(grid, tau, period)
+    problem = motion_problem(grid, tau, period)
     progress(0.2)
-    chosen, problem = _chosen_effects(problem, lambda share: progress(0.2 + 0.4 * share))
-    weights = _weights(problem, chosen)
+    chosen, problem = choose_effects(problem, lambda share: progress(0.2 + 0.4 * share))
+    weights = effort_weights(problem, chosen)
     fit = problem.consistent(chosen, weights)
     left_out = np.zeros(arm.num_joints)
     for fold in range(fit.folds):
         progress(0.65 + 0.35 * fold / fit.folds)
         left_out += fit.fold_errors(fold)
     section = _section(problem, chosen, fit, left_out, grid, tau, period)
-    predicted = problem.columns.tau - _residuals(problem, chosen, fit)
+    predicted = problem.columns.tau - residuals(problem, chosen, fit)
     model = _model(recording, arm, section, problem, fit)
     progress(1.0)
     return DynamicIdentification(model, grid, period, problem.columns.tau, predicted)
 
 
-def _problem(grid: MotionGrid, tau: NDArray[np.float64], period: float | None) -> DynamicProblem:
+def motion_problem(grid: MotionGrid, tau: NDArray[np.float64], period: float | None) -> DynamicProblem:
+    """The least squares of a motion; tau (m, n): the actuators' measured efforts, a row of the recording each."""
     effects = [*friction_effects(grid.arm, grid), *optional_effects(grid.arm, grid)]
     regressor = DynamicRegressor(grid.arm)
     columns = dynamic_columns(grid, tau, regressor, effects)
@@ -101,7 +102,7 @@ def _problem(grid: MotionGrid, tau: NDArray[np.float64], period: float | None) -
     return DynamicProblem(columns, regressor, fold, edge, min(independent, len(columns.tau)))
 
 
-def _chosen_effects(
+def choose_effects(
     problem: DynamicProblem, progress: Callable[[float], object]
 ) -> tuple[NDArray[np.int_], DynamicProblem]:
     """The effects, and the problem with gravity as the motion shows it."""
@@ -125,13 +126,15 @@ def _chosen_effects(
     return selection.choose(friction, candidates, lambda s: progress(0.5 + 0.5 * s)), problem
 
 
-def _weights(problem: DynamicProblem, chosen: NDArray[np.int_]) -> NDArray[np.float64]:
+def effort_weights(problem: DynamicProblem, chosen: NDArray[np.int_]) -> NDArray[np.float64]:
+    """(n,) one over the variance that each actuator's effort keeps with these effects."""
     selection = problem.selection()
     selection.fit(chosen)
     return selection.weights
 
 
-def _residuals(problem: DynamicProblem, chosen: NDArray[np.int_], fit: ConsistentFit) -> NDArray[np.float64]:
+def residuals(problem: DynamicProblem, chosen: NDArray[np.int_], fit: ConsistentFit) -> NDArray[np.float64]:
+    """(r, n) what a fit with these effects leaves of the efforts, on the rows of `problem`."""
     columns, p = problem.columns, problem.num_rigid
     drive = np.column_stack(
         [columns.shapes[i][:, chosen] @ (columns.rows[chosen, i] * fit.x[p:]) for i in range(columns.tau.shape[1])]

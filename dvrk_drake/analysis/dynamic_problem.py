@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -136,6 +136,15 @@ class DynamicProblem:
         """(p,) phi of a selection's unknowns x (k,)."""
         V = self._informative
         return self.prior + self.deviation * (V @ x[: V.shape[1]])
+
+    def subset(self, rows: NDArray[np.bool_]) -> DynamicProblem:
+        """The problem of some of the rows (r,), with their folds numbered anew."""
+        c = self.columns
+        shapes = tuple(shape[rows] for shape in c.shapes)
+        columns = replace(c, tau=c.tau[rows], rigid=c.rigid[rows], tilts=c.tilts[:, rows], shapes=shapes)
+        fold = np.unique(self.fold[rows], return_inverse=True)[1]
+        independent = self.independent * float(np.mean(rows))
+        return replace(self, columns=columns, fold=fold, edge=self.edge[rows], independent=independent)
 
     def consistent(self, chosen: NDArray[np.int_], weights: NDArray[np.float64]) -> ConsistentFit:
         """The physically consistent fit with some of the effects, and its cross-validation.
