@@ -1,8 +1,8 @@
 # make demo | make test | make lint | make benchmark: each sets itself up in .venv first. PYTHON=python3.12 picks another.
 PYTHON ?= python3
 VENV ?= .venv
-# Which tests test-fast runs, as pytest's -m: TESTS='not slow'.
-TESTS ?=
+# Which tests test-fast runs, as pytest's -m; TESTS= runs all of them, as CI does.
+TESTS ?= not slow
 BIN := $(VENV)/bin
 
 .PHONY: demo test test-fast test-udp test-recordings lint benchmark clean
