@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic_columns import dynamic_columns, friction_effects, optional_effects
+from dvrk_drake.analysis.dynamic_covariance import parameter_covariance
 from dvrk_drake.analysis.dynamic_problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.dynamic_statics import base_parameter_estimates
 from dvrk_drake.analysis.motion_grid import MotionGrid, default_settings, motion_grid
@@ -83,11 +84,12 @@ def identify_dynamic(
     for fold in range(fit.folds):
         progress(0.65 + 0.35 * fold / fit.folds)
         left_out += fit.fold_errors(fold)
-    section = _section(problem, chosen, fit, left_out, grid, tau, period)
-    predicted = problem.columns.tau - residuals(problem, chosen, fit)
-    model = _model(recording, arm, section, problem, fit)
+    left = residuals(problem, chosen, fit)
+    covariance = parameter_covariance(problem, fit, left, grid.rate, grid.settings.effort_cut_off, period)
+    section = _section(problem, chosen, fit, covariance, left_out, grid, tau, period)
+    model = _model(recording, arm, section, covariance)
     progress(1.0)
-    return DynamicIdentification(model, grid, period, problem.columns.tau, predicted)
+    return DynamicIdentification(model, grid, period, problem.columns.tau, problem.columns.tau - left)
 
 
 def motion_problem(grid: MotionGrid, tau: NDArray[np.float64], period: float | None) -> DynamicProblem:
@@ -146,13 +148,14 @@ def _section(
     problem: DynamicProblem,
     chosen: NDArray[np.int_],
     fit: ConsistentFit,
+    covariance: NDArray[np.float64],
     left_out: NDArray[np.float64],
     grid: MotionGrid,
     tau: NDArray[np.float64],
     period: float | None,
 ) -> DynamicSection:
     arm, p = grid.arm, problem.num_rigid
-    sd = np.sqrt(np.diag(fit.covariance))
+    sd = np.sqrt(np.diag(covariance))
     links = [
         LinkEstimate(link.link, [float(v) for v in x], float(np.linalg.eigvalsh(pseudo_inertia(x))[0]))
         for link, x in zip(problem.regressor.links, fit.x[: p - arm.num_joints].reshape(-1, 10), strict=True)
@@ -186,7 +189,7 @@ def _section(
 
 
 def _model(
-    recording: Recording, arm: Arm, section: DynamicSection, problem: DynamicProblem, fit: ConsistentFit
+    recording: Recording, arm: Arm, section: DynamicSection, covariance: NDArray[np.float64]
 ) -> IdentifiedModel:
     in_joints = recording.in_joint_coordinates(arm)
     joints = []
@@ -210,5 +213,5 @@ def _model(
     # The model's own arm, whose gravity is derived once for all.
     as_mounted = model.load_arm()
     regressor = DynamicRegressor(as_mounted)
-    model.base_parameters = base_parameter_estimates(as_mounted, section, regressor, fit.covariance)
+    model.base_parameters = base_parameter_estimates(as_mounted, section, regressor, covariance)
     return model

@@ -16,6 +16,7 @@ from pydrake.common.yaml import yaml_load_typed
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_schema import (
     ArmDescription,
+    BoundingShapes,
     CoupledLimit,
     Gains,
     Instrument,
@@ -55,6 +56,7 @@ class Arm:
         friction_coordinates: name -> (n,) coefficients of the joints: where parts rub beside joints and actuators.
         motion: how the signals of a recorded motion are treated, one value a joint.
         effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].
+        bounding_shapes: where the mass of the links of each file of `sdf` can be, see `bounding_boxes`.
     """
 
     name: str
@@ -75,6 +77,7 @@ class Arm:
     friction_coordinates: dict[str, NDArray[np.float64]]
     motion: MotionSettings
     effort_cut_off: float
+    bounding_shapes: tuple[BoundingShapes, ...]
 
     @property
     def num_joints(self) -> int:
@@ -240,6 +243,7 @@ def _build_arm(
         },
         motion=motion,
         effort_cut_off=_checked_cut_off(path, mechanism),
+        bounding_shapes=tuple(part.bounding_shapes for part in (mechanism, instrument) if part.sdf),
     )
 
 

@@ -48,6 +48,26 @@ class MotionSettings:
 
 
 @dataclass
+class BoxCorners:
+    """A box along the axes of a link's frame: its lower and upper corner [m]."""
+
+    lower: list[float] = field(default_factory=list)
+    upper: list[float] = field(default_factory=list)
+
+
+@dataclass
+class BoundingShapes:
+    """Where the mass of the links of one SDF file can be: in the box around a link's collision shapes, widened.
+
+    `margin` [m] on all sides is for what is not drawn: covers, screws, cables. `boxes` are those of links whose shapes
+    are not where their mass is, or that have none; no margin is added to them.
+    """
+
+    margin: float = 0.04
+    boxes: dict[str, BoxCorners] = field(default_factory=dict)
+
+
+@dataclass
 class Mechanism:
     """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common.
 
@@ -62,6 +82,7 @@ class Mechanism:
     loop_closures: list[LoopClosure] = field(default_factory=list)
     motion: MotionSettings = field(default_factory=MotionSettings)
     effort_cut_off: float = 10.0
+    bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
 
 
 @dataclass
@@ -80,6 +101,7 @@ class Instrument:
     gains: Gains = field(default_factory=Gains)
     friction_coordinates: dict[str, dict[str, float]] = field(default_factory=dict)
     motion: MotionSettings = field(default_factory=MotionSettings)
+    bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
 
 
 @dataclass
