@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 
@@ -16,6 +16,7 @@ from dvrk_drake.analysis.dynamic_statics import base_parameter_estimates
 from dvrk_drake.analysis.motion_grid import MotionGrid, default_settings, motion_grid
 from dvrk_drake.analysis.phase_folds import period_of, phase_folds
 from dvrk_drake.analysis.repetition import repeatability_floor
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import (
     ActuatorEffectEstimate,
@@ -92,9 +93,15 @@ def identify_dynamic(
     return DynamicIdentification(model, grid, period, problem.columns.tau, problem.columns.tau - left)
 
 
-def motion_problem(grid: MotionGrid, tau: NDArray[np.float64], period: float | None) -> DynamicProblem:
-    """The least squares of a motion; tau (m, n): the actuators' measured efforts, a row of the recording each."""
-    effects = [*friction_effects(grid.arm, grid), *optional_effects(grid.arm, grid)]
+def motion_problem(
+    grid: MotionGrid, tau: NDArray[np.float64], period: float | None, effects: Sequence[ActuatorEffect] | None = None
+) -> DynamicProblem:
+    """The least squares of a motion; tau (m, n): the actuators' measured efforts, a row of the recording each.
+
+    `effects`: the candidates, where they are known.
+    """
+    if effects is None:
+        effects = [*friction_effects(grid.arm, grid), *optional_effects(grid.arm, grid)]
     regressor = DynamicRegressor(grid.arm)
     columns = dynamic_columns(grid, tau, regressor, effects)
     fold, edge = phase_folds(grid, period)
