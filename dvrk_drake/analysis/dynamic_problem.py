@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.dynamic_columns import DynamicColumns
 from dvrk_drake.analysis.dynamic_selection import EffectSelection
 from dvrk_drake.analysis.normal_equations import NormalEquations, squared_errors
+from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.physical_consistency import LinkScale, consistent_parameters, log_det_curvature
 from dvrk_drake.dynamics.rotor_inertia import rotor_links
@@ -20,8 +21,9 @@ from dvrk_drake.models.bounding_boxes import BoundingBox, bounding_boxes
 LINK_DEVIATION = 0.3
 #: Least deviation of a rotor's inertia, and its least value as a share of the SDF's [kg m^2].
 LEAST_ROTOR_DEVIATION, LEAST_ROTOR_SHARE = 3e-6, 0.1
-#: Deviation of an effect about 0, as a share of the RMS efforts it acts on.
-EFFECT_DEVIATION = 0.3
+#: Deviation of an effect about 0, as a share of the RMS efforts it acts on: of friction, of which there are many shapes
+#: that add up; of torques by position that a drive is known to have, which gravity may balance; of all others.
+FRICTION_DEVIATION, KNOWN_DEVIATION, EFFECT_DEVIATION = 0.1, 1.0, 0.3
 #: Deviation of gravity's direction [rad]: how level a base stands.
 TILT_DEVIATION = 0.05
 #: The SDF says all about directions of the rigid body's parameters that the recording knows this much less of.
@@ -42,6 +44,7 @@ class DynamicProblem:
         tilt: (2,) change of gravity's x and y [m/s^2] that the columns are made for.
         fold, edge: see `phase_folds`.
         independent: how many rows are independent measurements of an effort; the others repeat them.
+        num_always: so many effects, the first ones, are in every model; the others are candidates.
     """
 
     columns: DynamicColumns
@@ -49,6 +52,7 @@ class DynamicProblem:
     fold: NDArray[np.int_]
     edge: NDArray[np.bool_]
     independent: float
+    num_always: int
     tilt: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
 
     @property
@@ -60,6 +64,11 @@ class DynamicProblem:
     def num_effects(self) -> int:
         """Number of candidate effects."""
         return len(self.columns.effects)
+
+    @property
+    def candidates(self) -> NDArray[np.int_]:
+        """Indices of the effects that are chosen only if they help."""
+        return np.arange(self.num_always, self.num_effects)
 
     @cached_property
     def efforts(self) -> NDArray[np.float64]:
@@ -100,7 +109,13 @@ class DynamicProblem:
             np.mean((self.columns.shapes[i] * self.columns.rows[:, i]) ** 2, axis=0) / (self.efforts[i] / self.num_rows)
             for i in range(len(self.efforts))
         )
-        return np.asarray(size) / EFFECT_DEVIATION**2 + 1e-9
+        deviation = np.full(self.num_effects, EFFECT_DEVIATION)
+        for k, effect in enumerate(self.columns.effects):
+            if effect.dissipative:
+                deviation[k] = FRICTION_DEVIATION
+            elif k < self.num_always and effect.kind in POSITION_KINDS and effect.kind != "offset":
+                deviation[k] = KNOWN_DEVIATION
+        return np.asarray(size) / deviation**2 + 1e-9
 
     @property
     def num_rows(self) -> int:
@@ -111,23 +126,26 @@ class DynamicProblem:
         """The choice of effects, with the rigid body reduced to what the recording can tell.
 
         Args:
-            phi: (p,) the parameters about which a tilt is linearised: two more columns follow the effects'. By default
-                there is no tilt.
+            phi: (p,) the parameters about which the tilt is linearised: if the arm's base may tilt, it is two unknowns
+                more, which follow the effects'. By default the tilt stays as it is.
         """
-        V = self._informative
-        columns = (self._reduced_columns(i, phi) for i in range(len(self.efforts)))
+        columns = [self._reduced_columns(i, phi) for i in range(len(self.efforts))]
         left = self.columns.tau - self.rigid @ self.prior
         tilts = len(self.columns.tilts) if phi is not None else 0
-        precision = [np.ones(V.shape[1]), self.effect_precision, np.full(tilts, 1 / (9.81 * TILT_DEVIATION) ** 2)]
+        if tilts:
+            left += np.column_stack([X[:, -tilts:] @ self.tilt for X in columns])
+        informative = self._informative.shape[1]
+        precision = [np.ones(informative), self.effect_precision, np.full(tilts, 1 / (9.81 * TILT_DEVIATION) ** 2)]
         non_negative = [effect.dissipative for effect in self.columns.effects]
+        folds = int(self.fold.max()) + 1
         return EffectSelection(
             equations=NormalEquations.of(columns, left, self.fold, self.edge),
-            efforts=self.efforts,
-            num_rigid=V.shape[1],
+            efforts=np.array([np.sum(self.columns.tau[self.fold == f] ** 2, axis=0) for f in range(folds)]),
+            rows=np.bincount(self.fold),
+            num_rigid=informative,
             precision=np.concatenate(precision),
-            non_negative=np.array([False] * V.shape[1] + non_negative + [False] * tilts),
-            independent=self.independent,
-            rows=self.num_rows,
+            non_negative=np.array([False] * informative + non_negative + [False] * tilts),
+            independent=self.independent / self.num_rows,
         )
 
     def _reduced_columns(self, i: int, phi: NDArray[np.float64] | None) -> NDArray[np.float64]:
@@ -157,7 +175,7 @@ class DynamicProblem:
         return replace(self, columns=columns, fold=fold, edge=self.edge[rows], independent=independent)
 
     def consistent(self, chosen: NDArray[np.int_], weights: NDArray[np.float64]) -> ConsistentFit:
-        """The physically consistent fit with some of the effects, and its cross-validation.
+        """The physically consistent fit with some of the effects.
 
         Raises:
             IdentificationError: the solver did not converge.
@@ -190,46 +208,48 @@ class ConsistentFit:
     """
 
     def __init__(self, problem: DynamicProblem, chosen: NDArray[np.int_], weights: NDArray[np.float64]) -> None:
-        self._problem, self.chosen, self.weights = problem, chosen, weights
+        self.chosen, self.weights = chosen, weights
+        program = ConsistentProgram(problem, chosen)
+        self.lower = program.lower
+        full = [np.column_stack([problem.chosen_columns(i, chosen), tau]) for i, tau in enumerate(problem.columns.tau.T)]
+        total = np.array([X.T @ X for X in full])
+        self.x = program.solve(total, weights)
+        self.errors = squared_errors(total, self.x)
+        self.information = np.tensordot(weights, total[:, :-1, :-1], axes=(0, 0))
+        self.prior_precision = np.diag(program.precision) + log_det_curvature(self.x, problem.regressor.links)
+
+
+class ConsistentProgram:
+    """What the convex program of one problem knows before the recording, with chosen effects.
+
+    Attributes:
+        precision: (p + e,) one over the variance of each parameter and effect.
+        lower: (p + e,) bounds, -inf where there is none.
+    """
+
+    def __init__(self, problem: DynamicProblem, chosen: NDArray[np.int_]) -> None:
+        self._problem = problem
         links = problem.regressor.links
         effects = [problem.columns.effects[k] for k in chosen]
         rotors = LEAST_ROTOR_SHARE * problem.prior[10 * len(links) :]
         dissipative = [0.0 if effect.dissipative else -np.inf for effect in effects]
         self.lower = np.concatenate([np.full(10 * len(links), -np.inf), rotors, dissipative])
+        self.precision = np.concatenate([problem.deviation**-2, problem.effect_precision[chosen]])
         self._mean = np.concatenate([problem.prior, np.zeros(len(chosen))])
-        self._precision = np.concatenate([problem.deviation**-2, problem.effect_precision[chosen]])
-        stacked = [problem.chosen_columns(i, chosen) for i in range(len(problem.efforts))]
-        self._equations = NormalEquations.of(stacked, problem.columns.tau, problem.fold, problem.edge)
-        total = self._equations.total()
-        self.x = self._solve(total)
-        self.errors = squared_errors(total, self.x)
-        self.information = np.tensordot(weights, total[:, :-1, :-1], axes=(0, 0))
-        self.prior_precision = np.diag(self._precision) + log_det_curvature(self.x, links)
 
-    @property
-    def folds(self) -> int:
-        """Number of folds."""
-        return self._equations.folds
+    def solve(self, products: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """x (p + e,) from (n, p + e + 1, p + e + 1) sums of squares, the measured effort last.
 
-    def fold_errors(self, fold: int) -> NDArray[np.float64]:
-        """(n,) sum of squares that the program leaves of a fold when it knows only the others.
+        The sums of squares are compressed to a triangle by Cholesky's decomposition in units of the prior's deviation,
+        where no eigenvalue is below 1: as exact as the QR decomposition of the rows, and a hundred times shorter.
 
         Raises:
             IdentificationError: the solver did not converge.
         """
-        x = self._solve(self._equations.without_fold(fold))
-        return squared_errors(self._equations.of_fold(fold), x)
-
-    def _solve(self, products: NDArray[np.float64]) -> NDArray[np.float64]:
-        """x.
-
-        The sums of squares are compressed to a triangle by Cholesky's decomposition in units of the prior's deviation,
-        where no eigenvalue is below 1: as exact as the QR decomposition of the rows, and a hundred times shorter.
-        """
-        scale = 1 / np.sqrt(self._precision)
-        sums = np.tensordot(self.weights, products, axes=(0, 0))
-        H = sums[:-1, :-1] + np.diag(self._precision)
+        scale = 1 / np.sqrt(self.precision)
+        sums = np.tensordot(weights, products, axes=(0, 0))
+        H = sums[:-1, :-1] + np.diag(self.precision)
         R = np.linalg.cholesky(H * np.outer(scale, scale)).T
-        b = np.linalg.solve(R.T, (sums[:-1, -1] + self._precision * self._mean) * scale)
+        b = np.linalg.solve(R.T, (sums[:-1, -1] + self.precision * self._mean) * scale)
         problem = self._problem
         return consistent_parameters(R / scale, b, problem.regressor.links, problem.boxes, self.lower)

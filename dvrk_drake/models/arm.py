@@ -257,7 +257,8 @@ def _motion_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -
             if values and len(values) != len(part.joints):
                 raise ArmError(f"{path}: motion.{which} has {len(values)} numbers for {len(part.joints)} joints")
             both[which] += values or [default] * len(part.joints)
-    return MotionSettings(both["acceleration_cut_off"], both["effort_delay"], mechanism.motion.base_may_tilt)
+    torques = {**mechanism.motion.position_torques, **instrument.motion.position_torques}
+    return MotionSettings(both["acceleration_cut_off"], both["effort_delay"], mechanism.motion.base_may_tilt, torques)
 
 
 def _check_limits(path: Path, joint: str, limits: list[float], prismatic: bool) -> None:
