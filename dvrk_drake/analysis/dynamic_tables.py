@@ -82,12 +82,13 @@ def print_dynamic_validation(console: Console, validation: DynamicValidation) ->
 
 _COLUMNS = ("", "value", "+-", "unit")
 _EFFECT_COLUMNS = ("", "kind", "scale", "value", "+-", "unit if it turns")
-_NAME_WIDTH = 64
+_NAME_WIDTH, _REMARK_WIDTH = 64, 30
 _MEANS = ("rms_fit", "rms_cross_validation", "rms_repeatability")
 
 
 def _print_links(console: Console, section: DynamicSection, nominal_mass: float) -> None:
     table = make_table("Links", "", "mass [kg]", "+-", "centre of mass [m]", "+-", "")
+    table.columns[-1].no_wrap, table.columns[-1].max_width = False, _REMARK_WIDTH
     for link in section.links:
         m, *h = link.parameters[:4]
         com = np.array(h) / m

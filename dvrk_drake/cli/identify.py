@@ -165,7 +165,7 @@ def _predict(options: argparse.Namespace) -> None:
     arm = model.load_arm()
     recording = read_recording(options.recording, arm, options.coordinates)
     print_notes(options.recording, recording.notes)
-    if recording.tau is not None:  # a prediction needs none, the check does
+    if recording.tau is not None:  # of poses a prediction needs none
         refuse_unusable(make_console(), recording, arm, warn=True)
     if model.dynamics is not None and find_poses(recording, arm).moves:
         tau = predict_motion(model, recording)
