@@ -162,9 +162,7 @@ def _section(
     return DynamicSection([float(g) for g in gravity], links, rotors, effects, actuators, grid.settings, expected)
 
 
-def _model(
-    recording: Recording, arm: Arm, section: DynamicSection, covariance: NDArray[np.float64]
-) -> IdentifiedModel:
+def _model(recording: Recording, arm: Arm, section: DynamicSection, covariance: NDArray[np.float64]) -> IdentifiedModel:
     in_joints = recording.in_joint_coordinates(arm)
     joints = []
     for j, name in enumerate(arm.joint_names):

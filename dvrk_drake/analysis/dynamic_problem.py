@@ -211,7 +211,9 @@ class ConsistentFit:
         self.chosen, self.weights = chosen, weights
         program = ConsistentProgram(problem, chosen)
         self.lower = program.lower
-        full = [np.column_stack([problem.chosen_columns(i, chosen), tau]) for i, tau in enumerate(problem.columns.tau.T)]
+        full = [
+            np.column_stack([problem.chosen_columns(i, chosen), tau]) for i, tau in enumerate(problem.columns.tau.T)
+        ]
         total = np.array([X.T @ X for X in full])
         self.x = program.solve(total, weights)
         self.errors = squared_errors(total, self.x)
