@@ -38,9 +38,9 @@ def print_dynamics(console: Console, model: IdentifiedModel) -> None:
     table.add_row("mean", "", "", "", *(_mean_percent(section.actuators, w) for w in _MEANS))
     console.print(table)
     console.print(
-        "* sixths of the motion's phases (stretches, if it does not repeat) predicted by models that know nothing of them: "
-        "neither parameters nor the choice of effects nor how the base leans. What the arm's file knows of its drives it "
-        "knows from motions like this, and another day has other friction: expect more error there",
+        "* sixths of the motion's phases (stretches, if it does not repeat) predicted by models that know nothing of "
+        "them: neither parameters nor the choice of effects nor how the base leans. What the arm's file says of its "
+        "drives flatters, for it was chosen on such motions; on another day friction is another",
         style="dim",
         soft_wrap=True,
     )
