@@ -51,6 +51,8 @@ EFFECT_KINDS: dict[str, EffectKind] = {
     "coulomb forward": EffectKind("N m", _WIDTH, code=3),
     "stribeck": EffectKind("N m", _WIDTH, code=4),
     "presliding": EffectKind("N m", "travel until it slips [rad, m]", dissipative=True, code=5),
+    # Friction of gears and cables that press harder under load: the weight that the SDF states at the coordinate.
+    "load coulomb": EffectKind("N m/N m", _WIDTH, dissipative=True, code=6),
     # It pulls no more than at the travel that a recording covered: a straight line runs away outside of it.
     "spring": EffectKind(
         "N m/rad",
@@ -66,7 +68,7 @@ POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.of_po
 
 
 @numba.njit(cache=True)
-def _step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float, float]:
+def _step(code: int, z: float, dx: float, v: float, scale: float, load: float) -> tuple[float, float]:
     """The next state and the shape of the kind with this code."""
     if code == 1:
         return z, v
@@ -84,6 +86,8 @@ def _step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float
         # parallel are a generalised Maxwell slip model, which has the hysteresis of dry friction before it slides.
         z = min(max(z + dx / scale, -1.0), 1.0)
         return z, z
+    if code == 6:
+        return z, load * math.tanh(v / scale)
     return z, math.nan
 
 
@@ -115,23 +119,27 @@ class ActuatorEffect:
         assert shape is not None, f"{self} depends on more than position"
         return shape(x, sympy.Integer(int(self.scale)) if self.scale.is_integer() else sympy.Float(self.scale))
 
-    def step(self, state: float, dx: float, x: float, v: float) -> tuple[float, float]:
+    def step(self, state: float, dx: float, x: float, v: float, load: float = 1.0) -> tuple[float, float]:
         """The next state, and the shape there: for a simulation.
 
         Args:
             state: dimensionless, 0 at the start; only `presliding` has one.
             dx: travel of the coordinate since the last step [rad, m].
             x, v: its position [rad, m] and velocity now.
+            load: size of the effort that it carries [N m, N]; only `load coulomb` asks.
         """
         if self.kind in POSITION_KINDS:
             return state, float(_numeric(self.kind)(x, self.scale))
-        return _step(EFFECT_KINDS[self.kind].code, state, dx, v, self.scale)
+        return _step(EFFECT_KINDS[self.kind].code, state, dx, v, self.scale, load)
 
-    def column(self, x: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The shape (m,) over a motion of the coordinate, x and v (m,), from state 0."""
+    def column(
+        self, x: NDArray[np.float64], v: NDArray[np.float64], load: NDArray[np.float64] | float = 1.0
+    ) -> NDArray[np.float64]:
+        """The shape (m,) over a motion of the coordinate, x and v (m,), from state 0; load: (m,), see `step`."""
         if self.kind in POSITION_KINDS:
             return np.array(np.broadcast_to(_numeric(self.kind)(x, self.scale), x.shape))
-        return _run(EFFECT_KINDS[self.kind].code, np.ascontiguousarray(x), np.ascontiguousarray(v), self.scale)
+        x, v, loads = (np.array(np.broadcast_to(signal, x.shape), dtype=np.float64) for signal in (x, v, load))
+        return _run(EFFECT_KINDS[self.kind].code, x, v, loads, self.scale)
 
 
 @cache
@@ -144,11 +152,13 @@ def _numeric(kind: str) -> Callable:
 
 
 @numba.njit(cache=True)
-def _run(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+def _run(
+    code: int, x: NDArray[np.float64], v: NDArray[np.float64], load: NDArray[np.float64], scale: float
+) -> NDArray[np.float64]:
     out = np.empty(len(x))
     state, before = 0.0, x[0]
     for i in range(len(x)):
-        state, out[i] = _step(code, state, x[i] - before, v[i], scale)
+        state, out[i] = _step(code, state, x[i] - before, v[i], scale, load[i])
         before = x[i]
     return out
 
