@@ -1,0 +1,138 @@
+"""How much of an arm's friction a controller may take away without moving the arm by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linprog
+from scipy.sparse import block_diag, csr_matrix, hstack, vstack
+
+from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_fault, joint_row
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.models.arm import Arm
+
+#: Friction that holds an arm at rest.
+_DRY = ("presliding", "coulomb")
+
+
+@dataclass(frozen=True)
+class Friction:
+    """The friction in an arm's drive, as identified: effects that only take energy.
+
+    Attributes:
+        arm: in whose drive it is.
+        effects: each dissipative, see `EFFECT_KINDS`.
+        coefficients: (k,) one for each effect, not negative, in the unit of its kind.
+    """
+
+    arm: Arm
+    effects: tuple[ActuatorEffect, ...]
+    coefficients: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, arm: Arm, effects: Sequence[ActuatorEffect], coefficients: ArrayLike) -> Friction:
+        """The dissipative ones among the effects of an arm; the others are left out.
+
+        Raises:
+            ControllerError: an effect that the arm cannot have, or a coefficient of friction that is negative or no
+                number.
+        """
+        values = np.asarray(coefficients, float)
+        if values.shape != (len(effects),):
+            raise ControllerError(f"friction: {len(effects)} effects need as many coefficients, not {values.shape}")
+        kept = [k for k, effect in enumerate(effects) if effect.kind not in EFFECT_KINDS or effect.dissipative]
+        for k in kept:
+            if fault := effect_fault(arm, effects[k]):
+                raise ControllerError(f"friction: {fault}")
+            if not 0 <= values[k] < np.inf:
+                raise ControllerError(f"friction: {effects[k]} has coefficient {values[k]:g}; it must be 0 or more")
+        kept = [k for k in kept if values[k] > 0]
+        return cls(arm, tuple(effects[k] for k in kept), values[kept])
+
+    @property
+    def rows(self) -> NDArray[np.float64]:
+        """(k, n) what the coordinate of each effect moves by per joint; f along it is row' f on the joints."""
+        return np.array([joint_row(self.arm, e.coordinate) for e in self.effects]).reshape(-1, self.arm.num_joints)
+
+    @property
+    def is_dry(self) -> NDArray[np.bool_]:
+        """(k,) whether the effect holds the arm at rest."""
+        return np.array([effect.kind in _DRY for effect in self.effects], bool)
+
+    @property
+    def of_joints(self) -> NDArray[np.float64]:
+        """(n,) dry friction that each joint feels when it alone moves [N m, N]."""
+        dry = self.is_dry
+        return np.abs(self.rows[dry]).T @ self.coefficients[dry]
+
+
+def safe_ratios(friction: Friction, ratio: float, holding_error: ArrayLike) -> NDArray[np.float64]:
+    """The share of each effect that may be compensated: at most `ratio`, and never so much that the arm creeps.
+
+    What remains of dry friction must hold whatever the gravity compensation may be wrong by: for every torque e in the
+    box |e_i| <= holding_error_i there must be forces f_k along the coordinates with sum row_k' f_k = e and
+    |f_k| <= (1 - ratio_k) coefficient_k. The box is convex, so its corners suffice; the largest such ratios are a
+    linear program. A joint whose friction cannot hold the error even uncompensated gets no compensation at all.
+
+    Args:
+        friction: of the arm.
+        ratio: wanted, 0..1.
+        holding_error: (n,) by which the gravity compensation may be wrong [N m, N].
+
+    Returns:
+        (k,) one ratio for each effect; effects of one coordinate have the same.
+
+    Raises:
+        ControllerError: a ratio outside 0..1, or an error that is none.
+    """
+    error = np.asarray(holding_error, float)
+    arm = friction.arm
+    if not 0 <= ratio <= 1:
+        raise ControllerError(f"friction ratio must be between 0 and 1; got {ratio:g}")
+    if error.shape != (arm.num_joints,) or not np.all((error >= 0) & np.isfinite(error)):
+        raise ControllerError(f"holding_error must be {arm.num_joints} numbers from 0; got {error.tolist()}")
+    names = list(dict.fromkeys(effect.coordinate for effect in friction.effects))
+    rows = np.array([joint_row(arm, name) for name in names]).reshape(-1, arm.num_joints)
+    index = np.array([names.index(effect.coordinate) for effect in friction.effects], np.intp)
+    dry = np.bincount(index, friction.coefficients * friction.is_dry, len(names)).astype(float)
+    creeps = friction.of_joints <= error
+    # A coordinate that moves a joint which creeps anyway keeps all its friction, and need not hold that joint.
+    most = np.where(np.any(rows[:, creeps] != 0, axis=1), 0.0, ratio)
+    return _largest(rows, dry, np.where(creeps, 0.0, error), most)[index]
+
+
+def _largest(
+    rows: NDArray[np.float64], dry: NDArray[np.float64], error: NDArray[np.float64], most: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(c,) largest ratios in 0..most of the coordinates whose remaining dry friction holds every corner of the box."""
+    held = np.flatnonzero(error)
+    if not len(rows) or not len(held):
+        return most
+    # Of opposite corners one suffices.
+    corners = [np.array([1.0, *signs]) * error[held] for signs in product((1.0, -1.0), repeat=len(held) - 1)]
+    m, c = len(corners), len(rows)
+    # Unknowns: the ratios, then the forces along the coordinates at each corner.
+    identity, limits = csr_matrix(np.eye(m * c)), csr_matrix(np.tile(np.diag(dry), (m, 1)))
+    done = linprog(
+        np.concatenate([-np.ones(c), np.zeros(m * c)]),
+        A_ub=vstack([hstack([limits, identity]), hstack([limits, -identity])]),
+        b_ub=np.tile(dry, 2 * m),
+        A_eq=hstack([csr_matrix((m * len(held), c)), block_diag([rows[:, held].T] * m)]),
+        b_eq=np.concatenate(corners),
+        bounds=[*((0.0, high) for high in most), *[(None, None)] * (m * c)],
+    )
+    return done.x[:c] if done.success else np.zeros(c)
+
+
+def holding_error(model: IdentifiedModel) -> NDArray[np.float64]:
+    """(n,) by which the model's gravity torque may be wrong [N m, N]: how well it predicts poses that it was not told.
+
+    Measured efforts of poses have friction in them, so this is rather too much. Zero for a model that was not
+    identified from poses.
+    """
+    return np.array([joint.rms_leave_one_out_undoubted for joint in model.joints])
