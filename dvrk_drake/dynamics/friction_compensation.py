@@ -13,7 +13,7 @@ from scipy.sparse import block_diag, csr_matrix, hstack, vstack
 
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_fault, joint_row
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import ControllerError
+from dvrk_drake.errors import ControllerError, ModelError
 from dvrk_drake.models.arm import Arm
 
 #: Friction that holds an arm at rest.
@@ -53,6 +53,22 @@ class Friction:
                 raise ControllerError(f"friction: {effects[k]} has coefficient {values[k]:g}; it must be 0 or more")
         kept = [k for k in kept if values[k] > 0]
         return cls(arm, tuple(effects[k] for k in kept), values[kept])
+
+    @classmethod
+    def of_model(cls, arm: Arm, model: IdentifiedModel) -> Friction:
+        """What a model that was identified from a motion says.
+
+        Raises:
+            ModelError: it was identified from poses, or of another arm.
+        """
+        if model.load_arm().joint_names != arm.joint_names:
+            raise ModelError(f"friction: the model is of {model.arm}, not of {arm.name}")
+        if model.dynamics is None:
+            raise ModelError(
+                "friction: the model was identified from poses, which tell nothing of friction; give a motion's"
+            )
+        effects = model.dynamics.effects
+        return cls.of(arm, [e.effect for e in effects], [e.value for e in effects])
 
     @property
     def rows(self) -> NDArray[np.float64]:
