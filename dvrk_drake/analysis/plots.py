@@ -52,7 +52,7 @@ def plot_torque_error(
     axes.set_title(title)
     axes.margins(y=0.25)
     axes.legend(fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_measured_against_predicted(
@@ -107,7 +107,7 @@ def plot_measured_against_predicted(
     if key:
         figure.legend(*key, loc="lower right", fontsize=8)
     figure.suptitle(f"{model.arm}: holding torque, {len(recording)} rows of {Path(recording.source).name}")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_identification(folder: Path, result: StaticIdentification) -> None:
@@ -163,10 +163,11 @@ def plot_positions(
     if key:
         figure.legend(*key, loc="lower right", fontsize=8)
     figure.suptitle(title)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-def _save(figure: plt.Figure, path: Path) -> None:
+def save_figure(figure: plt.Figure, path: Path) -> None:
+    """Writes a PNG at once or not at all, and forgets the figure."""
     with atomic_write(path, "wb") as stream:
         figure.savefig(stream, dpi=110, format="png")
     plt.close(figure)

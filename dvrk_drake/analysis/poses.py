@@ -27,11 +27,13 @@ class Poses(NamedTuple):
         recording: one row a pose, or the recording as it was.
         measured: (m, n) where an effort is a holding torque; None: everywhere.
         note: where the poses are from, or "".
+        moves: the arm moves all the time: there are no poses, but a dynamic model can be had.
     """
 
     recording: Recording
     measured: NDArray[np.bool_] | None
     note: str
+    moves: bool = False
 
 
 def find_poses(recording: Recording, arm: Arm, take_slow_parts: bool = False) -> Poses:
@@ -52,4 +54,4 @@ def find_poses(recording: Recording, arm: Arm, take_slow_parts: bool = False) ->
         return Poses(rests, None, f"{len(rests)} poses at which the arm rests are taken; {len(recording)} rows")
     if take_slow_parts:
         return Poses(*slow_parts(recording, arm), note=SLOW_PARTS_NOTE)
-    return Poses(recording, None, "")
+    return Poses(recording, None, "", moves=rests is not None and bool(recording.motion(arm)))

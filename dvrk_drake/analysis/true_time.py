@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.low_pass import low_pass, resample
 from dvrk_drake.analysis.velocity_agreement import velocity_agreement
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.recording import Recording
@@ -17,6 +18,8 @@ SAME_VALUE = 1e-9
 LEAST_ROWS, LEAST_JOINTS = 100, 2
 #: The recorded times are kept unless they leave this many times the variance that made ones leave.
 WORSE = 3.0
+#: Slower than this the recorded times are right [Hz].
+DRIFT = 1.0
 #: Shortest interval between two different rows, as a share of the mean.
 SHORTEST = 0.02
 _ITERATIONS = 8
@@ -59,16 +62,27 @@ def true_time(recording: Recording) -> TrueTime:
     if recording.qd is None or len(rows) < LEAST_ROWS:
         return TrueTime(rows, own, 0.0, False)
     q, qd, mean = recording.q[rows], recording.qd[rows], float(np.mean(np.diff(own)))
-    agrees = velocity_agreement(q, qd, 1 / mean).agrees
-    if np.sum(agrees) < LEAST_JOINTS:
-        return TrueTime(rows, own, 0.0, False)
-    dq, mean_qd = np.diff(q[:, agrees], axis=0), ((qd[1:] + qd[:-1]) / 2)[:, agrees]
-    intervals, noise = _intervals(dq, mean_qd, mean)
-    intervals *= (own[-1] - own[0]) / np.sum(intervals)
+    made = own
+    # Jitter spoils the agreement of some joints at first: it is judged again on the times that the others make.
+    for _ in range(2):
+        even = np.linspace(own[0], own[-1], len(own))
+        agrees = velocity_agreement(resample(made, q, even), resample(made, qd, even), 1 / mean).agrees
+        if np.sum(agrees) < LEAST_JOINTS:
+            return TrueTime(rows, own, 0.0, False)
+        dq, mean_qd = np.diff(q[:, agrees], axis=0), ((qd[1:] + qd[:-1]) / 2)[:, agrees]
+        intervals, noise = _intervals(dq, mean_qd, mean)
+        intervals *= (own[-1] - own[0]) / np.sum(intervals)
+        made = _without_drift(own, own[0] + np.concatenate([[0.0], np.cumsum(intervals)]), mean)
     if _left(dq, mean_qd, np.diff(own), noise) < WORSE * _left(dq, mean_qd, intervals, noise):
         return TrueTime(rows, own, 0.0, False)
-    jitter = float(np.std(intervals - np.diff(own))) / mean
-    return TrueTime(rows, own[0] + np.concatenate([[0.0], np.cumsum(intervals)]), jitter, True)
+    return TrueTime(rows, made, float(np.std(np.diff(made) - np.diff(own))) / mean, True)
+
+
+def _without_drift(own: NDArray[np.float64], made: NDArray[np.float64], mean: float) -> NDArray[np.float64]:
+    """The made times that keep to the recorded ones on the whole: an error of qd of a percent makes a drift of ms."""
+    lead = made - own
+    intervals = np.diff(own + lead - low_pass(lead, 1 / mean, DRIFT))
+    return own[0] + np.concatenate([[0.0], np.cumsum(np.maximum(intervals, SHORTEST * mean))])
 
 
 def repeated_rows(recording: Recording) -> NDArray[np.bool_]:

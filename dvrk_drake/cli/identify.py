@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
+from dvrk_drake.cli.dynamics import identify_motion, validate_in_motion
 from dvrk_drake.cli.support import (
     ProgressBar,
     add_gravity,
@@ -18,11 +19,14 @@ from dvrk_drake.cli.support import (
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
     """Adds the verbs and their options."""
-    verb = verbs.add_parser("identify", help="identify a model from a recording of poses and holding torques")
+    verb = verbs.add_parser(
+        "identify",
+        help="identify a model: of a motion the full dynamics, of poses and holding torques what holds the arm",
+    )
     add_recording(verb)
     verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, psm, or a YAML file")
     verb.add_argument("--output", required=True, metavar="MODEL.yaml", help="the model file to write")
-    verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="default: robust")
+    verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="for poses; default: robust")
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
     add_gravity(verb)
@@ -36,7 +40,11 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.set_defaults(run=_validate)
 
-    verb = verbs.add_parser("predict", help="write a model's holding torques at a recording's poses")
+    verb = verbs.add_parser(
+        "predict",
+        help="write a model's efforts at a recording's rows: in a motion behind the low-pass it was identified with, else "
+        "those that hold the poses",
+    )
     verb.add_argument("model", metavar="MODEL.yaml")
     add_recording(verb)
     verb.add_argument("--output", required=True, metavar="FILE.csv", help="columns tau1.., one row a row")
@@ -71,7 +79,10 @@ def _identify(options: argparse.Namespace) -> None:
     check_output(options.output, options.recording)
     plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
-    recording, measured, note = find_poses(recording, arm, options.slow_parts)
+    recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
+    if moves:
+        identify_motion(options, recording, arm, plots)
+        return
     if note:
         console.print(note)
     with ProgressBar("identifying") as (progress, task):
@@ -108,7 +119,10 @@ def _validate(options: argparse.Namespace) -> None:
         check_output(options.json, options.recording, options.model)
     plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
-    recording, measured, note = find_poses(recording, arm, options.slow_parts)
+    recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
+    if moves and model.dynamics is not None:
+        validate_in_motion(options, model, recording, plots)
+        return
     if note:
         console.print(note)
     if motion := recording.motion(arm):
@@ -131,6 +145,8 @@ def _validate(options: argparse.Namespace) -> None:
 
 
 def _predict(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.dynamic_validation import predict_motion
+    from dvrk_drake.analysis.poses import find_poses
     from dvrk_drake.analysis.validation import predict
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.recording import read_recording, write_csv
@@ -139,7 +155,13 @@ def _predict(options: argparse.Namespace) -> None:
     model = IdentifiedModel.load(options.model)
     recording = read_recording(options.recording, model.load_arm(), options.coordinates)
     print_notes(options.recording, recording.notes)
-    tau = predict(model, recording)
+    arm = model.load_arm()
+    if model.dynamics is not None and find_poses(recording, arm).moves:
+        tau = predict_motion(model, recording)
+        if recording.coordinates == "joint":
+            tau = arm.transmission.pull_back_effort(tau)
+    else:
+        tau = predict(model, recording)
     write_csv(options.output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
+from dvrk_drake.dynamics.dynamic_model import DynamicModel
+from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.dynamics.joint_effects import JointEffect, kinds_of
 from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
@@ -81,7 +83,8 @@ class Provenance:
 class IdentifiedModel:
     """A static model of one arm: tau = trust o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
 
-    `gravity` [m/s^2] is the gravity vector in the base frame that the base parameters were identified with.
+    `gravity` [m/s^2] is the gravity vector in the base frame that the base parameters were identified with. A model that
+    was identified from a motion also has `dynamics`; its base parameters are those of the links there.
     """
 
     format: str = "dvrk_drake identified model 1"
@@ -91,6 +94,7 @@ class IdentifiedModel:
     joint_effects: list[EffectEstimate] = field(default_factory=list)
     joints: list[JointStatistics] = field(default_factory=list)
     provenance: Provenance = field(default_factory=Provenance)
+    dynamics: DynamicSection | None = None
 
     @classmethod
     def from_arm(cls, arm: Arm) -> "IdentifiedModel":
@@ -157,6 +161,8 @@ class IdentifiedModel:
                 raise ModelError(f"{effect.joint} cannot have a joint effect {effect.kind}; kinds: {', '.join(kinds)}")
         if not np.all(np.isfinite(self.theta)) or not np.all((self.trust >= 0) & (self.trust <= 1)):
             raise ModelError("parameters must be finite numbers and trust between 0 and 1")
+        if self.dynamics is not None:
+            DynamicModel(arm, self.dynamics)
 
     def load_arm(self) -> Arm:
         """The arm that this model is of, mounted as it was when identified."""
@@ -176,6 +182,17 @@ class IdentifiedModel:
     def static_model(self) -> StaticModel:
         """The compiled structure that `theta` belongs to."""
         return compile_static_model(self.load_arm(), tuple(JointEffect(e.joint, e.kind) for e in self.joint_effects))
+
+    @cached_property
+    def dynamic_model(self) -> DynamicModel:
+        """The arm in motion.
+
+        Raises:
+            ModelError: the model was identified from poses and has no `dynamics`.
+        """
+        if self.dynamics is None:
+            raise ModelError("the model has no dynamics: it was identified from poses; identify a motion")
+        return DynamicModel(self.load_arm(), self.dynamics)
 
     def holding_torque(self, q: ArrayLike) -> NDArray[np.float64]:
         """Torque [N m, N] on the joints that holds the arm: (n,) for q (n,), (m, n) for q (m, n)."""

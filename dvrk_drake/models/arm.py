@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.common.yaml import yaml_load_typed
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.arm_schema import ArmDescription, CoupledLimit, Gains, Instrument, LoopClosure, Mechanism
+from dvrk_drake.models.arm_schema import (
+    ArmDescription,
+    CoupledLimit,
+    Gains,
+    Instrument,
+    LoopClosure,
+    Mechanism,
+    MotionSettings,
+)
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, compose_sdf, read_sdf_facts
 
@@ -44,6 +52,8 @@ class Arm:
         loop_closures: frames that must coincide.
         gravity: (3,) gravity vector in the base frame [m/s^2].
         gains: default gains of the controller.
+        friction_coordinates: name -> (n,) coefficients of the joints: where parts rub beside joints and actuators.
+        motion: how the signals of a recorded motion are treated, one value a joint.
         effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].
     """
 
@@ -62,6 +72,8 @@ class Arm:
     loop_closures: tuple[LoopClosure, ...]
     gravity: NDArray[np.float64]
     gains: Gains
+    friction_coordinates: dict[str, NDArray[np.float64]]
+    motion: MotionSettings
     effort_cut_off: float
 
     @property
@@ -198,6 +210,7 @@ def _build_arm(
     for which, values in dataclasses.asdict(gains).items():
         if len(values) != len(joints):
             raise ArmError(f"{path}: gains.{which} has {len(values)} numbers, one a joint is {len(joints)}")
+    motion = _motion_settings(path, mechanism.motion, instrument.motion, len(joints))
     G = np.zeros((len(facts.joint_names), len(joints)))
     c = np.zeros(len(facts.joint_names))
     for row, name in enumerate(facts.joint_names):
@@ -221,8 +234,24 @@ def _build_arm(
         loop_closures=tuple(mechanism.loop_closures),
         gravity=_checked_gravity(description.gravity),
         gains=gains,
+        friction_coordinates={
+            name: np.array([terms.get(j, 0.0) for j in joints])
+            for name, terms in instrument.friction_coordinates.items()
+        },
+        motion=motion,
         effort_cut_off=_checked_cut_off(path, mechanism),
     )
+
+
+def _motion_settings(path: Path, arm: MotionSettings, instrument: MotionSettings, num_joints: int) -> MotionSettings:
+    """The mechanism's with the instrument's appended; what neither states is 20 Hz and no delay."""
+    both = {}
+    for which, default in (("acceleration_cut_off", 20.0), ("effort_delay", 0.0)):
+        values = getattr(arm, which) + getattr(instrument, which)
+        if values and len(values) != num_joints:
+            raise ArmError(f"{path}: motion.{which} has {len(values)} numbers, one a joint is {num_joints}")
+        both[which] = values or [default] * num_joints
+    return dataclasses.replace(arm, **both)
 
 
 def _check_limits(path: Path, joint: str, limits: list[float], prismatic: bool) -> None:

@@ -34,6 +34,20 @@ class Gains:
 
 
 @dataclass
+class MotionSettings:
+    """How the signals of a recorded motion are treated; per joint, in the order of the joints that the file has.
+
+    `acceleration_cut_off` [Hz] of the low-pass for accelerations, `effort_delay` [s] by which the recorded effort is
+    later than the positions (negative: earlier). Of a mechanism also `base_may_tilt`, whether the direction of gravity is
+    estimated from a motion.
+    """
+
+    acceleration_cut_off: list[float] = field(default_factory=list)
+    effort_delay: list[float] = field(default_factory=list)
+    base_may_tilt: bool = False
+
+
+@dataclass
 class Mechanism:
     """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common.
 
@@ -46,6 +60,7 @@ class Mechanism:
     transmission: dict[str, dict[str, float]] = field(default_factory=dict)
     coupled_limits: list[CoupledLimit] = field(default_factory=list)
     loop_closures: list[LoopClosure] = field(default_factory=list)
+    motion: MotionSettings = field(default_factory=MotionSettings)
     effort_cut_off: float = 10.0
 
 
@@ -54,6 +69,8 @@ class Instrument:
     """Schema of `instruments/*.yaml`: what hangs on an arm and can be swapped; its joints follow the arm's.
 
     `joint_from_actuator` is the disc coupling as the dVRK states it: joint = sum of coefficient * actuator.
+    `friction_coordinates` are where parts rub on each other beside the joints and the actuators: name -> sum of
+    coefficient * joint.
     """
 
     sdf: str = ""
@@ -61,6 +78,8 @@ class Instrument:
     joint_from_actuator: dict[str, dict[str, float]] = field(default_factory=dict)
     position_limits: dict[str, list[float]] = field(default_factory=dict)
     gains: Gains = field(default_factory=Gains)
+    friction_coordinates: dict[str, dict[str, float]] = field(default_factory=dict)
+    motion: MotionSettings = field(default_factory=MotionSettings)
 
 
 @dataclass

@@ -1,0 +1,129 @@
+"""What explains an arm's efforts in a motion, column by column, behind the filter that the efforts are behind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.motion_grid import MotionGrid
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates, slides
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.models.arm import Arm
+
+#: Widths of the smoothed sign, as shares of the coordinate's standard deviation of speed.
+COULOMB_WIDTHS = (0.03, 0.1, 0.4)
+#: Travel until an elasto-plastic element slips, as shares of the coordinate's standard deviation of position.
+PRESLIDING_TRAVELS = (0.003, 0.01, 0.08, 0.3, 1.0)
+#: Periods in a turn of the cable torques.
+CABLE_PERIODS = (1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicColumns:
+    """tau ~ rigid phi + effects c, at r rows behind the filter, actuator by actuator.
+
+    Attributes:
+        tau: (r, n) measured efforts of the actuators.
+        rigid: (r, n, p) of the rigid bodies' parameters, links first, then one rotor an actuator.
+        tilts: (2, r, n, p) derivative of `rigid` by the x and y component of gravity [s^2/m].
+        effects: the candidate effects, in the order of the columns.
+        shapes: (r, e) of each effect along its coordinate, one column a block of actuators.
+        rows: (e, n) coordinate of each effect: its column of actuator i is shapes[i] * rows[:, i].
+    """
+
+    tau: NDArray[np.float64]
+    rigid: NDArray[np.float64]
+    tilts: NDArray[np.float64]
+    effects: tuple[ActuatorEffect, ...]
+    shapes: tuple[NDArray[np.float64], ...]
+    rows: NDArray[np.float64]
+
+    def of_actuator(self, i: int) -> NDArray[np.float64]:
+        """(r, p + e) all columns of one actuator."""
+        return np.hstack([self.rigid[:, i], self.shapes[i] * self.rows[:, i]])
+
+
+def friction_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
+    """What every drive may have: offset at the actuators; viscous, Coulomb and presliding friction everywhere."""
+    effects = []
+    for name, x, v in _coordinates(arm, grid):
+        if name.startswith("actuator."):
+            effects.append(ActuatorEffect(name, "offset"))
+        effects.append(ActuatorEffect(name, "viscous"))
+        if v.std() > 0:
+            effects += [ActuatorEffect(name, "coulomb", _rounded(w * v.std())) for w in COULOMB_WIDTHS]
+            effects += [ActuatorEffect(name, "presliding", _rounded(d * x.std())) for d in PRESLIDING_TRAVELS]
+    return effects
+
+
+def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
+    """What some drives have beside friction: springs, cables, friction that differs by direction."""
+    effects = []
+    for name, _, v in _coordinates(arm, grid):
+        if v.std() == 0:
+            continue
+        width = _rounded(0.1 * v.std())
+        effects += [ActuatorEffect(name, "coulomb forward", width), ActuatorEffect(name, "spring")]
+        if not slides(arm, name):
+            effects += [
+                ActuatorEffect(name, kind, float(periods))
+                for periods in CABLE_PERIODS
+                for kind in ("cable sine", "cable cosine")
+            ]
+    return effects
+
+
+def dynamic_columns(
+    grid: MotionGrid, tau: NDArray[np.float64], regressor: DynamicRegressor, effects: Sequence[ActuatorEffect]
+) -> DynamicColumns:
+    """Columns of all parameters and effects.
+
+    Args:
+        grid: the motion.
+        tau: (rows, n) recorded efforts of the actuators.
+        regressor: of the arm, mounted as expected.
+        effects: to make columns of.
+    """
+    arm, n = grid.arm, grid.arm.num_joints
+    p = len(regressor.values) - len(regressor.rotors) + n
+    nominal = regressor.regressor(grid.q, grid.v, grid.vd)[..., :p]
+    rigid = _filtered(grid, nominal)
+    tilts = []
+    for axis in range(2):
+        if not arm.motion.base_may_tilt:
+            break
+        tilted = DynamicRegressor(arm.with_gravity(regressor.arm.gravity + np.eye(3)[axis]))
+        tilts.append(_filtered(grid, tilted.regressor(grid.q, grid.v, grid.vd)[..., :p] - nominal))
+    coordinates = {name: (x, v) for name, x, v in _coordinates(arm, grid)}
+    on_grid = np.column_stack([effect.column(*coordinates[effect.coordinate]) for effect in effects])
+    rows = np.array([effect_coordinates(arm)[effect.coordinate] for effect in effects])
+    by_delay = {d: grid.behind_filter(grid.at_rows(on_grid, i)) for i, d in enumerate(grid.settings.effort_delay)}
+    shapes = tuple(by_delay[d] for d in grid.settings.effort_delay)
+    return DynamicColumns(
+        grid.behind_filter(tau), rigid, np.array(tilts).reshape(-1, *rigid.shape), tuple(effects), shapes, rows
+    )
+
+
+def _filtered(grid: MotionGrid, Y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(r, n, p) of the actuators behind the filter, from a regressor (m, n, p) of the joints on the grid."""
+    J_inverse = grid.arm.transmission.inverse().matrix
+    out = np.zeros((len(range(*grid.inner.indices(len(grid.row_times)))), *Y.shape[1:]))
+    for i in range(Y.shape[1]):
+        of_actuator = sum(J_inverse[j, i] * Y[:, j] for j in np.flatnonzero(J_inverse[:, i]))
+        moved = np.flatnonzero(np.any(of_actuator, axis=0))
+        out[:, i, moved] = grid.behind_filter(grid.at_rows(of_actuator[:, moved], i))
+    return out
+
+
+def _coordinates(arm: Arm, grid: MotionGrid) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
+    """(name, x, v) of every coordinate of the drive."""
+    a, a_dot = arm.transmission.position(grid.q), arm.transmission.velocity(grid.v)
+    return [(name, a @ h, a_dot @ h) for name, h in effect_coordinates(arm).items()]
+
+
+def _rounded(x: float) -> float:
+    """To three digits: a scale is a choice, not a measurement."""
+    return float(f"{x:.3g}")

@@ -1,0 +1,208 @@
+"""An arm's full dynamics from one recorded motion: links that can exist, rotors, and the effects in the drive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.dynamic_columns import dynamic_columns, friction_effects, optional_effects
+from dvrk_drake.analysis.dynamic_problem import ConsistentFit, DynamicProblem
+from dvrk_drake.analysis.dynamic_statics import static_part
+from dvrk_drake.analysis.motion_grid import MotionGrid, default_settings, motion_grid
+from dvrk_drake.analysis.phase_folds import period_of, phase_folds
+from dvrk_drake.analysis.repetition import repeatability_floor
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.dynamic_section import (
+    ActuatorEffectEstimate,
+    ActuatorStatistics,
+    DynamicSection,
+    LinkEstimate,
+    RotorEstimate,
+)
+from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics, Provenance
+from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.recording import Recording
+
+#: An effect whose effort is below this share of the actuators' is left out of the model.
+LEAST_EFFECT = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicIdentification:
+    """A model with what a report of it needs.
+
+    Attributes:
+        model: with `dynamics`; its base parameters and joint effects are those of the links and the drive at rest.
+        grid: the motion.
+        period: after which the motion repeats [s], or None.
+        measured, predicted: (r, n) efforts of the actuators behind the filter, ends left out [N m, N].
+    """
+
+    model: IdentifiedModel
+    grid: MotionGrid
+    period: float | None
+    measured: NDArray[np.float64]
+    predicted: NDArray[np.float64]
+
+
+def identify_dynamic(
+    recording: Recording, arm: Arm, progress: Callable[[float], object] = lambda _: None
+) -> DynamicIdentification:
+    """Identifies the dynamics of `arm` from a motion.
+
+    Efforts and all that explains them are compared behind the same low-pass. Every drive gets an offset and viscous,
+    smoothed Coulomb and presliding friction at its actuators and at the joints that actuators share; springs, cable
+    torques and friction that differs by direction are chosen by cross-validation over the phases of the motion. The
+    links' parameters are those nearest to the recording that bodies can have, the SDF's where it says nothing
+    (`consistent_parameters`). The direction of gravity is found along where the arm's file says that its base may tilt.
+
+    Args:
+        recording: a motion with t and tau, in either coordinates.
+        arm: which was recorded.
+        progress: called with the finished share, 0..1.
+
+    Raises:
+        RecordingError: the recording does not fit the arm, or is no motion.
+        IdentificationError: the program for consistent parameters did not converge.
+    """
+    grid = motion_grid(recording, arm, default_settings(arm))
+    tau = recording.in_actuator_coordinates(arm).measured_effort()
+    progress(0.05)
+    period = period_of(grid)
+    problem = _problem(grid, tau, period)
+    progress(0.2)
+    chosen, problem = _chosen_effects(problem, lambda share: progress(0.2 + 0.4 * share))
+    weights = _weights(problem, chosen)
+    fit = problem.consistent(chosen, weights)
+    left_out = np.zeros(arm.num_joints)
+    for fold in range(fit.folds):
+        progress(0.65 + 0.35 * fold / fit.folds)
+        left_out += fit.fold_errors(fold)
+    section = _section(problem, chosen, fit, left_out, grid, tau, period)
+    predicted = problem.columns.tau - _residuals(problem, chosen, fit)
+    model = _model(recording, arm, section, problem, fit)
+    progress(1.0)
+    return DynamicIdentification(model, grid, period, problem.columns.tau, predicted)
+
+
+def _problem(grid: MotionGrid, tau: NDArray[np.float64], period: float | None) -> DynamicProblem:
+    effects = [*friction_effects(grid.arm, grid), *optional_effects(grid.arm, grid)]
+    regressor = DynamicRegressor(grid.arm)
+    columns = dynamic_columns(grid, tau, regressor, effects)
+    fold, edge = phase_folds(grid, period)
+    # A low-passed effort has two independent values a period of the cut-off; repetitions say the same again.
+    duration = len(columns.tau) / grid.rate
+    independent = 2 * grid.settings.effort_cut_off * min(duration, period or duration)
+    return DynamicProblem(columns, regressor, fold, edge, min(independent, len(columns.tau)))
+
+
+def _chosen_effects(
+    problem: DynamicProblem, progress: Callable[[float], object]
+) -> tuple[NDArray[np.int_], DynamicProblem]:
+    """The effects, and the problem with gravity as the motion shows it."""
+    optional = {"coulomb forward", "spring", "cable sine", "cable cosine", "stribeck"}
+    is_optional = np.array([effect.kind in optional for effect in problem.columns.effects])
+    friction, candidates = np.flatnonzero(~is_optional), np.flatnonzero(is_optional)
+    tilts = len(problem.columns.tilts)
+    if tilts:
+        # The tilt and the effects are found in turn: a lean base looks like a spring, and the other way round.
+        phi, chosen = problem.prior, friction
+        last = problem.num_effects + np.arange(tilts)
+        for turn in range(3):
+            selection = problem.selection(phi)
+            if turn == 0:
+                found = selection.choose(np.append(chosen, last), candidates, lambda s: progress(0.4 * s))
+                chosen = found[found < problem.num_effects]
+            x = selection.fit(np.append(chosen, last))
+            phi = problem.rigid_parameters(x)
+            problem = replace(problem, tilt=problem.tilt + x[-tilts:])
+    selection = problem.selection()
+    return selection.choose(friction, candidates, lambda s: progress(0.5 + 0.5 * s)), problem
+
+
+def _weights(problem: DynamicProblem, chosen: NDArray[np.int_]) -> NDArray[np.float64]:
+    selection = problem.selection()
+    selection.fit(chosen)
+    return selection.weights
+
+
+def _residuals(problem: DynamicProblem, chosen: NDArray[np.int_], fit: ConsistentFit) -> NDArray[np.float64]:
+    columns, p = problem.columns, problem.num_rigid
+    drive = np.column_stack(
+        [columns.shapes[i][:, chosen] @ (columns.rows[chosen, i] * fit.x[p:]) for i in range(columns.tau.shape[1])]
+    )
+    return columns.tau - problem.rigid @ fit.x[:p] - drive
+
+
+def _section(
+    problem: DynamicProblem,
+    chosen: NDArray[np.int_],
+    fit: ConsistentFit,
+    left_out: NDArray[np.float64],
+    grid: MotionGrid,
+    tau: NDArray[np.float64],
+    period: float | None,
+) -> DynamicSection:
+    arm, p = grid.arm, problem.num_rigid
+    sd = np.sqrt(np.diag(fit.covariance))
+    links = [
+        LinkEstimate(link.link, [float(v) for v in x], float(np.linalg.eigvalsh(pseudo_inertia(x))[0]))
+        for link, x in zip(problem.regressor.links, fit.x[: p - arm.num_joints].reshape(-1, 10), strict=True)
+    ]
+    rotors = [
+        RotorEstimate(name, float(fit.x[i]), float(sd[i]))
+        for i, name in enumerate(arm.joint_names, start=p - arm.num_joints)
+    ]
+    effects = []
+    for k, effect in enumerate(problem.columns.effects[c] for c in chosen):
+        value = float(fit.x[p + k])
+        if value**2 * problem.effect_precision[chosen[k]] > LEAST_EFFECT**2:
+            effects.append(
+                ActuatorEffectEstimate(effect.coordinate, effect.kind, effect.scale, value, float(sd[p + k]))
+            )
+    rows = problem.num_rows
+    size = np.sqrt(problem.efforts / rows)
+    floor = np.zeros(arm.num_joints)
+    if period is not None:
+        floor = np.nan_to_num(repeatability_floor(tau, grid.rate, period, grid.settings.effort_cut_off)) * size
+    actuators = [
+        ActuatorStatistics(name, *map(float, numbers))
+        for name, *numbers in zip(
+            arm.joint_names, size, np.sqrt(fit.errors / rows), np.sqrt(left_out / rows), floor, strict=True
+        )
+    ]
+    gravity = problem.regressor.arm.gravity + np.append(problem.tilt, 0.0)
+    gravity *= np.linalg.norm(problem.regressor.arm.gravity) / np.linalg.norm(gravity)
+    return DynamicSection([float(g) for g in gravity], links, rotors, effects, actuators, grid.settings)
+
+
+def _model(
+    recording: Recording, arm: Arm, section: DynamicSection, problem: DynamicProblem, fit: ConsistentFit
+) -> IdentifiedModel:
+    in_joints = recording.in_joint_coordinates(arm)
+    base_parameters, joint_effects = static_part(arm, section, problem.regressor, fit.covariance, in_joints.q)
+    joints = []
+    for j, name in enumerate(arm.joint_names):
+        lower, upper = float(in_joints.q[:, j].min()), float(in_joints.q[:, j].max())
+        coverage = (upper - lower) / float(arm.position_upper[j] - arm.position_lower[j])
+        joints.append(JointStatistics(name=name, position_lower=lower, position_upper=upper, coverage=coverage))
+    return IdentifiedModel(
+        arm=arm.source,
+        gravity=[float(g) for g in arm.gravity],
+        base_parameters=base_parameters,
+        joint_effects=joint_effects,
+        joints=joints,
+        provenance=Provenance(
+            recording=recording.source,
+            sha256=recording.sha256,
+            poses=len(recording),
+            method="dynamic",
+            version=version("dvrk-drake"),
+        ),
+        dynamics=section,
+    )

@@ -1,0 +1,116 @@
+"""Least squares over many parts of a motion at once: sums of squares and products, fold by fold, and what they give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """[X tau]'[X tau] of every actuator over every part of a motion.
+
+    Attributes:
+        products: (n, folds, 3, k + 1, k + 1); the three parts of a fold are its start, its middle and its end, the last
+            column is the measured effort.
+    """
+
+    products: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        columns: list[NDArray[np.float64]],
+        tau: NDArray[np.float64],
+        fold: NDArray[np.int_],
+        edge: NDArray[np.bool_],
+    ) -> NormalEquations:
+        """Sums up.
+
+        Args:
+            columns: (r, k) of each of the n actuators.
+            tau: (r, n).
+            fold: (r,) of each row.
+            edge: (r, 2) whether it is at the start, at the end of its fold.
+        """
+        folds = int(fold.max()) + 1
+        part = np.where(edge[:, 0], 0, np.where(edge[:, 1], 2, 1)) + 3 * fold
+        k = columns[0].shape[1] + 1
+        products = np.zeros((tau.shape[1], 3 * folds, k, k))
+        for i, X in enumerate(columns):
+            full = np.column_stack([X, tau[:, i]])
+            some = np.flatnonzero(np.any(full, axis=0))
+            for b in range(3 * folds):
+                rows = full[part == b][:, some]
+                products[i, b][np.ix_(some, some)] = rows.T @ rows
+        return cls(products.reshape(tau.shape[1], folds, 3, k, k))
+
+    @property
+    def folds(self) -> int:
+        """Number of folds."""
+        return self.products.shape[1]
+
+    def total(self) -> NDArray[np.float64]:
+        """(n, k + 1, k + 1) over the whole motion."""
+        return self.products.sum(axis=(1, 2))
+
+    def of_fold(self, fold: int) -> NDArray[np.float64]:
+        """(n, k + 1, k + 1) over one fold."""
+        return self.products[:, fold].sum(axis=1)
+
+    def without_fold(self, fold: int) -> NDArray[np.float64]:
+        """(n, k + 1, k + 1) over all rows but those of one fold and those of its neighbours that touch it."""
+        before, after = (fold - 1) % self.folds, (fold + 1) % self.folds
+        return self.total() - self.of_fold(fold) - self.products[:, before, 2] - self.products[:, after, 0]
+
+    def transformed(self, T: NDArray[np.float64]) -> NormalEquations:
+        """Those of other unknowns: [X tau] T instead of [X tau]; T (k + 1, j)."""
+        return NormalEquations(np.einsum("ax,nfpab,by->nfpxy", T, self.products, T, optimize=True))
+
+    def chosen(self, index: NDArray[np.int_]) -> NormalEquations:
+        """Those of some of the columns; the effort's column stays."""
+        index = np.append(index, self.products.shape[-1] - 1)
+        return NormalEquations(self.products[..., index[:, None], index])
+
+
+def squared_errors(products: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) sum of squares that x (k,) leaves, from products (n, k + 1, k + 1)."""
+    residual = np.append(-x, 1.0)
+    return np.maximum(np.einsum("a,nab,b->n", residual, products, residual, optimize=True), 0.0)
+
+
+def solve(
+    products: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    precision: NDArray[np.float64],
+    non_negative: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """x (k,) that minimises sum_i weights_i |tau_i - X_i x|^2 + sum_j precision_j x_j^2, some of it not negative.
+
+    What may have any sign is eliminated first; the rest is scipy's non-negative least squares (Lawson and Hanson).
+
+    Args:
+        products: (n, k + 1, k + 1).
+        weights: (n,) one over the variance of an effort.
+        precision: (k,) one over the variance of each unknown about 0, before the recording; positive.
+        non_negative: (k,).
+    """
+    sums = np.tensordot(weights, products, axes=(0, 0))
+    H = sums[:-1, :-1] + np.diag(precision)
+    scale = 1 / np.sqrt(np.diag(H))
+    H, b = H * np.outer(scale, scale), sums[:-1, -1] * scale
+    free, bound = np.flatnonzero(~non_negative), np.flatnonzero(non_negative)
+    factor = scipy.linalg.cho_factor(H[np.ix_(free, free)], lower=True, check_finite=False)
+    x = np.zeros(len(b))
+    if len(bound):
+        coupling = scipy.linalg.cho_solve(factor, H[np.ix_(free, bound)], check_finite=False)
+        left = H[np.ix_(bound, bound)] - H[np.ix_(bound, free)] @ coupling
+        L = np.linalg.cholesky(left)
+        x[bound] = nnls(L.T, scipy.linalg.solve_triangular(L, b[bound] - coupling.T @ b[free], lower=True))[0]
+        b = b - H[:, bound] @ x[bound]
+    x[free] = scipy.linalg.cho_solve(factor, b[free], check_finite=False)
+    return x * scale

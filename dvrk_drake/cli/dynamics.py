@@ -1,0 +1,68 @@
+"""What `identify` and `validate` do with a recording in which the arm moves."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dvrk_drake.cli.support import ProgressBar
+from dvrk_drake.errors import RecordingError
+
+if TYPE_CHECKING:
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.models.arm import Arm
+    from dvrk_drake.models.recording import Recording
+
+
+def identify_motion(options: argparse.Namespace, recording: Recording, arm: Arm, plots: Path | None) -> None:
+    """Identifies the dynamics, prints them, writes the model and the plots."""
+    from dvrk_drake.analysis.dynamic_identification import identify_dynamic
+    from dvrk_drake.analysis.dynamic_tables import print_dynamics
+    from dvrk_drake.analysis.dynamic_validation import validate_motion
+    from dvrk_drake.analysis.recording_check import check_recording
+    from dvrk_drake.analysis.tables import make_console
+
+    console = make_console()
+    report = check_recording(recording, arm)
+    for finding in report.findings:
+        if finding.severity != "note":
+            console.print(str(finding), style="yellow", markup=False, soft_wrap=True)
+    if report.refusals:
+        raise RecordingError(f"{options.recording}: refused, see above and dvrk-drake check")
+    with ProgressBar("identifying") as (progress, task):
+        result = identify_dynamic(recording, arm, lambda share: progress.update(task, completed=100 * share))
+    print_dynamics(console, result.model)
+    result.model.save(options.output)
+    console.print(f"model: {options.output}")
+    if plots is not None:
+        from dvrk_drake.analysis.dynamic_plots import plot_motion
+
+        title = f"{arm.name}, fitted to {Path(recording.source).name}"
+        plot_motion(plots, arm, validate_motion(result.model, recording), title)
+        console.print(f"plots: {options.plots}")
+
+
+def validate_in_motion(
+    options: argparse.Namespace, model: IdentifiedModel, recording: Recording, plots: Path | None
+) -> None:
+    """Compares a dynamic model with a motion, prints the errors, writes the JSON and the plots."""
+    from dvrk_drake.analysis.dynamic_tables import print_dynamic_validation
+    from dvrk_drake.analysis.dynamic_validation import validate_motion
+    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.models.atomic_file import atomic_write
+
+    console = make_console()
+    validation = validate_motion(model, recording)
+    print_dynamic_validation(console, validation)
+    if options.json is not None:
+        with atomic_write(options.json) as stream:
+            json.dump(validation.as_dict(), stream, indent=2)
+            stream.write("\n")
+    if plots is not None:
+        from dvrk_drake.analysis.dynamic_plots import plot_motion
+
+        arm = model.load_arm()
+        plot_motion(plots, arm, validation, f"{arm.name}, {Path(recording.source).name}")
+        console.print(f"plots: {options.plots}")

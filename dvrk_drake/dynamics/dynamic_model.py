@@ -1,0 +1,117 @@
+"""An identified arm's efforts in motion: its links, rotors and the effects in its drive."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_coordinates, slides
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.dynamic_section import DynamicSection
+from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES, LinkInertia, pseudo_inertia
+from dvrk_drake.errors import ModelError
+from dvrk_drake.models.arm import Arm
+
+
+class DynamicModel:
+    """tau_actuator = J'^-1 Y(q, v, vd) phi + sum of effects, of one arm.
+
+    Attributes:
+        arm: whose model it is, mounted as the section says.
+        section: the numbers.
+        regressor: of the rigid bodies.
+        parameters: (p,) phi, for `regressor`.
+        effects: in the order of `coefficients`.
+        coefficients: (e,).
+    """
+
+    def __init__(self, arm: Arm, section: DynamicSection) -> None:
+        """Puts the numbers together.
+
+        Raises:
+            ModelError: they are not of this arm.
+        """
+        self.arm = arm.with_gravity(section.gravity)
+        self.section = section
+        self.regressor = DynamicRegressor(self.arm)
+        check_section(self.regressor, section)
+        phi = [x for link in section.links for x in link.parameters] + [rotor.value for rotor in section.rotors]
+        # Columns that couple two rotors belong to no motor, see `rotor_inertias`.
+        self.parameters = np.concatenate([phi, np.zeros(len(self.regressor.values) - len(phi))])
+        self.effects = tuple(ActuatorEffect(e.coordinate, e.kind, e.scale) for e in section.effects)
+        self.coefficients = np.array([e.value for e in section.effects])
+
+    @cached_property
+    def links(self) -> tuple[LinkInertia, ...]:
+        """The identified links, to be written into a plant or an SDF."""
+        return tuple(LinkInertia(link.link, np.array(link.parameters)) for link in self.section.links)
+
+    def rigid_body_effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
+        """(m, n) efforts of the actuators [N m, N] without effects, from motions (m, n) of the joints."""
+        tau = self.regressor.torque(q, v, vd, self.parameters)
+        return self.arm.transmission.inverse().pull_back_effort(tau)
+
+    def effect_effort(self, q: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
+        """(m, n) efforts of the actuators [N m, N] against the effects, over an evenly sampled motion of the joints."""
+        a, a_dot = self.arm.transmission.position(q), self.arm.transmission.velocity(v)
+        rows = effect_coordinates(self.arm)
+        tau = np.zeros(a.shape)
+        for effect, coefficient in zip(self.effects, self.coefficients, strict=True):
+            if coefficient:
+                h = rows[effect.coordinate]
+                tau += coefficient * effect.column(a @ h, a_dot @ h)[:, None] * h
+        return tau
+
+    def effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
+        """(m, n) efforts of the actuators [N m, N] over an evenly sampled motion of the joints (m, n).
+
+        Effects with memory start at rest with the first sample; sample at 400 Hz or more, or fine ones are missed.
+        """
+        return self.rigid_body_effort(q, v, vd) + self.effect_effort(q, v)
+
+    def mass_matrix(self, q: ArrayLike) -> NDArray[np.float64]:
+        """M (m, n, n) of the joints, rotors included, at poses q (m, n)."""
+        return self.regressor.mass_matrix(q, self.parameters)
+
+
+def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
+    """Raises ModelError unless the section fits the arm, has bodies that can exist, and settings for every actuator."""
+    arm = regressor.arm
+    if [link.link for link in section.links] != [link.link for link in regressor.links]:
+        raise ModelError(f"dynamics.links must be, in this order: {', '.join(link.link for link in regressor.links)}")
+    for link in section.links:
+        if len(link.parameters) != len(PARAMETER_NAMES) or not np.all(np.isfinite(link.parameters)):
+            raise ModelError(f"dynamics: {link.link} must have ten finite numbers: {', '.join(PARAMETER_NAMES)}")
+        least = float(np.linalg.eigvalsh(pseudo_inertia(link.parameters))[0])
+        if not least > 0:
+            raise ModelError(
+                f"dynamics: no body has the inertia of {link.link}: least eigenvalue {least:.2g} of its pseudo-inertia"
+            )
+    if [rotor.actuator for rotor in section.rotors] != list(arm.joint_names):
+        raise ModelError(f"dynamics.rotors must be, in this order: {', '.join(arm.joint_names)}")
+    if not all(0 <= rotor.value < np.inf for rotor in section.rotors):
+        raise ModelError("dynamics: rotor inertias must be finite numbers from 0")
+    _check_effects(arm, section)
+    settings = section.signals
+    for which, values in (("acceleration_cut_off", settings.acceleration_cut_off), ("delay", settings.effort_delay)):
+        if len(values) != arm.num_joints or not np.all(np.isfinite(values)):
+            raise ModelError(f"dynamics.signals: {which} must have {arm.num_joints} finite numbers")
+    if not min(settings.effort_cut_off, settings.position_cut_off, *settings.acceleration_cut_off) > 0:
+        raise ModelError("dynamics.signals: cut-offs must be positive")
+
+
+def _check_effects(arm: Arm, section: DynamicSection) -> None:
+    coordinates = effect_coordinates(arm)
+    for effect in section.effects:
+        where = f"dynamics: effect {effect.coordinate} {effect.kind}"
+        if effect.coordinate not in coordinates:
+            raise ModelError(f"{where}: unknown coordinate; known: {', '.join(coordinates)}")
+        if effect.kind not in EFFECT_KINDS:
+            raise ModelError(f"{where}: unknown kind; known: {', '.join(EFFECT_KINDS)}")
+        kind = EFFECT_KINDS[effect.kind]
+        if kind.revolute and slides(arm, effect.coordinate):
+            raise ModelError(f"{where}: is of an angle, and this slides")
+        if not np.isfinite(effect.value) or not effect.scale >= 0 or (kind.dissipative and effect.value < 0):
+            raise ModelError(f"{where}: value {effect.value:g}, scale {effect.scale:g}; friction must be 0 or more")
