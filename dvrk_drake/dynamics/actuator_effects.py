@@ -75,6 +75,10 @@ def _step(code: int, z: float, dx: float, x: float, v: float, scale: float) -> t
     return z, 1.0
 
 
+#: The compiled step itself, for the compiled code of simulations: (code, state, dx, x, v, scale) -> (state, shape).
+effect_step = _step
+
+
 @dataclass(frozen=True)
 class ActuatorEffect:
     """One effect along one coordinate of the drive.

@@ -1,0 +1,82 @@
+"""Friction along the coordinates of an arm's drive, as elements of Drake's own solver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Joint, JointActuator, PdControllerGains
+
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates
+from dvrk_drake.errors import StationError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.systems.real_arm.drive_joints import DriveJoints
+
+
+@dataclass(frozen=True)
+class Slider:
+    """An elasto-plastic element in the plant: an actuator with a position gain and an effort limit.
+
+    Attributes:
+        actuator: of the plant.
+        effect: whose law it is.
+        travel: of the actuator's joint until it slips [rad, m].
+    """
+
+    actuator: JointActuator
+    effect: ActuatorEffect
+    travel: float
+
+
+def coordinate_row(arm: Arm, coordinate: str) -> NDArray[np.float64]:
+    """(n,) with x = row q, q the joints' positions, of a coordinate of the drive.
+
+    Raises:
+        StationError: no such coordinate.
+    """
+    rows = effect_coordinates(arm)
+    if coordinate not in rows:
+        raise StationError(f"{arm.name}: no coordinate {coordinate} of the drive; allowed: {', '.join(rows)}")
+    row: NDArray[np.float64] = rows[coordinate] @ arm.transmission.matrix
+    return row
+
+
+def add_friction(
+    plant: MultibodyPlant, arm: Arm, drive: DriveJoints, friction: list[DriveEffect]
+) -> tuple[Slider, ...]:
+    """Adds friction to a plant that is not finalized; the sliders need a `SlipFollower`.
+
+    The solver takes each element at the end of the step, so it takes energy in every step, whatever its stiffness:
+
+    - "presliding" with coefficient c and scale s: effort -c clip((x - x_s) / s, +-1), where x_s is what the
+      `SlipFollower` says: a spring that gives way. Below c it holds without creep.
+    - "coulomb": -c clip(v / s, +-1); the smoothed sign of an identification. It creeps below c, at a speed up to s.
+    - "viscous": -c v.
+
+    Raises:
+        StationError: a coordinate that the arm's drive has not.
+    """
+    sliders = []
+    for i, effect in enumerate(friction):
+        if effect.coefficient == 0:
+            continue
+        joint, ratio = drive.joint(coordinate_row(arm, effect.coordinate))
+        if effect.kind == "viscous":
+            _add_damping(joint, effect.coefficient * ratio**2)
+            continue
+        limit, slope = effect.coefficient * abs(ratio), effect.coefficient / effect.scale * ratio**2
+        actuator = plant.AddJointActuator(f"friction_{i}", joint, limit)
+        if effect.kind == "coulomb":
+            actuator.set_controller_gains(PdControllerGains(p=0.0, d=slope))
+        else:
+            actuator.set_controller_gains(PdControllerGains(p=slope, d=0.0))
+            law = ActuatorEffect(effect.coordinate, effect.kind, effect.scale / abs(ratio))
+            sliders.append(Slider(actuator, law, law.scale))
+    return tuple(sliders)
+
+
+def _add_damping(joint: Joint, damping: float) -> None:
+    joint.set_default_damping_vector(joint.default_damping_vector() + damping)
