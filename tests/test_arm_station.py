@@ -71,7 +71,7 @@ def test_port_names_and_sizes(name):
     assert expected.inputs.items() <= inputs.items()
     assert expected.outputs.items() <= outputs.items()
     assert set(inputs) - set(expected.inputs) == {f"{name}.effort_disturbance"}
-    assert set(outputs) - set(expected.outputs) == {"plant_state", "body_poses", "query_object"}
+    assert set(outputs) - set(expected.outputs) == {f"{name}.state_true", "plant_state", "body_poses", "query_object"}
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])

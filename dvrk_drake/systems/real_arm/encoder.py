@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
 
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import EncoderEffect, per_actuator
+from dvrk_drake.systems.gravity_pid_step import entry_point
 
 
 class Encoder(LeafSystem):
@@ -38,76 +39,81 @@ class Encoder(LeafSystem):
         """Of `arm`, with `delay` >= 0 whole time steps of `time_step` [s]."""
         super().__init__()
         n = arm.num_joints
-        self._num_joints, self._delay = n, delay
         resolution = per_actuator(encoder.resolution if encoder else {}, arm.joint_names, 0.0)
-        cut_off = encoder.velocity_cut_off if encoder else 0.0
-        decay = math.exp(-2.0 * math.pi * cut_off * time_step) if encoder else -1.0
+        decay = math.exp(-2.0 * math.pi * encoder.velocity_cut_off * time_step) if encoder else -1.0
         self._constants = np.concatenate([resolution, [decay, time_step]])
-        self._J = np.ascontiguousarray(arm.transmission.matrix)
-        self._J_inverse = np.ascontiguousarray(arm.transmission.inverse().matrix)
+        self._maps = np.array([arm.transmission.matrix, arm.transmission.inverse().matrix])
+        self._measure_into = entry_point(_measure_into)
         self.DeclareVectorInputPort(name="state", size=2 * n)
-        # The last reading (n) and the last velocity (n) of the actuators, then what is known but not out yet.
-        self.DeclareDiscreteState(num_state_variables=2 * n + 2 * n * delay)
-        late = {self.all_state_ticket()}
-        self.DeclareVectorOutputPort(
-            name="state_estimated",
-            size=2 * n,
-            calc=self._calc,
-            prerequisites_of_calc=late if delay else late | {self.all_input_ports_ticket()},
-        )
+        # What is out now; the measurements that are not out yet, oldest first; last reading and velocity of the actuators.
+        self.DeclareDiscreteState(num_state_variables=2 * n)
+        self.DeclareDiscreteState(num_state_variables=2 * n * max(delay - 1, 0))
+        memory = self.DeclareDiscreteState(num_state_variables=2 * n)
+        if delay:
+            self.DeclareStateOutputPort(name="state_estimated", state_index=DiscreteStateIndex(_OUT))
+        else:
+            needs = {self.all_input_ports_ticket(), self.discrete_state_ticket(memory)}
+            self.DeclareVectorOutputPort(
+                name="state_estimated", size=2 * n, calc=self._calc, prerequisites_of_calc=needs
+            )
         self.DeclareInitializationDiscreteUpdateEvent(update=self._start)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_sec=time_step, offset_sec=0.0, update=self._update)
+        update = self._make_update()
+        self.DeclarePeriodicDiscreteUpdateEvent(period_sec=time_step, offset_sec=0.0, update=update)
 
-    def _measure(self, context: Context, memory: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The state (2n,) as measured now; puts the reading into `memory`."""
-        state = self.EvalVectorInput(context, 0).get_value()
-        measured = np.empty(2 * self._num_joints)
-        _measure_into(state, self._J, self._J_inverse, self._constants, memory, measured)
-        return measured
+    def _make_update(self) -> Callable[[Context, DiscreteValues], None]:
+        eval_vector_input, step = self.EvalVectorInput, self._measure_into
+        maps, constants = self._maps, self._constants
+
+        def update(context: Context, discrete_state: DiscreteValues) -> None:
+            value = discrete_state.get_mutable_value
+            state = eval_vector_input(context, 0).get_value()
+            step(state, maps, constants, value(_MEMORY), value(_QUEUE), value(_OUT))
+
+        return update
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        memory = context.get_discrete_state_vector().get_value()
-        n = self._num_joints
-        if self._delay:
-            output.SetFromVector(memory[2 * n : 4 * n])
-        else:
-            output.SetFromVector(self._measure(context, memory[: 2 * n].copy()))
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        memory, n = discrete_state.get_mutable_value(), self._num_joints
-        measured = self._measure(context, memory[: 2 * n])
-        if self._delay:
-            queue = memory[2 * n :]
-            queue[: -2 * n] = queue[2 * n :].copy()
-            queue[-2 * n :] = measured
+        """Without delay: what the update is about to compute."""
+        memory = context.get_discrete_state(_MEMORY).get_value().copy()
+        state = self.EvalVectorInput(context, 0).get_value()
+        self._measure_into(state, self._maps, self._constants, memory, np.empty(0), output.get_mutable_value())
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
-        memory, n = discrete_state.get_mutable_value(), self._num_joints
-        self._measure(context, memory[: 2 * n])
-        memory[n : 2 * n] = 0.0
-        queue = memory[2 * n :]
-        if self._delay:
-            queue[:] = np.tile(self._measure(context, memory[: 2 * n]), self._delay)
+        state = self.EvalVectorInput(context, 0).get_value()
+        memory, queue, out = (discrete_state.get_mutable_value(group) for group in (_MEMORY, _QUEUE, _OUT))
+        n = len(memory) // 2
+        at_rest = np.concatenate([state[:n], np.zeros(n)]) if self._constants[n] >= 0 else state
+        self._measure_into(at_rest, self._maps, self._constants, memory, np.empty(0), out)
+        memory[n:] = 0.0
+        self._measure_into(at_rest, self._maps, self._constants, memory, np.empty(0), out)
+        queue[:] = np.tile(out, len(queue) // len(out))
 
 
-@numba.njit(cache=True)
-def _measure_into(
-    state: NDArray[np.float64],
-    J: NDArray[np.float64],
-    J_inverse: NDArray[np.float64],
-    constants: NDArray[np.float64],
-    memory: NDArray[np.float64],
-    measured: NDArray[np.float64],
-) -> None:
-    n = len(J)
+_OUT, _QUEUE, _MEMORY = 0, 1, 2  # indices of the discrete state groups
+
+
+@numba.njit(
+    "void(float64[::1], float64[:, :, ::1], float64[::1], float64[::1], float64[::1], float64[::1])", cache=True
+)
+def _measure_into(state, maps, constants, memory, queue, out):
+    """Measures `state`; the oldest measurement of `queue` goes out and this one in, or out at once if it is empty.
+
+    `maps` (2, n, n) are J and its inverse, `constants` resolutions (n), decay of the low-pass, time step.
+    """
+    n = len(state) // 2
     decay, time_step = constants[n], constants[n + 1]
+    late = len(queue)
+    if late:
+        out[:] = queue[: 2 * n]
+        for i in range(late - 2 * n):
+            queue[i] = queue[i + 2 * n]
+    measured = queue[late - 2 * n :] if late else out
     if decay < 0.0:
         measured[:] = state
         return
     for i in range(n):
         a = 0.0
         for k in range(n):
-            a += J[i, k] * state[k]
+            a += maps[0, i, k] * state[k]
         if constants[i] > 0.0:
             a = constants[i] * np.rint(a / constants[i])
         memory[n + i] = decay * memory[n + i] + (1.0 - decay) * (a - memory[i]) / time_step
@@ -115,7 +121,7 @@ def _measure_into(
     for i in range(n):
         q, v = 0.0, 0.0
         for k in range(n):
-            q += J_inverse[i, k] * memory[k]
-            v += J_inverse[i, k] * memory[n + k]
+            q += maps[1, i, k] * memory[k]
+            v += maps[1, i, k] * memory[n + k]
         measured[i] = q
         measured[n + i] = v

@@ -55,6 +55,9 @@ def add_motor_channel(
         limit = per_actuator(effects.saturation, names, np.inf)
         motors = behind(motors, Saturation(min_value=-limit, max_value=limit), "motor_saturation")
     measured = motors
+    if delay.measurement:
+        # Before noise and steps: these are computed only when somebody reads the port.
+        measured = behind(measured, DiscreteTimeDelay(time_step, delay.measurement, n), "measurement_delay")
     if effort.noise:
         source = builder.AddNamedSystem("noise", NoiseSource(table(effort.noise), time_step, seed))
         total = builder.AddNamedSystem("noisy_effort", Adder(2, n))
@@ -63,6 +66,4 @@ def add_motor_channel(
         measured = total.get_output_port()
     if effort.measured_resolution:
         measured = behind(measured, Quantizer(table(effort.measured_resolution)), "measured_steps")
-    if delay.measurement:
-        measured = behind(measured, DiscreteTimeDelay(time_step, delay.measurement, n), "measurement_delay")
     return behind(motors, MatrixGain(D=J.T), "to_joints"), behind(measured, MatrixGain(D=J.T), "measured_effort")

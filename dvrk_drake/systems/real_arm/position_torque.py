@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, effect_step
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.systems.gravity_pid_step import entry_point
 from dvrk_drake.systems.real_arm.dry_friction import coordinate_row
 
 
@@ -41,34 +41,30 @@ class PositionTorque(LeafSystem):
         n = arm.num_joints
         self._rows = np.array([coordinate_row(arm, effect.coordinate) for effect in effects]).reshape(-1, n)
         self._codes = np.array([EFFECT_KINDS[effect.kind].code for effect in effects], dtype=int)
-        self._scales = np.array([effect.scale for effect in effects])
-        self._coefficients = np.array([effect.coefficient for effect in effects])
+        self._constants = np.array([[effect.scale, effect.coefficient] for effect in effects])
         self.DeclareVectorInputPort(name="state", size=2 * n)
         self.DeclareVectorOutputPort(
-            name="effort", size=n, calc=self._calc_effort, prerequisites_of_calc={self.all_input_ports_ticket()}
+            name="effort", size=n, calc=self._make_calc(), prerequisites_of_calc={self.all_input_ports_ticket()}
         )
 
-    def _calc_effort(self, context: Context, output: BasicVector) -> None:
-        state = self.EvalVectorInput(context, 0).get_value()
-        _torque_into(
-            state, self._rows, self._codes, self._scales, self._coefficients, output.get_mutable_value()
-        )
+    def _make_calc(self) -> Callable[[Context, BasicVector], None]:
+        eval_vector_input, step = self.EvalVectorInput, entry_point(_torque_into)
+        rows, codes, constants = self._rows, self._codes, self._constants
+
+        def calc(context: Context, output: BasicVector) -> None:
+            step(eval_vector_input(context, 0).get_value(), rows, codes, constants, output.get_mutable_value())
+
+        return calc
 
 
-@numba.njit(cache=True)
-def _torque_into(
-    state: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    codes: NDArray[np.int_],
-    scales: NDArray[np.float64],
-    coefficients: NDArray[np.float64],
-    effort: NDArray[np.float64],
-) -> None:
+@numba.njit("void(float64[::1], float64[:, ::1], int64[::1], float64[:, ::1], float64[::1])", cache=True)
+def _torque_into(state, rows, codes, constants, effort):
+    """`constants` (effects, 2): scale and coefficient."""
     effort[:] = 0.0
     for i in range(len(codes)):
         x = 0.0
         for k in range(len(effort)):
             x += rows[i, k] * state[k]
-        _, shape = effect_step(codes[i], 0.0, 0.0, x, 0.0, scales[i])
+        _, shape = effect_step(codes[i], 0.0, 0.0, x, 0.0, constants[i, 0])
         for k in range(len(effort)):
-            effort[k] -= rows[i, k] * coefficients[i] * shape
+            effort[k] -= rows[i, k] * constants[i, 1] * shape

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, effect_step
+from dvrk_drake.systems.gravity_pid_step import entry_point
 from dvrk_drake.systems.real_arm.dry_friction import Slider
 
 
@@ -50,29 +50,28 @@ class SlipFollower(LeafSystem):
         state = self.DeclareDiscreteState(num_state_variables=2 * len(order))
         self.DeclareStateOutputPort(name="desired_state", state_index=state)
         self.DeclareInitializationDiscreteUpdateEvent(update=self._slacken)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_sec=time_step, offset_sec=0.0, update=self._follow)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_sec=time_step, offset_sec=0.0, update=self._make_follow())
 
     def _slacken(self, context: Context, discrete_state: DiscreteValues) -> None:
         hooks = discrete_state.get_mutable_value()
         hooks[self._entries] = self.EvalVectorInput(context, 0).get_value()[self._columns]
 
-    def _follow(self, context: Context, discrete_state: DiscreteValues) -> None:
-        hooks = discrete_state.get_mutable_value()
-        state = self.EvalVectorInput(context, 0).get_value()
-        _follow_all(state, self._columns, self._entries, self._travel, hooks)
+    def _make_follow(self) -> Callable[[Context, DiscreteValues], None]:
+        """The handler of the update, with all that it needs at hand: see GravityPidController."""
+        eval_vector_input, step = self.EvalVectorInput, entry_point(_follow_all)
+        columns, entries, travel = self._columns, self._entries, self._travel
+
+        def follow(context: Context, discrete_state: DiscreteValues) -> None:
+            step(eval_vector_input(context, 0).get_value(), columns, entries, travel, discrete_state.get_mutable_value())
+
+        return follow
 
 
 _PRESLIDING = EFFECT_KINDS["presliding"].code
 
 
-@numba.njit(cache=True)
-def _follow_all(
-    state: NDArray[np.float64],
-    columns: NDArray[np.int_],
-    entries: NDArray[np.int_],
-    travel: NDArray[np.float64],
-    hooks: NDArray[np.float64],
-) -> None:
+@numba.njit("void(float64[::1], int64[::1], int64[::1], float64[::1], float64[::1])", cache=True)
+def _follow_all(state, columns, entries, travel, hooks):
     for i in range(len(columns)):
         position = state[columns[i]]
         stretch = position - hooks[entries[i]]
