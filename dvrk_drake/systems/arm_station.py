@@ -113,6 +113,7 @@ class ArmStation(Diagram):
         self._arm = arm
         self._true_arm = plant_arm or arm
         self._plant: MultibodyPlant | None = None
+        self._encoder: Encoder | None = None
         builder = DiagramBuilder()
         if hardware:
             if any(option is not None for option in (meshcat, plant_arm, modify_plant, effects)):
@@ -203,6 +204,8 @@ class ArmStation(Diagram):
         q_plant = self.plant.GetPositions(plant_context)
         self._plant_effects.drive.set_positions(q_plant, q)
         self.plant.SetPositions(plant_context, q_plant)
+        if self._encoder is not None:
+            self._encoder.set_at_rest(self.GetMutableSubsystemContext(self._encoder, context), q)
         self.plant.SetVelocities(plant_context, np.zeros(self.plant.num_velocities()))
 
     def get_positions(self, context: Context) -> NDArray[np.float64]:
@@ -244,8 +247,11 @@ class ArmStation(Diagram):
             for shape in plant.GetCollisionGeometriesForBody(body):
                 self._scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
+    def _home(self) -> NDArray[np.float64]:
+        return np.clip(0.0, self._true_arm.position_lower, self._true_arm.position_upper)
+
     def _set_default_pose(self) -> None:
-        home = np.clip(0.0, self._true_arm.position_lower, self._true_arm.position_upper)
+        home = self._home()
         q_plant = self.plant.GetDefaultPositions()
         tree = tree_selector(self.plant, self._true_arm, self._instance)
         q_plant[tree] = self._true_arm.linkage.position(home)
@@ -307,10 +313,10 @@ class ArmStation(Diagram):
         builder.ExportOutput(state_true, f"{name}.state_true")
         if effects.encoder is not None or effects.delay is not None:
             delay = effects.delay.measurement if effects.delay else 0
-            encoder = Encoder(self._arm, effects.encoder, delay, plant.time_step())
-            builder.AddNamedSystem("encoder", encoder)
-            builder.Connect(state, encoder.get_input_port())
-            state = encoder.get_output_port()
+            self._encoder = Encoder(self._arm, effects.encoder, delay, plant.time_step(), self._home())
+            builder.AddNamedSystem("encoder", self._encoder)
+            builder.Connect(state, self._encoder.get_input_port())
+            state = self._encoder.get_output_port()
         builder.ExportOutput(state, f"{name}.state_estimated")
         halves = np.split(np.eye(2 * n), 2)
         for port, D in zip(("position_measured", "velocity_estimated"), halves, strict=True):

@@ -69,6 +69,7 @@ def add_friction(
             continue
         limit, slope = effect.coefficient * abs(ratio), effect.coefficient / effect.scale * ratio**2
         actuator = plant.AddJointActuator(f"friction_{i}", joint, limit)
+        _copy_rotor(plant, actuator)
         if effect.kind == "coulomb":
             actuator.set_controller_gains(PdControllerGains(p=0.0, d=slope))
         else:
@@ -76,6 +77,15 @@ def add_friction(
             law = ActuatorEffect(effect.coordinate, effect.kind, effect.scale / abs(ratio))
             sliders.append(Slider(actuator, law, law.scale))
     return tuple(sliders)
+
+
+def _copy_rotor(plant: MultibodyPlant, actuator: JointActuator) -> None:
+    """Of several actuators on a joint Drake takes the rotor inertia of the last one alone (1.51 to 1.58): say it again."""
+    for index in plant.GetJointActuatorIndices():
+        motor = plant.get_joint_actuator(index)
+        if motor.joint().index() == actuator.joint().index() and motor.default_rotor_inertia() > 0:
+            actuator.set_default_rotor_inertia(motor.default_rotor_inertia())
+            actuator.set_default_gear_ratio(motor.default_gear_ratio())
 
 
 def _add_damping(joint: Joint, damping: float) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
 
 from dvrk_drake.models.arm import Arm
@@ -32,11 +33,14 @@ class Encoder(LeafSystem):
     difference of two readings over the time step h, low-passed to first order: with a = exp(-2 pi f h),
     y[k] = a y[k-1] + (1 - a) (x[k] - x[k-1]) / h. Without an `encoder` position and velocity are exact.
 
-    At initialization the arm is taken to have rested where it is.
+    The arm is taken to have rested before it starts: where `set_at_rest` says, or where it is at initialization. With a
+    delay, what is out during initialization itself is the former.
     """
 
-    def __init__(self, arm: Arm, encoder: EncoderEffect | None, delay: int, time_step: float) -> None:
-        """Of `arm`, with `delay` >= 0 whole time steps of `time_step` [s]."""
+    def __init__(
+        self, arm: Arm, encoder: EncoderEffect | None, delay: int, time_step: float, q_default: NDArray[np.float64]
+    ) -> None:
+        """Of `arm`, with `delay` >= 0 whole time steps of `time_step` [s]; it rested at `q_default` (n,) before."""
         super().__init__()
         n = arm.num_joints
         resolution = per_actuator(encoder.resolution if encoder else {}, arm.joint_names, 0.0)
@@ -45,14 +49,14 @@ class Encoder(LeafSystem):
         self._maps = np.array([arm.transmission.matrix, arm.transmission.inverse().matrix])
         self._measure_into = entry_point(_measure_into)
         self.DeclareVectorInputPort(name="state", size=2 * n)
+        self._queue_length = max(delay - 1, 0)
         # What is out now; the measurements that are not out yet, oldest first; last reading and velocity of the actuators.
-        self.DeclareDiscreteState(num_state_variables=2 * n)
-        self.DeclareDiscreteState(num_state_variables=2 * n * max(delay - 1, 0))
-        memory = self.DeclareDiscreteState(num_state_variables=2 * n)
+        for value in self._at_rest(q_default):
+            self.DeclareDiscreteState(value)
         if delay:
             self.DeclareStateOutputPort(name="state_estimated", state_index=DiscreteStateIndex(_OUT))
         else:
-            needs = {self.all_input_ports_ticket(), self.discrete_state_ticket(memory)}
+            needs = {self.all_input_ports_ticket(), self.all_state_ticket()}
             self.DeclareVectorOutputPort(
                 name="state_estimated", size=2 * n, calc=self._calc, prerequisites_of_calc=needs
             )
@@ -77,15 +81,23 @@ class Encoder(LeafSystem):
         state = self.EvalVectorInput(context, 0).get_value()
         self._measure_into(state, self._maps, self._constants, memory, np.empty(0), output.get_mutable_value())
 
+    def set_at_rest(self, context: Context, q: NDArray[np.float64]) -> None:
+        """What has been measured of an arm that rested at q (n,) until now; in this system's context."""
+        for group, value in enumerate(self._at_rest(q)):
+            context.SetDiscreteState(group, value)
+
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = self.EvalVectorInput(context, 0).get_value()
-        memory, queue, out = (discrete_state.get_mutable_value(group) for group in (_MEMORY, _QUEUE, _OUT))
-        n = len(memory) // 2
-        at_rest = np.concatenate([state[:n], np.zeros(n)]) if self._constants[n] >= 0 else state
-        self._measure_into(at_rest, self._maps, self._constants, memory, np.empty(0), out)
-        memory[n:] = 0.0
-        self._measure_into(at_rest, self._maps, self._constants, memory, np.empty(0), out)
-        queue[:] = np.tile(out, len(queue) // len(out))
+        q = self.EvalVectorInput(context, 0).get_value()[: self._maps.shape[1]]
+        for group, value in enumerate(self._at_rest(q)):
+            discrete_state.set_value(group, value)
+
+    def _at_rest(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        n = self._maps.shape[1]
+        state, memory, out = np.concatenate([q, np.zeros(n)]), np.zeros(2 * n), np.zeros(2 * n)
+        for _ in range(2):  # the second reading differs from the first by nothing
+            memory[n:] = 0.0
+            self._measure_into(state, self._maps, self._constants, memory, np.empty(0), out)
+        return out, np.tile(out, self._queue_length), memory
 
 
 _OUT, _QUEUE, _MEMORY = 0, 1, 2  # indices of the discrete state groups
