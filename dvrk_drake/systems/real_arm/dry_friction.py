@@ -16,6 +16,11 @@ from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.systems.real_arm.drive_joints import DriveJoints
 
 
+#: Of the springs of presliding [s]: their damping over their stiffness. An arm that is hit rings for a moment, not for a
+#: minute. Drake limits the sum of spring and damper to the element's coefficient, so sliding is the same.
+RELAXATION = 0.01
+
+
 @dataclass(frozen=True)
 class Slider:
     """An elasto-plastic element in the plant: an actuator with a position gain and an effort limit.
@@ -51,8 +56,8 @@ def add_friction(
 
     The solver takes each element at the end of the step, so it takes energy in every step, whatever its stiffness:
 
-    - "presliding" with coefficient c and scale s: effort -c clip((x - x_s) / s, +-1), where x_s is what the
-      `SlipFollower` says: a spring that gives way. Below c it holds without creep.
+    - "presliding" with coefficient c and scale s: effort -c clip((x - x_s + T v) / s, +-1), where x_s is what the
+      `SlipFollower` says and T = `RELAXATION`: a spring that gives way. Below c it holds without creep.
     - "coulomb": -c clip(v / s, +-1); the smoothed sign of an identification. It creeps below c, at a speed up to s.
     - "viscous": -c v.
 
@@ -73,7 +78,7 @@ def add_friction(
         if effect.kind == "coulomb":
             actuator.set_controller_gains(PdControllerGains(p=0.0, d=slope))
         else:
-            actuator.set_controller_gains(PdControllerGains(p=slope, d=0.0))
+            actuator.set_controller_gains(PdControllerGains(p=slope, d=RELAXATION * slope))
             law = ActuatorEffect(effect.coordinate, effect.kind, effect.scale / abs(ratio))
             sliders.append(Slider(actuator, law, law.scale))
     return tuple(sliders)
