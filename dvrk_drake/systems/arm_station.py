@@ -59,7 +59,8 @@ class ArmStation(Diagram):
 
     Without `effects` all of it is C++ and has no state but the plant's, and measured values are exact and undelayed.
     `effects` are those of a real arm, see `ArmEffects`: friction, cables, stops, encoders, motors and delays as
-    `arm.effects` states them. Drake's solver holds the linkage to about 1e-8 m at 1 ms with either `closure`, and each joint in its position limits; the
+    `arm.effects` states them. With them (be they empty) a discrete controller beside the station sees the arm before the
+    step that its command is for: its command is a period late, as on hardware. Drake's solver holds the linkage to about 1e-8 m at 1 ms with either `closure`, and each joint in its position limits; the
     coupled limits of the linkage are not there. An arm's shapes never touch each other: they are collision shapes
     only where `modify_plant` adds one that they can touch.
 
@@ -157,6 +158,9 @@ class ArmStation(Diagram):
         self._instance = add_arm(self.plant, true_arm, closure)
         if modify_plant is not None:
             modify_plant(self.plant)
+        if effects is not None:
+            # Otherwise Drake steps the plant before all discrete updates, and what they measure is from after the step.
+            self.plant.SetUseSampledOutputPorts(False)
         effects = effects or ArmEffects()
         self._plant_effects = PlantEffects(self.plant, true_arm, self._instance, effects)
         self.plant.Finalize()

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, Joint, ModelInstanceIndex, RevoluteJoint, RigidBody, SpatialInertia
-from pydrake.multibody.tree import RotationalInertia as Inertia
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    Joint,
+    ModelInstanceIndex,
+    RevoluteJoint,
+    RigidBody,
+    RotationalInertia,
+    SpatialInertia,
+)
 
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 
-#: Of each body that is added [kg, kg m^2]: below a hundredth of any link's and rotor's that it turns with.
-MASS, INERTIA = 1e-6, 1e-6
+#: Of each body that is added: its inertia, as a share of what the arm shows at the coordinate. Drake makes a tie as stiff as
+#: the lighter of what it ties allows at the time step: at a thousandth, an MTM's parallelogram gives 1 mrad for 3 N m.
+SHARE, MASS = 2e-3, 1e-6
 #: Where bodies that turn together are tied, from their axis [m].
 RADIUS = 0.1
 
@@ -68,7 +79,7 @@ class DriveJoints:
                 total = total + sign * self._arm.linkage.matrix[names.index(joint.name())]
                 if joint is not last and np.allclose(total, row, atol=1e-12):
                     origin = _offset(joint.frame_on_parent()) + along
-                    return self._beside(joint.parent_body(), origin, last)
+                    return self._beside(row, joint.parent_body(), origin, last)
                 parent = joint.parent_body()
                 if parent.index() not in above:
                     break
@@ -79,10 +90,12 @@ class DriveJoints:
                 along, joint = along + step, upper
         return None
 
-    def _beside(self, parent: RigidBody, p_PR: NDArray[np.float64], last: RevoluteJoint) -> Joint:
+    def _beside(
+        self, row: NDArray[np.float64], parent: RigidBody, p_PR: NDArray[np.float64], last: RevoluteJoint
+    ) -> Joint:
         """A joint from `parent` about the axis of `last` at p_PR, whose body turns with the child of `last`."""
         plant, name = self._plant, f"drive_{len(self._added)}"
-        body = self._body(name)
+        body = self._body(name, row)
         frame = plant.AddFrame(FixedOffsetFrame(f"{name}_base", parent, RigidTransform(p_PR)))
         joint = plant.AddJoint(RevoluteJoint(name, frame, body.body_frame(), last.revolute_axis()))
         self._tie(last.child_body(), _offset(last.frame_on_child()), body, last.revolute_axis())
@@ -93,12 +106,12 @@ class DriveJoints:
         axis, end = np.array([0.0, 0.0, 1.0]), plant.world_body()
         for k in np.flatnonzero(row):
             leader = self._arm.joint_names[k]
-            body = self._body(_chain_name(i, leader))
+            body = self._body(_chain_name(i, leader), row)
             link = RevoluteJoint(_chain_name(i, leader), end.body_frame(), body.body_frame(), axis)
             follower = plant.AddJoint(link)
             plant.AddCouplerConstraint(follower, plant.GetJointByName(leader, self._instance), float(row[k]))
             end = body
-        body = self._body(f"drive_{i}")
+        body = self._body(f"drive_{i}", row)
         joint = plant.AddJoint(RevoluteJoint(f"drive_{i}", plant.world_frame(), body.body_frame(), axis))
         self._tie(end, np.zeros(3), body, axis)
         return joint
@@ -109,9 +122,22 @@ class DriveJoints:
         f = np.cross(axis, e)
         self._plant.AddDistanceConstraint(A, p_AAxis + RADIUS * e, B, RADIUS * f, float(np.sqrt(2.0)) * RADIUS)
 
-    def _body(self, name: str) -> RigidBody:
-        inertia = SpatialInertia.MakeFromCentralInertia(MASS, np.zeros(3), Inertia(INERTIA, INERTIA, INERTIA))
+    def _body(self, name: str, row: NDArray[np.float64]) -> RigidBody:
+        I = SHARE / float(row @ np.linalg.solve(_mass_matrix(self._arm), row))
+        inertia = SpatialInertia.MakeFromCentralInertia(MASS, np.zeros(3), RotationalInertia(I, I, I))
         return self._plant.AddRigidBody(name, self._instance, inertia)
+
+
+@cache
+def _mass_matrix(arm: Arm) -> NDArray[np.float64]:
+    """(n, n) of the joints, in the middle of their ranges."""
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    set_arm_positions(plant, context, arm, 0.5 * (arm.position_lower + arm.position_upper))
+    tree = tree_selector(plant, arm)
+    M: NDArray[np.float64] = plant.CalcMassMatrix(context)[np.ix_(tree, tree)]
+    G = arm.linkage.matrix
+    return G.T @ M @ G
 
 
 def _chain_name(i: int, leader: str) -> str:

@@ -48,7 +48,8 @@ def add_motor_channel(
 
     motors = behind(commanded, MatrixGain(D=np.linalg.inv(J).T), "to_motors")
     if delay.command:
-        motors = behind(motors, DiscreteTimeDelay(time_step, delay.command, n), "command_delay")
+        # Its input comes out a step later by itself: the plant steps while it is stored.
+        motors = behind(motors, DiscreteTimeDelay(time_step, delay.command - 1, n), "command_delay")
     if effort.command_resolution:
         motors = behind(motors, Quantizer(table(effort.command_resolution)), "command_steps")
     if effects.saturation:
@@ -57,7 +58,7 @@ def add_motor_channel(
     measured = motors
     if delay.measurement:
         # Before noise and steps: these are computed only when somebody reads the port.
-        measured = behind(measured, DiscreteTimeDelay(time_step, delay.measurement, n), "measurement_delay")
+        measured = behind(measured, DiscreteTimeDelay(time_step, delay.measurement - 1, n), "measurement_delay")
     if effort.noise:
         source = builder.AddNamedSystem("noise", NoiseSource(table(effort.noise), time_step, seed))
         total = builder.AddNamedSystem("noisy_effort", Adder(2, n))

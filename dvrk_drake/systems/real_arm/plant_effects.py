@@ -36,9 +36,6 @@ class PlantEffects:
                 joint, ratio = self.drive.joint(rows[i])
                 ends = np.sort([lower[i] / ratio, upper[i] / ratio])
                 joint.set_position_limits(ends[:1], ends[1:])
-        if effects.friction or effects.stops:
-            # What is sampled is computed in every step, whether somebody reads it or not.
-            plant.SetUseSampledOutputPorts(False)
 
     def connect(self, builder: DiagramBuilder) -> None:
         """Adds what the sliders need to the diagram of the plant, which is finalized by now."""
