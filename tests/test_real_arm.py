@@ -24,7 +24,7 @@ from dvrk_drake.models.effects_schema import (
 from dvrk_drake.models.plant import tree_selector
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.real_arm.dry_friction import coordinate_row
+from dvrk_drake.systems.real_arm.dry_friction import RELAXATION, coordinate_row
 
 ARMS = ["mtml", "mtmr", "psm"]
 STEP = 1e-3
@@ -108,7 +108,9 @@ def test_friction_slides_above_its_limit(name):
     n = arm.num_joints
     for i in range(n):
         everything = sum(
-            e.coefficient * abs(coordinate_row(arm, e.coordinate)[i]) for e in arm.effects.friction if e.kind != "viscous"
+            effect.coefficient * abs(coordinate_row(arm, effect.coordinate)[i])
+            for effect in arm.effects.friction
+            if effect.kind != "viscous"
         )
         run = Run(arm, arm.effects.only(["friction"]))
         run.fix("effort_disturbance", 1.3 * everything * np.eye(n)[i])
@@ -168,8 +170,8 @@ def test_friction_is_the_element_that_is_identified(name):
     law = ActuatorEffect(effect.coordinate, "presliding", effect.scale)
     expected = -effect.coefficient * law.column(x, np.zeros_like(x))[1:]
     assert np.ptp(expected) == pytest.approx(2 * effect.coefficient)
-    # Its damper, which the law has not, is worth what it travels in 10 ms; it rounds the corners.
-    rounding = effect.coefficient * np.minimum(0.01 * np.abs(np.diff(x)) / STEP / effect.scale, 2.0)
+    # Its damper, which the law has not, is worth what it travels in that time; it rounds the corners.
+    rounding = effect.coefficient * np.minimum(RELAXATION * np.abs(np.diff(x)) / STEP / effect.scale, 2.0)
     assert np.all(np.abs(effort - expected) < rounding + 1e-6)
     assert np.mean(np.abs(effort - expected)) < 0.1 * effect.coefficient
 
@@ -184,9 +186,10 @@ def test_friction_leaves_the_inertia_as_it_is(name):
         plant_context = station.GetMutableSubsystemContext(station.plant, context)
         tree = tree_selector(station.plant, arm)
         matrices.append(station.plant.CalcMassMatrix(plant_context)[np.ix_(tree, tree)])
-    # The bodies that are added have 0.2 % of the inertia that they turn with, beside joints that carry them.
+    # The bodies that are added have 0.2 % of the inertia that they turn with; the roll, which carries those of the
+    # fingers, is lighter than they are.
     size = np.sqrt(np.outer(np.diag(matrices[0]), np.diag(matrices[0])))
-    assert np.all(np.abs(matrices[1] - matrices[0]) < 2e-3 * size)
+    assert np.all(np.abs(matrices[1] - matrices[0]) <= 2e-2 * size)
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -373,11 +376,17 @@ def test_a_seed_gives_the_same_bits(name):
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_the_whole_real_arm_is_held(name):
-    recording = simulate(load_scenario(name, ["duration=2", "real_arm=[all]"])).recording
+def test_a_controller_that_knows_only_gravity_holds_the_real_arm(name):
     arm = load_arm(name)
-    # A count of the coarsest encoder, and what the cables of 0.07 N m pull at first.
-    assert np.abs(recording.q[-20:] - recording.q[0]).max() < 0.02
+    path = simulate(load_scenario(name, ["duration=2", "real_arm=[all]"])).recording.q
+    # Cables and springs, which it does not know, pull it by their torque over its gain until its integral has grown.
+    assert np.abs(path - path[0]).max() < 0.1
+    rest = [part for part in EFFECT_NAMES if part not in ("cables", "springs")]
+    recording = simulate(load_scenario(name, ["duration=2", f"real_arm={rest}"])).recording
+    resolution = np.array([arm.effects.encoder.resolution[joint] for joint in arm.joint_names])
+    counts = arm.transmission.position(recording.q - recording.q[0]) / resolution
+    # Presliding alone is some counts of the fine encoders: 3 mrad under its load.
+    assert np.all(np.abs(counts * resolution) < np.maximum(2 * resolution, 0.003))
     assert np.all(np.abs(recording.tau) <= 1.1 * arm.effort_limits)
 
 
@@ -405,7 +414,7 @@ def test_a_typo_is_an_error(tmp_path):
         ("outer_yaw: 1.861", "outer_jaw: 1.861", "effects.saturation: unknown actuator outer_jaw"),
         ("outer_yaw: 1.861", "outer_yaw: -1.861", "effects.saturation.outer_yaw = -1.861 must be"),
         ("measurement: 1", "measurement: -1", "effects.delay.measurement = -1"),
-        ("kind: presliding, scale: 0.015", "kind: stiction, scale: 0.015", 'effects.friction: kind "stiction"; allowed'),
+        ("presliding, scale: 0.015", "stiction, scale: 0.015", 'effects.friction: kind "stiction"; allowed'),
         ("scale: 0.015", "scale: 0.0", "has scale 0"),
         ("coefficient: 0.0019", "coefficient: -0.0019", "has coefficient -0.0019"),
     ):
@@ -419,7 +428,7 @@ def test_a_typo_is_an_error(tmp_path):
 def test_a_coordinate_that_is_none_is_refused():
     arm = load_arm("mtml")
     nowhere = ArmEffects(friction=[DriveEffect("actuator.elbow", "presliding", 0.01, 0.1)])
-    with pytest.raises(StationError, match="no coordinate actuator.elbow of the drive; allowed: actuator.outer_yaw"):
+    with pytest.raises(StationError, match=r"no coordinate actuator\.elbow of the drive; allowed: actuator\.outer_yaw"):
         ArmStation(arm, effects=nowhere)
     with pytest.raises(StationError, match="of a simulation"):
         ArmStation(arm, hardware=True, effects=arm.effects)

@@ -54,7 +54,7 @@ class Mechanism:
     """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common.
 
     `effort_cut_off` [Hz] is that of the low-pass behind which measured and modelled efforts are compared. `effects` are
-    those of a real arm, for its simulation.
+    what a real arm has beside all that, for its simulation.
     """
 
     sdf: str = ""

@@ -6,6 +6,7 @@ No postponed annotations here: yaml_load_typed reads the types at run time.
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,12 +133,13 @@ class ArmEffects:
             if not 0 <= ticks <= 100:
                 raise ArmError(f"delay.{which} = {ticks}; allowed: 0..100 time steps")
         for effect in self.friction:
+            where = f"friction: {effect.coordinate} {effect.kind}"
             if effect.kind not in FRICTION_KINDS:
                 raise ArmError(f'friction: kind "{effect.kind}"; allowed: {", ".join(FRICTION_KINDS)}')
             if not 0 <= effect.coefficient < 1e3:
-                raise ArmError(f"friction: {effect.coordinate} {effect.kind} has coefficient {effect.coefficient:g}; >= 0")
+                raise ArmError(f"{where} has coefficient {effect.coefficient:g}; it must not be negative")
             if effect.kind != "viscous" and not 1e-9 < effect.scale < 1e3:
-                raise ArmError(f"friction: {effect.coordinate} {effect.kind} has scale {effect.scale:g}; must be positive")
+                raise ArmError(f"{where} has scale {effect.scale:g}; it must be positive")
         for effect in [*self.cables, *self.springs]:
             if effect.kind not in POSITION_KINDS:
                 raise ArmError(f'cables, springs: kind "{effect.kind}"; allowed: {", ".join(POSITION_KINDS)}')
@@ -158,7 +160,7 @@ def per_actuator(values: dict[str, float], joint_names: Sequence[str], otherwise
     return np.array([values.get(name, otherwise) for name in joint_names])
 
 
-def _joined(one: object, other: object) -> object:
+def _joined(one: Any, other: Any) -> Any:
     if one is None or other is None:
         return one if other is None else other
     if isinstance(one, bool):

@@ -59,10 +59,12 @@ class ArmStation(Diagram):
 
     Without `effects` all of it is C++ and has no state but the plant's, and measured values are exact and undelayed.
     `effects` are those of a real arm, see `ArmEffects`: friction, cables, stops, encoders, motors and delays as
-    `arm.effects` states them. With them (be they empty) a discrete controller beside the station sees the arm before the
-    step that its command is for: its command is a period late, as on hardware. Drake's solver holds the linkage to about 1e-8 m at 1 ms with either `closure`, and each joint in its position limits; the
-    coupled limits of the linkage are not there. An arm's shapes never touch each other: they are collision shapes
-    only where `modify_plant` adds one that they can touch.
+    `arm.effects` states them. With them (be they empty) a discrete controller beside the station sees the arm before
+    the step that its command is for: the command is a period late, as on hardware.
+
+    Drake's solver holds the linkage to about 1e-8 m at 1 ms with either `closure`, and each joint in its position
+    limits; the coupled limits of the linkage are there with the effect `stops`. An arm's shapes never touch each other:
+    they are collision shapes only where `modify_plant` adds one that they can touch.
 
     **On hardware** the ports of `station_ports` are all there are. Measured values are those of the last DVRK_STATUS
     message, NaN before the first. Efforts go out in DVRK_COMMAND messages every `driver.status_period` and on forced
@@ -262,9 +264,7 @@ class ArmStation(Diagram):
         self._plant_effects.drive.set_positions(q_plant, home)
         self.plant.SetDefaultPositions(q_plant)
 
-    def _export_inputs(
-        self, builder: DiagramBuilder, effects: ArmEffects, seed: int, state_true: OutputPort
-    ) -> None:
+    def _export_inputs(self, builder: DiagramBuilder, effects: ArmEffects, seed: int, state_true: OutputPort) -> None:
         plant, name, n = self.plant, self._arm.name.lower(), self._arm.num_joints
         # The plant clamps as well, but silently: clamp here, at the plant's limits, to know what is applied.
         actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(self._instance)]

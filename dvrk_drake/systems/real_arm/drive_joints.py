@@ -21,8 +21,9 @@ from pydrake.multibody.tree import (
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 
-#: Of each body that is added: its inertia, as a share of what the arm shows at the coordinate. Drake makes a tie as stiff as
-#: the lighter of what it ties allows at the time step: at a thousandth, an MTM's parallelogram gives 1 mrad for 3 N m.
+#: Of each body that is added: its inertia, as a share of what the arm shows at the coordinate, and its mass [kg]. Drake
+#: makes a tie as stiff as the lighter of its bodies allows at the time step: so an MTM's parallelogram gives 1 mrad for
+#: 3 N m.
 SHARE, MASS = 2e-3, 1e-6
 #: Where bodies that turn together are tied, from their axis [m].
 RADIUS = 0.1
@@ -123,9 +124,9 @@ class DriveJoints:
         self._plant.AddDistanceConstraint(A, p_AAxis + RADIUS * e, B, RADIUS * f, float(np.sqrt(2.0)) * RADIUS)
 
     def _body(self, name: str, row: NDArray[np.float64]) -> RigidBody:
-        I = SHARE / float(row @ np.linalg.solve(_mass_matrix(self._arm), row))
-        inertia = SpatialInertia.MakeFromCentralInertia(MASS, np.zeros(3), RotationalInertia(I, I, I))
-        return self._plant.AddRigidBody(name, self._instance, inertia)
+        about_axis = SHARE / float(row @ np.linalg.solve(_mass_matrix(self._arm), row))
+        M_BBo_B = SpatialInertia.MakeFromCentralInertia(MASS, np.zeros(3), RotationalInertia(*np.full(3, about_axis)))
+        return self._plant.AddRigidBody(name, self._instance, M_BBo_B)
 
 
 @cache

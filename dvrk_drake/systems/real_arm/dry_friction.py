@@ -15,10 +15,9 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.systems.real_arm.drive_joints import DriveJoints
 
-
-#: Of the springs of presliding [s]: their damping over their stiffness. An arm that is hit rings for a moment, not for a
-#: minute. Drake limits the sum of spring and damper to the element's coefficient, so sliding is the same.
-RELAXATION = 0.01
+#: Of the springs of presliding [s]: their damping over their stiffness. An arm that is hit rings for a moment, not for
+#: minutes. Drake limits the sum of spring and damper to the element's coefficient, so sliding is the same.
+RELAXATION = 0.02
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ def add_friction(
 
 
 def _copy_rotor(plant: MultibodyPlant, actuator: JointActuator) -> None:
-    """Of several actuators on a joint Drake takes the rotor inertia of the last one alone (1.51 to 1.58): say it again."""
+    """Of several actuators on a joint Drake takes only the last one's rotor inertia (1.51 to 1.58): say it again."""
     for index in plant.GetJointActuatorIndices():
         motor = plant.get_joint_actuator(index)
         if motor.joint().index() == actuator.joint().index() and motor.default_rotor_inertia() > 0:

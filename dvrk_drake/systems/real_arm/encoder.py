@@ -50,7 +50,7 @@ class Encoder(LeafSystem):
         self._measure_into = entry_point(_measure_into)
         self.DeclareVectorInputPort(name="state", size=2 * n)
         self._queue_length = max(delay - 1, 0)
-        # What is out now; the measurements that are not out yet, oldest first; last reading and velocity of the actuators.
+        # What is out now; what is measured but not out yet, oldest first; last reading and velocity of the actuators.
         for value in self._at_rest(q_default):
             self.DeclareDiscreteState(value)
         if delay:

@@ -18,7 +18,7 @@ class NoiseSource(LeafSystem):
 
     - `noise` (n): independent numbers with the standard deviations that were given.
 
-    The generator counts (Philox, Salmon et al., SC 2011): the numbers of a time step follow from the seed and its index,
+    The generator counts (Philox, Salmon et al., SC 2011): the numbers of a time step follow from seed and index alone,
     whoever asks, in whatever order. So a seed gives the same noise bit for bit, and what nobody reads costs nothing.
     Drake's RandomSource has no seed that Python can set (1.51 to 1.58).
     """

@@ -39,7 +39,10 @@ class Quantizer(LeafSystem):
             raise StationError(f"steps of a quantizer must be finite and not negative; got {steps.tolist()}")
         self.DeclareVectorInputPort(name="u", size=len(steps))
         self.DeclareVectorOutputPort(
-            name="y", size=len(steps), calc=self._make_calc(steps), prerequisites_of_calc={self.all_input_ports_ticket()}
+            name="y",
+            size=len(steps),
+            calc=self._make_calc(steps),
+            prerequisites_of_calc={self.all_input_ports_ticket()},
         )
 
     def _make_calc(self, steps: NDArray[np.float64]) -> Callable[[Context, BasicVector], None]:

@@ -27,8 +27,8 @@ class SlipFollower(LeafSystem):
         - desired_state
 
     - `plant_state`: of the plant that the sliders are part of.
-    - `desired_state`: for the plant's port of that name and the arm's instance: positions, then velocities (zero) of all
-      its actuators.
+    - `desired_state`: for the plant's port of that name and the arm's instance: positions, then velocities (zero) of
+      all its actuators.
 
     A hook stands still while its spring is stretched by less than its travel, and follows at that distance when it is
     stretched further: `ActuatorEffect.step` of "presliding". The spring is taken at the end of a step by the plant and
@@ -62,7 +62,8 @@ class SlipFollower(LeafSystem):
         columns, entries, travel = self._columns, self._entries, self._travel
 
         def follow(context: Context, discrete_state: DiscreteValues) -> None:
-            step(eval_vector_input(context, 0).get_value(), columns, entries, travel, discrete_state.get_mutable_value())
+            hooks = discrete_state.get_mutable_value()
+            step(eval_vector_input(context, 0).get_value(), columns, entries, travel, hooks)
 
         return follow
 
