@@ -296,7 +296,7 @@ def test_collision_shapes_are_there_when_something_can_be_touched():
 
 
 def test_errors_say_what_to_do():
-    with pytest.raises(StationError, match="plant_arm and modify_plant are of a simulation"):
+    with pytest.raises(StationError, match="modify_plant and effects are of a simulation"):
         ArmStation(ARM, hardware=True, plant_arm=ARM)
     with pytest.raises(StationError, match="driver and lcm are of hardware"):
         ArmStation(ARM, driver=DvrkDriver())

@@ -30,6 +30,8 @@ class PlantEffects:
         self.drive = DriveJoints(plant, arm, instance)
         self._plant, self._instance = plant, instance
         self._sliders = add_friction(plant, arm, self.drive, effects.friction)
+        # Drake disarms the gains of all of an instance's actuators while their desired state is not connected.
+        self._rubs = any(effect.kind != "viscous" for effect in effects.friction)
         if effects.stops:
             rows, lower, upper = arm.limit_matrix()
             for i in range(arm.num_joints, len(rows)):
@@ -39,7 +41,7 @@ class PlantEffects:
 
     def connect(self, builder: DiagramBuilder) -> None:
         """Adds what the sliders need to the diagram of the plant, which is finalized by now."""
-        if not self._sliders:
+        if not self._rubs:
             return
         plant = self._plant
         follower = SlipFollower(plant, self._instance, self._sliders, plant.time_step())
