@@ -66,8 +66,8 @@ POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.of_po
 
 
 @numba.njit(cache=True)
-def _step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float, float]:
-    """The next state and the shape of the kind with this code."""
+def effect_step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float, float]:
+    """The next state and the shape of the kind with this code, compiled; NaN for a kind of position alone."""
     if code == 1:
         return z, v
     if code == 2:
@@ -125,7 +125,7 @@ class ActuatorEffect:
         """
         if self.kind in POSITION_KINDS:
             return state, float(_numeric(self.kind)(x, self.scale))
-        return _step(EFFECT_KINDS[self.kind].code, state, dx, v, self.scale)
+        return effect_step(EFFECT_KINDS[self.kind].code, state, dx, v, self.scale)
 
     def column(self, x: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
         """The shape (m,) over a motion of the coordinate, x and v (m,), from state 0."""
@@ -148,7 +148,7 @@ def _run(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale: float
     out = np.empty(len(x))
     state, before = 0.0, x[0]
     for i in range(len(x)):
-        state, out[i] = _step(code, state, x[i] - before, v[i], scale)
+        state, out[i] = effect_step(code, state, x[i] - before, v[i], scale)
         before = x[i]
     return out
 
