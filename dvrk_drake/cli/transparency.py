@@ -97,7 +97,7 @@ def _compensations(options: argparse.Namespace, arm: Arm) -> list[Compensation]:
         if models[name].load_arm().joint_names != arm.joint_names:
             raise ModelError(f"{path}: is of {models[name].arm}, not of {arm.name}")
     if not models:
-        models["the SDF's gravity"] = IdentifiedModel.from_arm(arm)
+        models["SDF"] = IdentifiedModel.from_arm(arm)
     listed = [Compensation("nothing")]
     for name, model in models.items():
         listed.append(Compensation(name, model))
