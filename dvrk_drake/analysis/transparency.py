@@ -147,7 +147,8 @@ def feel(
     root = simulator.get_mutable_context()
     station.set_positions(station.GetMyMutableContextFromRoot(root), path.value(0.0).ravel())
     simulator.Initialize()
-    times = np.arange(SAMPLE_PERIOD, path.end_time(), SAMPLE_PERIOD)
+    # Multiples, not sums: where rounding tells the time from that of a step, the step would count or not by chance.
+    times = SAMPLE_PERIOD * np.arange(1, int(path.end_time() / SAMPLE_PERIOD), dtype=np.float64)
     forces, deviation = np.empty((len(times), 6)), np.empty(len(times))
     state = station.GetOutputPort(f"{name}.state_true")
     for i, t in enumerate(times):
