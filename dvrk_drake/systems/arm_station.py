@@ -163,7 +163,8 @@ class ArmStation(Diagram):
                 f"{true_arm.name} has {', '.join(true_arm.joint_names)}"
             )
         self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=time_step)
-        self._instance = add_arm(self.plant, true_arm, closure)
+        # Nothing else is in the plant, so nothing touches the arm unless somebody adds it.
+        self._instance = add_arm(self.plant, true_arm, closure, collision_shapes=modify_plant is not None)
         if modify_plant is not None:
             modify_plant(self.plant)
         if effects is not None:
