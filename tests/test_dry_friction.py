@@ -54,18 +54,26 @@ def test_friction_slides_above_its_limit(name):
         assert fastest > 0.01
 
 
-def smooth_sign(arm):
-    """Friction as "coulomb" effects alone: as much as what slides along the actuators."""
+def friction_of(arm, law):
+    """As much along each actuator as what slides there, by another law."""
     limits = zip(arm.joint_names, breakaway(arm), strict=True)
-    return ArmEffects(friction=[FrictionEffect(f"actuator.{joint}", "coulomb", 0.05, limit) for joint, limit in limits])
+    return ArmEffects(friction=[FrictionEffect(f"actuator.{joint}", *law(limit)) for joint, limit in limits])
 
 
-@pytest.mark.parametrize("smooth", [False, True])
+LAWS = {
+    "smooth": lambda limit: ("coulomb", 0.05, limit),
+    "falls with speed": lambda limit: ("presliding", 0.01, limit, 0.2),
+    "forward": lambda limit: ("presliding forward", 0.01, limit),
+    "backward": lambda limit: ("presliding forward", 0.01, -limit),
+}
+
+
+@pytest.mark.parametrize("law", ["the arm's", *LAWS])
 @pytest.mark.parametrize("name", ARMS)
-def test_friction_only_takes_energy(name, smooth):
+def test_friction_only_takes_energy(name, law):
     """Work on the friction, by what Drake says that it applies: never less than nothing, whatever the motion."""
     arm = weightless(name)
-    run = Run(arm, smooth_sign(arm) if smooth else arm.effects.only(["friction"]))
+    run = Run(arm, friction_of(arm, LAWS[law]) if law in LAWS else arm.effects.only(["friction"]))
     plant = run.station.plant
     plant_context = plant.GetMyContextFromRoot(run.context)
     instance = plant.GetModelInstanceByName(arm.sdf[0].split("/")[-1].removesuffix(".sdf"))
@@ -130,3 +138,41 @@ def test_friction_leaves_the_inertia_as_it_is(name):
     # fingers, is lighter than they are.
     size = np.sqrt(np.outer(np.diag(matrices[0]), np.diag(matrices[0])))
     assert np.all(np.abs(matrices[1] - matrices[0]) <= 2e-2 * size)
+
+
+def roll_friction(*effects):
+    """These along the wrist roll; all other actuators move as through honey."""
+    arm = weightless("mtml")
+    honey = [FrictionEffect(f"actuator.{joint}", "viscous", 0.0, 1.0) for joint in arm.joint_names[:-1]]
+    along = [FrictionEffect("actuator.wrist_roll", *effect) for effect in effects]
+    return Run(arm, ArmEffects(friction=[*honey, *along]))
+
+
+@pytest.mark.parametrize("more", [-0.001, 0.001])
+def test_friction_of_one_side_holds_more_on_that_side(more):
+    for direction in (-1.0, 1.0):
+        limit = 0.002 + (0.001 if more * direction > 0 else 0.0)
+        for share in (0.95, 1.05):
+            run = roll_friction(("presliding", 0.01, 0.002), ("presliding forward", 0.01, more))
+            run.fix("effort_disturbance", direction * share * limit * np.eye(7)[6])
+            run.advance(300)
+            assert (direction * run.v[6] > 0.05) == (share > 1)
+
+
+def test_friction_that_falls_with_speed_lets_go_once_it_slides():
+    """Stribeck's friction: the same effort holds an arm that rests and keeps one going that slides."""
+    at_rest, sliding, fall_speed, viscous = 0.002, 0.002, 2.0, 2e-4
+    travel = 0.1
+    effects = ("presliding", 0.01, sliding), ("presliding", travel, at_rest, fall_speed), ("viscous", 0.0, viscous)
+    effort = 0.003
+    run = roll_friction(*effects)
+    run.fix("effort_disturbance", effort * np.eye(7)[6])
+    run.advance(400)
+    assert abs(run.v[6]) < 1e-6
+    run.fix("effort_disturbance", 2.5 * effort * np.eye(7)[6])
+    run.advance(60)
+    run.fix("effort_disturbance", effort * np.eye(7)[6])
+    run.advance(900)
+    v = run.v[6]
+    # The steady slide: what pushes is what viscosity and sliding take, and the hook that comes two steps late.
+    assert v == pytest.approx((effort - sliding) / (viscous + 2 * STEP * at_rest / travel), rel=0.02)
