@@ -1,70 +1,76 @@
-"""From the effort that is commanded to what motors apply and what is measured of it."""
+"""From the effort that is commanded to what the motors give."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numba
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import DiagramBuilder, OutputPort, System
-from pydrake.systems.primitives import Adder, DiscreteTimeDelay, MatrixGain, Saturation
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, EffortEffect, per_actuator
-from dvrk_drake.systems.real_arm.noise_source import NoiseSource
-from dvrk_drake.systems.real_arm.quantizer import Quantizer
+from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
+from dvrk_drake.systems.gravity_pid_step import entry_point
 
 
-def add_motor_channel(
-    builder: DiagramBuilder, arm: Arm, effects: ArmEffects, commanded: OutputPort, time_step: float, seed: int
-) -> tuple[OutputPort, OutputPort]:
-    """What the motors make of the efforts (n) on the joints that are `commanded`; both results are on the joints too.
+class MotorChannel(LeafSystem):
+    """What the motors make of the efforts that are commanded of the joints.
 
-    In the actuators' coordinates: the command's delay, its steps, the motors' saturation; then, of what is measured,
-    noise, steps and delay. The same `seed` gives the same noise, bit for bit; it is new in every time step.
+    .. pydrake_system::
 
-    Args:
-        builder: of the station.
-        arm: whose transmission it is.
-        effects: of which `delay`, `effort` and `saturation` count.
-        commanded: after the limits of the joints.
-        time_step: of the plant [s].
-        seed: of the noise.
+        name: MotorChannel
+        input_ports:
+        - effort_commanded (optional)
+        output_ports:
+        - motor_effort
 
-    Returns:
-        the applied efforts, and the measured ones.
+    - `effort_commanded` (n): on the joints [N m, N]. Unconnected: zero.
+    - `motor_effort` (n): on the actuators [N m, N]: the command, clamped to the joints' limits, as efforts of the
+      actuators J^-T tau, in whole steps of `effort.command_resolution`, and no more than `saturation`.
     """
-    if effects.delay is None and effects.effort is None and not effects.saturation:
-        return commanded, commanded
-    names, n = arm.joint_names, arm.num_joints
-    delay, effort = effects.delay or DelayEffect(), effects.effort or EffortEffect()
-    J = arm.transmission.matrix
 
-    def behind(port: OutputPort, system: System, name: str) -> OutputPort:
-        builder.AddNamedSystem(name, system)
-        builder.Connect(port, system.get_input_port(0))
-        return system.get_output_port()
+    def __init__(self, arm: Arm, effects: ArmEffects, effort_limits: NDArray[np.float64]) -> None:
+        """Of `arm`; `effort_limits` (n,) are those of the joints."""
+        super().__init__()
+        n, names = arm.num_joints, arm.joint_names
+        steps = per_actuator(effects.effort.command_resolution if effects.effort else {}, names, 0.0)
+        most = per_actuator(effects.saturation, names, np.inf)
+        self._constants = np.array([effort_limits, steps, most])
+        self._to_motors = np.ascontiguousarray(np.linalg.inv(arm.transmission.matrix).T)
+        self.DeclareVectorInputPort(name="effort_commanded", size=n)
+        self.DeclareVectorOutputPort(
+            name="motor_effort", size=n, calc=self._make_calc(), prerequisites_of_calc={self.all_input_ports_ticket()}
+        )
 
-    def table(values: dict[str, float]) -> NDArray[np.float64]:
-        return per_actuator(values, names, 0.0)
+    def _make_calc(self) -> Callable[[Context, BasicVector], None]:
+        """The handler of the port, with all that it needs at hand: see GravityPidController."""
+        eval_vector_input, effort_into = self.EvalVectorInput, entry_point(_motor_effort_into)
+        to_motors, constants = self._to_motors, self._constants
+        nothing = np.zeros(len(to_motors))
 
-    motors = behind(commanded, MatrixGain(D=np.linalg.inv(J).T), "to_motors")
-    if delay.command:
-        # Its input comes out a step later by itself: the plant steps while it is stored.
-        motors = behind(motors, DiscreteTimeDelay(time_step, delay.command - 1, n), "command_delay")
-    if effort.command_resolution:
-        motors = behind(motors, Quantizer(table(effort.command_resolution)), "command_steps")
-    if effects.saturation:
-        limit = per_actuator(effects.saturation, names, np.inf)
-        motors = behind(motors, Saturation(min_value=-limit, max_value=limit), "motor_saturation")
-    measured = motors
-    if delay.measurement:
-        # Before noise and steps: these are computed only when somebody reads the port.
-        measured = behind(measured, DiscreteTimeDelay(time_step, delay.measurement - 1, n), "measurement_delay")
-    if effort.noise:
-        source = builder.AddNamedSystem("noise", NoiseSource(table(effort.noise), time_step, seed))
-        total = builder.AddNamedSystem("noisy_effort", Adder(2, n))
-        builder.Connect(measured, total.get_input_port(0))
-        builder.Connect(source.get_output_port(), total.get_input_port(1))
-        measured = total.get_output_port()
-    if effort.measured_resolution:
-        measured = behind(measured, Quantizer(table(effort.measured_resolution)), "measured_steps")
-    return behind(motors, MatrixGain(D=J.T), "to_joints"), behind(measured, MatrixGain(D=J.T), "measured_effort")
+        def calc(context: Context, output: BasicVector) -> None:
+            command = eval_vector_input(context, 0)
+            effort = nothing if command is None else command.get_value()
+            effort_into(effort, to_motors, constants, output.get_mutable_value())
+
+        return calc
+
+
+@numba.njit("float64(float64, float64)", cache=True)
+def in_steps(value, step):
+    """`value` to the next whole number of steps; exact where the step is 0."""
+    return step * np.rint(value / step) if step > 0.0 else value
+
+
+@numba.njit("void(float64[::1], float64[:, ::1], float64[:, ::1], float64[::1])", cache=True)
+def _motor_effort_into(command, to_motors, constants, effort):
+    """`constants` (3, n): limits of the joints, steps, and most of each motor."""
+    limits, steps, most = constants
+    effort[:] = 0.0
+    for k in range(len(command)):
+        tau = min(max(command[k], -limits[k]), limits[k])
+        for i in range(len(effort)):
+            effort[i] += to_motors[i, k] * tau
+    for i in range(len(effort)):
+        effort[i] = min(max(in_steps(effort[i], steps[i]), -most[i]), most[i])
