@@ -74,7 +74,7 @@ def test_a_decaying_oscillation_settles_and_overshoots_as_its_formula_says():
 
 def test_what_never_settles_is_infinite_and_a_late_disturbance_counts():
     assert Measure("settling_time")(*stepped(0.4 * np.clip(T / 2, 0, 1) + 0.002)) == math.inf
-    bump = np.where(T == T[1500], 0.01, 0.0)
+    bump = np.where(T[1500] == T, 0.01, 0.0)
     assert Measure("settling_time")(*stepped(0.4 * np.clip(T / 2, 0, 1) + bump)) == pytest.approx(13.01)
 
 

@@ -128,9 +128,10 @@ def test_the_table_does_not_depend_on_workers_nor_on_order(executor, reference, 
 @pytest.mark.parametrize("cases", [0, 1, 23])
 def test_lost_workers_lose_no_rows(cases, reference, tmp_path):
     path = tmp_path / "killed.csv"
-    with Dying(cases) as executor, pytest.raises(StudyError, match=rf"^{24 - cases} of 24 cases are missing: case") as e:
+    message = rf"^{24 - cases} of 24 cases are missing: case"
+    with Dying(cases) as executor, pytest.raises(StudyError, match=message) as loss:
         run_study(make_study(), executor, path)
-    assert isinstance(e.value.__cause__, BrokenProcessPool)
+    assert isinstance(loss.value.__cause__, BrokenProcessPool)
     counts = []
     with Dying(24 - cases) as executor:  # as many as are missing, and no more
         rows = run_study(make_study(), executor, path, lambda done, all_cases: counts.append((done, all_cases)))

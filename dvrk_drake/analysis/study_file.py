@@ -165,7 +165,7 @@ class Study:
         for name, most in (("count", 1_000_000), ("seed", 2**63), ("margin", 0.49)):
             value, least = getattr(self.random_poses, name), int(name == "count")
             if not least <= value <= most:
-                raise StudyError(f"random_poses.{name} is {value:g}; allowed: {least}..{most:g}")
+                raise StudyError(f"random_poses.{name} is {value:g}; allowed: {least}..{most}")
 
     def _starts(self) -> list[list[float]]:
         """Where the arm starts."""
