@@ -23,6 +23,7 @@ from dvrk_drake.cli import (
     recalibrate,
     record,
     simulate,
+    study,
     transparency,
 )
 from dvrk_drake.cli.support import import_interruptibly
@@ -66,6 +67,7 @@ def _parser() -> argparse.ArgumentParser:
         payload,
         export,
         simulate,
+        study,
         transparency,
         demo,
         lcm,
