@@ -60,8 +60,8 @@ class ArmStation(Diagram):
 
     Without `effects` all of it is C++ and has no state but the plant's, and measured values are exact and undelayed.
     `effects` are those of a real arm, see `ArmEffects`: friction, cables, stops, encoders, motors and delays as
-    `arm.effects` states them. With them (be they empty) a discrete controller beside the station sees the arm before
-    the step that its command is for: the command is a period late, as on hardware.
+    `arm.effects` states them. A discrete controller beside the station sees the arm as it is when the period starts,
+    and its command acts from the next one on: it is a period late, as on hardware.
 
     Drake's solver holds the linkage to about 1e-8 m at 1 ms with either `closure`, and each joint in its position
     limits; the coupled limits of the linkage are there with the effect `stops`. An arm's shapes never touch each other:
@@ -167,9 +167,9 @@ class ArmStation(Diagram):
         self._instance = add_arm(self.plant, true_arm, closure, collision_shapes=modify_plant is not None)
         if modify_plant is not None:
             modify_plant(self.plant)
+        # Otherwise Drake steps the plant before all discrete updates, and what they measure is from after the step.
+        self.plant.SetUseSampledOutputPorts(False)
         if effects is not None:
-            # Otherwise Drake steps the plant before all discrete updates, and what they measure is from after the step.
-            self.plant.SetUseSampledOutputPorts(False)
             self._parts = PlantEffects(self.plant, true_arm, self._instance, effects)
         self.plant.Finalize()
         self._drop_idle_shapes()

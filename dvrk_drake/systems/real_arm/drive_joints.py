@@ -68,11 +68,7 @@ class DriveJoints:
         row = joint_row(self._arm, f"actuator.{name}")
         joint = self._new(row, cable)
         motor = plant.AddJointActuator(f"motor_{name}", joint)
-        at_joint = next(
-            actuator
-            for actuator in map(plant.get_joint_actuator, plant.GetJointActuatorIndices(self._instance))
-            if actuator.joint().name() == name
-        )
+        at_joint = plant.GetJointActuatorByName(name, self._instance)
         motor.set_default_rotor_inertia(at_joint.default_rotor_inertia())
         motor.set_default_gear_ratio(at_joint.default_gear_ratio())
         at_joint.set_default_rotor_inertia(0.0)

@@ -148,8 +148,9 @@ def _follow(state, places, laws, time_step, hooks):
             continue
         stretch = z * holds
         if holds < travel:
-            # The arm stretches it further in the step to come; up to `travel`, the effort limit takes care of that.
-            stretch = math.copysign(max(abs(stretch) - time_step * abs(velocity), 0.0), stretch)
+            # The arm stretches it further in the step that goes on and in the one that it is for. Up to `travel`, the
+            # effort limit takes care of that.
+            stretch = math.copysign(max(abs(stretch) - 2.0 * time_step * abs(velocity), 0.0), stretch)
         hooks[hook] = position - side * stretch
 
 

@@ -66,6 +66,8 @@ def add_friction(
       w it holds c exp(-(v/w)^2): Stribeck's, lost when it slides; T is 0, as its spring's force is all that it has.
     - "presliding forward": the same with 0 instead of -1: what friction towards +x has more than towards -x; with a
       negative coefficient the other way round. T is 0.
+    - Where these two hold less than c, the hook comes two time steps h late and they act like viscous friction of
+      2 h c / s, so give them a travel s well above 2 h v.
     - "coulomb": -c clip(v / s, +-1); the smoothed sign of an identification. It creeps below c, at a speed up to s.
     - "viscous": -c v.
 
