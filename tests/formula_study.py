@@ -19,7 +19,7 @@ def simulate(scenario):
     t = np.arange(0.0, scenario.duration + 1e-9, scenario.sample_period)
     rate = (1 + scenario.controller.parameter_error) * (scenario.seed % 1000) / 5e4
     q = np.array(scenario.start) + rate * t[:, None]
-    return Simulation(Recording(q=q, qd=0 * q, tau=q / 10, t=t), None)
+    return Simulation(Recording(q=q, qd=0 * q, tau=q / 10, t=t), np.hstack([q, 0 * q]), None, None)
 
 
 if __name__ in ("__main__", "__mp_main__"):  # the command, and its workers
