@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from dvrk_drake.analysis.dynamic_choice import effort_weights
 from dvrk_drake.analysis.dynamic_covariance import parameter_covariance
-from dvrk_drake.analysis.dynamic_identification import effort_weights, motion_problem, residuals
+from dvrk_drake.analysis.dynamic_identification import motion_problem, residuals
 from dvrk_drake.analysis.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.phase_folds import period_of
 from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters

@@ -261,8 +261,15 @@ def _motion_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -
             if values and len(values) != len(part.joints):
                 raise ArmError(f"{path}: motion.{which} has {len(values)} numbers for {len(part.joints)} joints")
             both[which] += values or [default] * len(part.joints)
-    torques = {**mechanism.motion.position_torques, **instrument.motion.position_torques}
-    return MotionSettings(both["acceleration_cut_off"], both["effort_delay"], mechanism.motion.base_may_tilt, torques)
+    known = {**mechanism.motion.known_effects, **instrument.motion.known_effects}
+    if not all(0 < travel < np.inf for travel in mechanism.motion.presliding_travels):
+        raise ArmError(f"{path}: motion.presliding_travels must be positive numbers")
+    return dataclasses.replace(
+        mechanism.motion,
+        acceleration_cut_off=both["acceleration_cut_off"],
+        effort_delay=both["effort_delay"],
+        known_effects=known,
+    )
 
 
 def _check_limits(path: Path, joint: str, limits: list[float], prismatic: bool) -> None:
