@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates
+from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_coordinates
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 
 
@@ -28,7 +28,7 @@ def effect_shapes(
     a, a_dot = arm.transmission.position(q), arm.transmission.velocity(v)
     rows = effect_coordinates(arm)
     weight = np.zeros_like(a)
-    if any(effect.kind == "load coulomb" for effect in effects):
+    if any(EFFECT_KINDS[effect.kind].loaded for effect in effects):
         rest = np.zeros_like(q)
         weight = arm.transmission.inverse().pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
     for effect in effects:

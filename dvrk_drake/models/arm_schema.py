@@ -5,6 +5,8 @@ No postponed annotations here: yaml_load_typed reads the types at run time.
 
 from dataclasses import dataclass, field
 
+from dvrk_drake.models.effects_schema import ArmEffects
+
 
 @dataclass
 class CoupledLimit:
@@ -76,7 +78,8 @@ class BoundingShapes:
 class Mechanism:
     """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common.
 
-    `effort_cut_off` [Hz] is that of the low-pass behind which measured and modelled efforts are compared.
+    `effort_cut_off` [Hz] is that of the low-pass behind which measured and modelled efforts are compared. `effects` are
+    what a real arm has beside all that, for its simulation.
     """
 
     sdf: str = ""
@@ -88,6 +91,7 @@ class Mechanism:
     motion: MotionSettings = field(default_factory=MotionSettings)
     effort_cut_off: float = 10.0
     bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
+    effects: ArmEffects = field(default_factory=ArmEffects)
 
 
 @dataclass
@@ -107,6 +111,7 @@ class Instrument:
     friction_coordinates: dict[str, dict[str, float]] = field(default_factory=dict)
     motion: MotionSettings = field(default_factory=MotionSettings)
     bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
+    effects: ArmEffects = field(default_factory=ArmEffects)
 
 
 @dataclass
