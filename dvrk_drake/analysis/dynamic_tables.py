@@ -49,8 +49,9 @@ def print_dynamics(console: Console, result: DynamicIdentification, full: bool =
     table.add_row("mean", "", "", "", *(_mean_percent(section.actuators, w) for w in _MEANS))
     console.print(table)
     console.print(
-        "* phases of the motion predicted from the other phases (stretches, if it does not repeat); which effects "
-        "there are was chosen with all of them: expect more error on another motion",
+        "* sixths of the motion's phases (stretches, if it does not repeat) predicted by models that know nothing of "
+        "them: neither parameters nor the choice of effects nor how the base leans. What the arm's file says of its "
+        "drives flatters, for it was chosen on such motions; on another day friction is another",
         style="dim",
         soft_wrap=True,
     )

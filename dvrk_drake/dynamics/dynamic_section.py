@@ -81,7 +81,8 @@ class ActuatorEffectEstimate:
 class ActuatorStatistics:
     """How the effort of one actuator was fitted, behind the low-pass: RMS in N m (N of one that slides).
 
-    `rms_cross_validation`: of phases of the motion (or stretches, if it does not repeat) predicted from the others.
+    `rms_cross_validation`: of phases of the motion (or stretches, if it does not repeat) predicted by what the others
+    alone give, the choice of effects and the direction of gravity included.
     `rms_repeatability`: by which the arm does not repeat its efforts from period to period; 0 where it is unknown.
     """
 

@@ -24,6 +24,7 @@ from dvrk_drake.models.arm_schema import (
     Mechanism,
     MotionSettings,
 )
+from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, compose_sdf, read_sdf_facts
 
@@ -57,6 +58,7 @@ class Arm:
         motion: how the signals of a recorded motion are treated, one value a joint.
         effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].
         bounding_shapes: where the mass of the links of each file of `sdf` can be, see `bounding_boxes`.
+        effects: what the real arm has beside all that; only a simulation that asks for them has them.
     """
 
     name: str
@@ -78,6 +80,7 @@ class Arm:
     motion: MotionSettings
     effort_cut_off: float
     bounding_shapes: tuple[BoundingShapes, ...]
+    effects: ArmEffects
 
     @property
     def num_joints(self) -> int:
@@ -244,6 +247,7 @@ def _build_arm(
         motion=motion,
         effort_cut_off=_checked_cut_off(path, mechanism),
         bounding_shapes=tuple(part.bounding_shapes for part in (mechanism, instrument) if part.sdf),
+        effects=_checked_effects(path, mechanism.effects.joined(instrument.effects), joints),
     )
 
 
@@ -257,8 +261,15 @@ def _motion_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -
             if values and len(values) != len(part.joints):
                 raise ArmError(f"{path}: motion.{which} has {len(values)} numbers for {len(part.joints)} joints")
             both[which] += values or [default] * len(part.joints)
-    torques = {**mechanism.motion.position_torques, **instrument.motion.position_torques}
-    return MotionSettings(both["acceleration_cut_off"], both["effort_delay"], mechanism.motion.base_may_tilt, torques)
+    known = {**mechanism.motion.known_effects, **instrument.motion.known_effects}
+    if not all(0 < travel < np.inf for travel in mechanism.motion.presliding_travels):
+        raise ArmError(f"{path}: motion.presliding_travels must be positive numbers")
+    return dataclasses.replace(
+        mechanism.motion,
+        acceleration_cut_off=both["acceleration_cut_off"],
+        effort_delay=both["effort_delay"],
+        known_effects=known,
+    )
 
 
 def _check_limits(path: Path, joint: str, limits: list[float], prismatic: bool) -> None:
@@ -285,6 +296,14 @@ def _checked_cut_off(path: Path, mechanism: Mechanism) -> float:
             f"{path}: effort_cut_off = {mechanism.effort_cut_off:g} Hz of its mechanism; 0.1..1000 Hz is allowed"
         )
     return mechanism.effort_cut_off
+
+
+def _checked_effects(path: Path, effects: ArmEffects, joints: list[str]) -> ArmEffects:
+    try:
+        effects.check(joints)
+    except ArmError as error:
+        raise ArmError(f"{path}: effects.{error}") from error
+    return effects
 
 
 def _checked_gravity(gravity: Sequence[float]) -> NDArray[np.float64]:

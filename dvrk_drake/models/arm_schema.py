@@ -5,6 +5,8 @@ No postponed annotations here: yaml_load_typed reads the types at run time.
 
 from dataclasses import dataclass, field
 
+from dvrk_drake.models.effects_schema import ArmEffects
+
 
 @dataclass
 class CoupledLimit:
@@ -38,15 +40,18 @@ class MotionSettings:
     """How the signals of a recorded motion are treated; per joint, in the order of the joints that the file has.
 
     `acceleration_cut_off` [Hz] of the low-pass for accelerations, `effort_delay` [s] by which the recorded effort is
-    later than the positions (negative: earlier). `position_torques` are those that the drives are known to have: name
-    of a coordinate of the drive (`effect_coordinates`) -> "spring", "cable 1" (sine and cosine of one period a turn),
-    "cable 2" (of two). Of a mechanism also `base_may_tilt`, whether the direction of gravity is estimated from a motion.
+    later than the positions (negative: earlier). `known_effects` are what drives have beside friction: name of a
+    coordinate of the drive (`effect_coordinates`) -> "spring", "cable 1" (sine and cosine of one period a turn),
+    "cable 2" (of two), "asymmetric friction". Of a mechanism also `base_may_tilt`, whether the direction of gravity is
+    estimated from a motion, and `presliding_travels`, over which elasto-plastic elements give way, as shares of a
+    coordinate's standard deviation of position.
     """
 
     acceleration_cut_off: list[float] = field(default_factory=list)
     effort_delay: list[float] = field(default_factory=list)
     base_may_tilt: bool = False
-    position_torques: dict[str, list[str]] = field(default_factory=dict)
+    known_effects: dict[str, list[str]] = field(default_factory=dict)
+    presliding_travels: list[float] = field(default_factory=lambda: [0.003, 0.01, 0.08, 0.3, 1.0])
 
 
 @dataclass
@@ -73,7 +78,8 @@ class BoundingShapes:
 class Mechanism:
     """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common.
 
-    `effort_cut_off` [Hz] is that of the low-pass behind which measured and modelled efforts are compared.
+    `effort_cut_off` [Hz] is that of the low-pass behind which measured and modelled efforts are compared. `effects` are
+    what a real arm has beside all that, for its simulation.
     """
 
     sdf: str = ""
@@ -85,6 +91,7 @@ class Mechanism:
     motion: MotionSettings = field(default_factory=MotionSettings)
     effort_cut_off: float = 10.0
     bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
+    effects: ArmEffects = field(default_factory=ArmEffects)
 
 
 @dataclass
@@ -104,6 +111,7 @@ class Instrument:
     friction_coordinates: dict[str, dict[str, float]] = field(default_factory=dict)
     motion: MotionSettings = field(default_factory=MotionSettings)
     bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
+    effects: ArmEffects = field(default_factory=ArmEffects)
 
 
 @dataclass
