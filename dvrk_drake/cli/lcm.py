@@ -11,6 +11,7 @@ from dvrk_drake.cli.support import add_gravity, mounted, quiet_drake
 
 if TYPE_CHECKING:
     from dvrk_drake.processes.arm_controller import ArmController
+    from dvrk_drake.systems.friction_compensator import FrictionCompensator
     from dvrk_drake.systems.gravity_pid_controller import Mode
 
 
@@ -64,6 +65,16 @@ def _add_run(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--reset", action="store_true", help="say which fault the arm has, if any, and clear it before it is controlled"
     )
+    verb.add_argument(
+        "--friction-ratio",
+        type=float,
+        default=0.0,
+        metavar="R",
+        help="in mode gravity, the share of the friction to take off the hand, 0..0.9; less where the arm could creep",
+    )
+    verb.add_argument(
+        "--friction", metavar="MODEL.yaml", help="from identify of a motion: whose friction; default: that of --model"
+    )
     verb.set_defaults(run=_run)
 
 
@@ -73,7 +84,8 @@ def _run(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.live_status import LiveStatus
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
-    controller, url, period = ready_controller(options, options.mode, reset=options.reset)
+    compensator = _friction_compensator(options)
+    controller, url, period = ready_controller(options, options.mode, compensator, reset=options.reset)
     arm = controller.arm
     stopped = stop_on_signals()
     print(
@@ -99,6 +111,36 @@ def _run(options: argparse.Namespace) -> None:
     print(f"{arm.name} holds by itself", flush=True)
 
 
+def _friction_compensator(options: argparse.Namespace) -> FrictionCompensator | None:
+    """What --friction-ratio asks for, with a warning that names the joints where it cannot be had in full.
+
+    Raises:
+        ControllerError: it asks for what is not safe.
+        ModelError: the model has no friction.
+    """
+    if options.friction_ratio == 0:
+        return None
+    from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.errors import ControllerError
+    from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.systems.friction_compensator import FrictionCompensator
+
+    if options.mode != "gravity":
+        raise ControllerError("--friction-ratio is for --mode gravity: an arm that is held shall not be easy to move")
+    if options.model is None:
+        raise ControllerError(
+            "--friction-ratio needs --model: without friction an arm creeps if its weight is not known well"
+        )
+    arm, model = load_arm(options.arm), IdentifiedModel.load(options.model)
+    friction = Friction.of_model(arm, IdentifiedModel.load(options.friction or options.model))
+    compensator = FrictionCompensator(friction, ratio=options.friction_ratio, holding_error=holding_error(model))
+    less = {e.coordinate: r for e, r in zip(friction.effects, compensator.ratios, strict=True)}
+    if said := ", ".join(f"{name} {r:.2f}" for name, r in less.items() if r < 0.99 * options.friction_ratio):
+        _warn(f"friction is compensated less where what remains must hold the arm against the model's error: {said}")
+    return compensator
+
+
 def add_control(verb: argparse.ArgumentParser) -> None:
     """Adds the options of `ready_controller`."""
     verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
@@ -108,11 +150,11 @@ def add_control(verb: argparse.ArgumentParser) -> None:
 
 
 def ready_controller(
-    options: argparse.Namespace, mode: Mode, *, reset: bool = False
+    options: argparse.Namespace, mode: Mode, friction: FrictionCompensator | None = None, *, reset: bool = False
 ) -> tuple[ArmController, str, float]:
     """A controller of an arm that may be controlled, the URL of the network, and the period of its statuses [s].
 
-    With `reset` a latched fault is said and cleared first.
+    With `friction` it compensates that as well; with `reset` a latched fault is said and cleared first.
 
     Raises:
         ModelError: the model is of another arm.
@@ -138,7 +180,7 @@ def ready_controller(
         status, period = first_status(link)
     if status.gravity_compensation:
         _warn(f"{arm.name} adds gravity compensation of its own: switch it off, or it is compensated twice")
-    controller = ArmController(arm, model, mode, period)
+    controller = ArmController(arm, model, mode, period, friction)
     if options.realtime:
         for warning in make_realtime():
             _warn(warning)

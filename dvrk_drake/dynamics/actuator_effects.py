@@ -51,6 +51,7 @@ EFFECT_KINDS: dict[str, EffectKind] = {
     "coulomb forward": EffectKind("N m", _WIDTH, code=3),
     "stribeck": EffectKind("N m", _WIDTH, code=4),
     "presliding": EffectKind("N m", "travel until it slips [rad, m]", dissipative=True, code=5),
+    "presliding forward": EffectKind("N m", "travel until it slips [rad, m]", code=6),
     # It pulls no more than at the travel that a recording covered: a straight line runs away outside of it.
     "spring": EffectKind(
         "N m/rad",
@@ -66,8 +67,8 @@ POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.of_po
 
 
 @numba.njit(cache=True)
-def _step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float, float]:
-    """The next state and the shape of the kind with this code."""
+def effect_step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float, float]:
+    """The next state and the shape of the kind with this code, compiled; NaN for a kind of position alone."""
     if code == 1:
         return z, v
     if code == 2:
@@ -83,6 +84,10 @@ def _step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float
         # An elasto-plastic element (Prandtl): a spring that gives way when it is stretched by `scale`. Several in
         # parallel are a generalised Maxwell slip model, which has the hysteresis of dry friction before it slides.
         z = min(max(z + dx / scale, -1.0), 1.0)
+        return z, z
+    if code == 6:
+        # What dry friction towards +x has more than towards -x.
+        z = min(max(z + dx / scale, 0.0), 1.0)
         return z, z
     return z, math.nan
 
@@ -119,13 +124,13 @@ class ActuatorEffect:
         """The next state, and the shape there: for a simulation.
 
         Args:
-            state: dimensionless, 0 at the start; only `presliding` has one.
+            state: dimensionless, 0 at the start; only the kinds of presliding have one.
             dx: travel of the coordinate since the last step [rad, m].
             x, v: its position [rad, m] and velocity now.
         """
         if self.kind in POSITION_KINDS:
             return state, float(_numeric(self.kind)(x, self.scale))
-        return _step(EFFECT_KINDS[self.kind].code, state, dx, v, self.scale)
+        return effect_step(EFFECT_KINDS[self.kind].code, state, dx, v, self.scale)
 
     def column(self, x: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
         """The shape (m,) over a motion of the coordinate, x and v (m,), from state 0."""
@@ -148,7 +153,7 @@ def _run(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale: float
     out = np.empty(len(x))
     state, before = 0.0, x[0]
     for i in range(len(x)):
-        state, out[i] = _step(code, state, x[i] - before, v[i], scale)
+        state, out[i] = effect_step(code, state, x[i] - before, v[i], scale)
         before = x[i]
     return out
 

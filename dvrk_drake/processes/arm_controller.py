@@ -11,6 +11,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.effort_ramp import EffortRamp
+from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
 from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
 from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
@@ -19,15 +20,23 @@ from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
 class ArmController:
     """Gravity compensation or a pose hold of one arm, from status to command.
 
-    A Diagram of DvrkStatusReceiver, GravityPidController, EffortRamp and DvrkCommandSender, stepped by forced updates:
-    one status in, one command out, nothing in between waits for a period. Whenever efforts do not act yet, or not any
-    more, it commands the measured efforts; when they begin to act it ramps to its own, and latches the pose to hold.
+    A Diagram of DvrkStatusReceiver, GravityPidController, FrictionCompensator if wanted, EffortRamp and
+    DvrkCommandSender, stepped by forced updates: one status in, one command out, nothing in between waits for a period.
+    Whenever efforts do not act yet, or not any more, it commands the measured efforts; when they begin to act it ramps
+    to its own, and latches the pose to hold.
 
     Attributes:
         arm: which it controls.
     """
 
-    def __init__(self, arm: Arm, model: IdentifiedModel, mode: Mode, period: float) -> None:
+    def __init__(
+        self,
+        arm: Arm,
+        model: IdentifiedModel,
+        mode: Mode,
+        period: float,
+        friction: FrictionCompensator | None = None,
+    ) -> None:
         """Of `arm`, carried by `model`.
 
         Args:
@@ -35,6 +44,7 @@ class ArmController:
             model: of that arm, mounted as it is.
             mode: "gravity" or "hold".
             period: in which statuses come [s].
+            friction: takes friction off the hand in mode "gravity"; becomes part of this controller.
         """
         builder = DiagramBuilder()
         self.arm, self._mode = arm, mode
@@ -44,7 +54,13 @@ class ArmController:
         self._sender = builder.AddSystem(DvrkCommandSender(arm))
         builder.Connect(receiver.GetOutputPort("state_estimated"), self._controller.GetInputPort("state_estimated"))
         builder.Connect(receiver.GetOutputPort("effort_measured"), self._ramp.GetInputPort("effort_measured"))
-        builder.Connect(self._controller.GetOutputPort("effort"), self._ramp.GetInputPort("effort_wanted"))
+        wanted = self._controller.GetOutputPort("effort")
+        if friction is not None:
+            builder.AddSystem(friction)
+            builder.Connect(receiver.GetOutputPort("state_estimated"), friction.GetInputPort("state_estimated"))
+            builder.Connect(wanted, friction.GetInputPort("effort_wanted"))
+            wanted = friction.GetOutputPort("effort")
+        builder.Connect(wanted, self._ramp.GetInputPort("effort_wanted"))
         builder.Connect(self._ramp.GetOutputPort("effort"), self._sender.GetInputPort("effort"))
         status = builder.ExportInput(receiver.GetInputPort("lcmt_dvrk_status"), "lcmt_dvrk_status")
         builder.ConnectInput(status, self._sender.GetInputPort("lcmt_dvrk_status"))

@@ -11,13 +11,19 @@ from pydrake.lcm import DrakeLcmInterface
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.primitives import MatrixGain, PassThrough, Saturation
+from pydrake.systems.primitives import MatrixGain
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.plant import Closure, add_arm, set_arm_positions, tree_selector
+from dvrk_drake.systems.ideal_drive import DrivePorts, add_ideal_drive
 from dvrk_drake.systems.lcm.arm_connection import connect_arm
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.plant_joints import PlantJoints
+from dvrk_drake.systems.real_arm.drive_step import DriveStep
+from dvrk_drake.systems.real_arm.plant_effects import PlantEffects
+from dvrk_drake.systems.real_arm.real_drive import RealDrive, add_real_drive
 from dvrk_drake.systems.station_ports import station_ports
 
 
@@ -35,6 +41,7 @@ class ArmStation(Diagram):
         - mtml.velocity_estimated
         - mtml.state_estimated
         - mtml.effort_measured
+        - mtml.state_true
         - plant_state
         - body_poses
         - query_object
@@ -47,13 +54,18 @@ class ArmStation(Diagram):
     - `effort_disturbance`: added behind the motors and not clamped: friction, cables, a hand. Unconnected:
       zero.
     - `effort_measured`: what the motors apply, the command after the clamp.
-    - `plant_state`, `body_poses`, `query_object`: the plant's own, of the whole tree. Simulation only, as is
-      `effort_disturbance`; all others are those of `station_ports`.
+    - `state_true` (2n): q, then v as they are, whatever `effects` make of what is measured.
+    - `plant_state`, `body_poses`, `query_object`: the plant's own, of the whole tree. Simulation only, as are
+      `state_true` and `effort_disturbance`; all others are those of `station_ports`.
 
-    All of it is C++ and has no state but the plant's. Measured values are exact and undelayed. Drake's solver
-    holds the linkage to about 1e-8 m at 1 ms with either `closure`, and each joint in its position limits; the
-    coupled limits of the linkage are not there. An arm's shapes never touch each other: they are collision shapes
-    only where `modify_plant` adds one that they can touch.
+    Without `effects` all of it is C++ and has no state but the plant's, and measured values are exact and undelayed.
+    `effects` are those of a real arm, see `ArmEffects`: friction, cables, stops, encoders, motors and delays as
+    `arm.effects` states them. A discrete controller beside the station sees the arm as it is when the period starts,
+    and its command acts from the next one on: it is a period late, as on hardware.
+
+    Drake's solver holds the linkage to about 1e-8 m at 1 ms with either `closure`, and each joint in its position
+    limits; the coupled limits of the linkage are there with the effect `stops`. An arm's shapes never touch each other:
+    they are collision shapes only where `modify_plant` adds one that they can touch.
 
     **On hardware** the ports of `station_ports` are all there are. Measured values are those of the last DVRK_STATUS
     message, NaN before the first. Efforts go out in DVRK_COMMAND messages every `driver.status_period` and on forced
@@ -70,6 +82,8 @@ class ArmStation(Diagram):
         closure: Closure = "mimic",
         plant_arm: Arm | None = None,
         modify_plant: Callable[[MultibodyPlant], None] | None = None,
+        effects: ArmEffects | None = None,
+        seed: int = 0,
         driver: DvrkDriver | None = None,
         lcm: DrakeLcmInterface | None = None,
     ) -> None:
@@ -88,6 +102,9 @@ class ArmStation(Diagram):
             other effort limits.
                 Drake can change the inertia of links that are already there only in a Context:
                 `set_link_inertias`.
+            effects: of the real arm that the simulation shall have, e.g. `arm.effects` or
+            `arm.effects.only(["friction"])`; none by default.
+            seed: of the effects' noise.
             driver: how the hardware is driven; `DvrkDriver()` by default.
             lcm: whose `HandleSubscriptions` somebody else calls, for loops that are driven by messages; by default one
                 at `driver.lcm_url` that a Simulator of this station handles.
@@ -100,17 +117,21 @@ class ArmStation(Diagram):
         self._arm = arm
         self._true_arm = plant_arm or arm
         self._plant: MultibodyPlant | None = None
+        self._parts: PlantEffects | None = None
+        self._drive_step: DriveStep | None = None
         builder = DiagramBuilder()
         if hardware:
-            if (time_step, meshcat, closure, plant_arm, modify_plant) != (1e-3, None, "mimic", None, None):
+            of_a_simulation = (time_step, meshcat, closure, plant_arm, modify_plant, effects)
+            if of_a_simulation != (1e-3, None, "mimic", None, None, None):
                 raise StationError(
-                    "time_step, meshcat, closure, plant_arm and modify_plant are of a simulation: use hardware=False"
+                    "time_step, meshcat, closure, plant_arm, modify_plant and effects are of a simulation: "
+                    "use hardware=False"
                 )
             self._connect_hardware(builder, driver or DvrkDriver(), lcm)
         else:
             if driver is not None or lcm is not None:
                 raise StationError("driver and lcm are of hardware; apply_driver_config puts a simulation behind LCM")
-            self._simulate(builder, time_step, meshcat, closure, modify_plant)
+            self._simulate(builder, time_step, meshcat, closure, modify_plant, effects, seed)
         builder.BuildInto(self)
         self.set_name(f"{arm.name.lower()}_station")
 
@@ -128,6 +149,8 @@ class ArmStation(Diagram):
         meshcat: Meshcat | None,
         closure: Closure,
         modify_plant: Callable[[MultibodyPlant], None] | None,
+        effects: ArmEffects | None,
+        seed: int,
     ) -> None:
         arm, true_arm = self._arm, self._true_arm
         if not 0 < time_step <= 0.01:
@@ -140,18 +163,30 @@ class ArmStation(Diagram):
                 f"{true_arm.name} has {', '.join(true_arm.joint_names)}"
             )
         self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=time_step)
-        self._instance = add_arm(self.plant, true_arm, closure)
+        # Nothing else is in the plant, so nothing touches the arm unless somebody adds it.
+        self._instance = add_arm(self.plant, true_arm, closure, collision_shapes=modify_plant is not None)
         if modify_plant is not None:
             modify_plant(self.plant)
+        # Otherwise Drake steps the plant before all discrete updates, and what they measure is from after the step.
+        self.plant.SetUseSampledOutputPorts(False)
+        if effects is not None:
+            self._parts = PlantEffects(self.plant, true_arm, self._instance, effects)
         self.plant.Finalize()
         self._drop_idle_shapes()
+        self._joints = PlantJoints(self.plant, true_arm, self._instance)
         self._set_default_pose()
         if meshcat is not None:
             # The visualizer deletes its prefix when it starts: one level down, so that a SetTransform stays.
             parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
             MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
-        self._export_inputs(builder)
-        self._export_outputs(builder)
+        if effects is None or self._parts is None:
+            ports = add_ideal_drive(builder, self.plant, self._joints, self._instance)
+        else:
+            drive = RealDrive(
+                true_arm, self.plant, self._instance, self._joints, self._parts, effects, seed, self._home()
+            )
+            ports, self._drive_step = add_real_drive(builder, drive)
+        self._export(builder, ports)
 
     @property
     def arm(self) -> Arm:
@@ -184,11 +219,19 @@ class ArmStation(Diagram):
             raise StationError(f"a pose of {self._arm.name} is {self._arm.num_joints} finite numbers; got {q.tolist()}")
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
         set_arm_positions(self.plant, plant_context, self._true_arm, q)
+        q_plant = self.plant.GetPositions(plant_context)
+        if self._parts is not None:
+            self._parts.drive.set_positions(q_plant, q)
+        self.plant.SetPositions(plant_context, q_plant)
+        if self._drive_step is not None:
+            self._drive_step.set_at_rest(self.GetMutableSubsystemContext(self._drive_step, context), q)
         self.plant.SetVelocities(plant_context, np.zeros(self.plant.num_velocities()))
 
     def get_positions(self, context: Context) -> NDArray[np.float64]:
         """Pose (n,) of the independent joints in this station's context."""
-        return self.GetOutputPort(f"{self._arm.name.lower()}.position_measured").Eval(context)
+        plant_context = self.GetSubsystemContext(self.plant, context)
+        q: NDArray[np.float64] = self.plant.GetPositions(plant_context)[self._joints.index]
+        return q
 
     def set_link_inertias(self, context: Context, inertias: Mapping[str, SpatialInertia]) -> None:
         """Gives links another inertia in this station's context: an arm that differs from its model.
@@ -208,12 +251,6 @@ class ArmStation(Diagram):
         for name, M_LLo_L in inertias.items():
             self.plant.get_body(bodies[name]).SetSpatialInertiaInBodyFrame(plant_context, M_LLo_L)
 
-    def _independent(self) -> NDArray[np.int_]:
-        """Index into the plant's q and v of each independent joint."""
-        names = list(self._true_arm.tree_joint_names)
-        tree = tree_selector(self.plant, self._true_arm, self._instance)
-        return tree[[names.index(joint) for joint in self._arm.joint_names]]
-
     def _drop_idle_shapes(self) -> None:
         """Takes the collision shapes out if no two of them may touch: they would cost a sixth of a step for nothing."""
         if self._scene_graph.model_inspector().GetCollisionCandidates():
@@ -223,64 +260,30 @@ class ArmStation(Diagram):
             for shape in plant.GetCollisionGeometriesForBody(body):
                 self._scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
+    def _home(self) -> NDArray[np.float64]:
+        return np.clip(0.0, self._true_arm.position_lower, self._true_arm.position_upper)
+
     def _set_default_pose(self) -> None:
-        home = np.clip(0.0, self._true_arm.position_lower, self._true_arm.position_upper)
+        home = self._home()
         q_plant = self.plant.GetDefaultPositions()
         tree = tree_selector(self.plant, self._true_arm, self._instance)
         q_plant[tree] = self._true_arm.linkage.position(home)
+        if self._parts is not None:
+            self._parts.drive.set_positions(q_plant, home)
         self.plant.SetDefaultPositions(q_plant)
 
-    def _export_inputs(self, builder: DiagramBuilder) -> None:
-        plant, name, n = self.plant, self._arm.name.lower(), self._arm.num_joints
-        # The plant clamps as well, but silently: clamp here, at the plant's limits, to know what is applied.
-        actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(self._instance)]
-        driven = [actuator.joint().name() for actuator in actuators]
-        if undriven := [joint for joint in self._arm.joint_names if joint not in driven]:
-            raise StationError(
-                f"{' '.join(self._true_arm.sdf)}: joint {', '.join(undriven)} has no <effort>, so no motor"
-            )
-        columns = [driven.index(joint) for joint in self._arm.joint_names]
-        limits = np.array([actuators[i].effort_limit() for i in columns])
-        # Motors of other joints (massless rotors that ride on a linkage) get zero: their inertia is all they
-        # are for.
-        B = np.zeros((len(actuators), n))
-        B[columns, range(n)] = 1.0
-        commanded = builder.AddNamedSystem("effort_commanded", PassThrough(n))
-        clamp = builder.AddNamedSystem("effort_clamp", Saturation(min_value=-limits, max_value=limits))
-        to_actuators = builder.AddNamedSystem("to_actuators", MatrixGain(D=B))
-        builder.Connect(commanded.get_output_port(), clamp.get_input_port())
-        builder.Connect(clamp.get_output_port(), to_actuators.get_input_port())
-        builder.Connect(to_actuators.get_output_port(), plant.get_actuation_input_port(self._instance))
-        builder.ExportInput(commanded.get_input_port(), f"{name}.effort_commanded")
-        builder.ExportOutput(clamp.get_output_port(), f"{name}.effort_measured")
-
-        disturbance = builder.AddNamedSystem("effort_disturbance", PassThrough(n))
-        to_tree = builder.AddNamedSystem("to_tree", MatrixGain(D=self._tree_selection()))
-        builder.Connect(disturbance.get_output_port(), to_tree.get_input_port())
-        builder.Connect(to_tree.get_output_port(), plant.get_applied_generalized_force_input_port())
-        builder.ExportInput(disturbance.get_input_port(), f"{name}.effort_disturbance")
-
-    def _export_outputs(self, builder: DiagramBuilder) -> None:
-        plant, name = self.plant, self._arm.name.lower()
-        S = self._tree_selection().T
-        zero = np.zeros_like(S)
-        for port, D in {
-            "position_measured": np.hstack([S, zero]),
-            "velocity_estimated": np.hstack([zero, S]),
-            "state_estimated": np.block([[S, zero], [zero, S]]),
-        }.items():
+    def _export(self, builder: DiagramBuilder, ports: DrivePorts) -> None:
+        name, n = self._arm.name.lower(), self._arm.num_joints
+        builder.ExportInput(ports.effort_commanded, f"{name}.effort_commanded")
+        builder.ExportInput(ports.effort_disturbance, f"{name}.effort_disturbance")
+        builder.ExportOutput(ports.effort_measured, f"{name}.effort_measured")
+        builder.ExportOutput(ports.state_true, f"{name}.state_true")
+        builder.ExportOutput(ports.state_estimated, f"{name}.state_estimated")
+        halves = np.split(np.eye(2 * n), 2)
+        for port, D in zip(("position_measured", "velocity_estimated"), halves, strict=True):
             select = builder.AddNamedSystem(port, MatrixGain(D=D))
-            builder.Connect(plant.get_state_output_port(), select.get_input_port())
+            builder.Connect(ports.state_estimated, select.get_input_port())
             builder.ExportOutput(select.get_output_port(), f"{name}.{port}")
-        builder.ExportOutput(plant.get_state_output_port(), "plant_state")
-        builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
+        builder.ExportOutput(self.plant.get_state_output_port(), "plant_state")
+        builder.ExportOutput(self.plant.get_body_poses_output_port(), "body_poses")
         builder.ExportOutput(self._scene_graph.get_query_output_port(), "query_object")
-
-    def _tree_selection(self) -> NDArray[np.float64]:
-        """(nv, n): efforts on the independent joints to efforts on the plant; its transpose picks their
-        positions."""
-        if self.plant.num_positions() != self.plant.num_velocities():
-            raise StationError("modify_plant must not add floating bodies: weld them to the arm")
-        selection = np.zeros((self.plant.num_velocities(), self._arm.num_joints))
-        selection[self._independent(), range(self._arm.num_joints)] = 1.0
-        return selection

@@ -1,0 +1,172 @@
+"""How much of an arm's friction a controller may take away without moving the arm by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linprog
+from scipy.sparse import block_diag, csr_matrix, hstack, vstack
+from scipy.sparse.csgraph import connected_components
+
+from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_fault, joint_row
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ControllerError, ModelError
+from dvrk_drake.models.arm import Arm
+
+#: Travel within which friction must hold the arm [rad, m]: an element that is stretched further before it slips lets
+#: the arm move that far. The smoothed sign of an identification stands for friction that holds at once.
+HOLDING_TRAVEL = 0.015
+
+
+@dataclass(frozen=True)
+class Friction:
+    """The friction in an arm's drive, as identified: effects that only take energy.
+
+    Attributes:
+        arm: in whose drive it is.
+        effects: each dissipative, see `EFFECT_KINDS`.
+        coefficients: (k,) one for each effect, not negative, in the unit of its kind.
+    """
+
+    arm: Arm
+    effects: tuple[ActuatorEffect, ...]
+    coefficients: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, arm: Arm, effects: Sequence[ActuatorEffect], coefficients: ArrayLike) -> Friction:
+        """The dissipative ones among the effects of an arm; the others are left out.
+
+        Raises:
+            ControllerError: an effect that the arm cannot have, or a coefficient of friction that is negative or no
+                number.
+        """
+        values = np.asarray(coefficients, float)
+        if values.shape != (len(effects),):
+            raise ControllerError(f"friction: {len(effects)} effects need as many coefficients, not {values.shape}")
+        kept = [k for k, effect in enumerate(effects) if effect.kind not in EFFECT_KINDS or effect.dissipative]
+        for k in kept:
+            if fault := effect_fault(arm, effects[k]):
+                raise ControllerError(f"friction: {fault}")
+            if not 0 <= values[k] < np.inf:
+                raise ControllerError(f"friction: {effects[k]} has coefficient {values[k]:g}; it must be 0 or more")
+        kept = [k for k in kept if values[k] > 0]
+        return cls(arm, tuple(effects[k] for k in kept), values[kept])
+
+    @classmethod
+    def of_arm(cls, arm: Arm) -> Friction:
+        """What the arm's files state.
+
+        Raises:
+            ControllerError: they state none.
+        """
+        effects = arm.effects.friction
+        if not effects:
+            raise ControllerError(f"friction: the files of {arm.name} state none")
+        return cls.of(
+            arm, [ActuatorEffect(e.coordinate, e.kind, e.scale) for e in effects], [e.coefficient for e in effects]
+        )
+
+    @classmethod
+    def of_model(cls, arm: Arm, model: IdentifiedModel) -> Friction:
+        """What a model that was identified from a motion says.
+
+        Raises:
+            ModelError: it was identified from poses, or of another arm.
+        """
+        if model.load_arm().joint_names != arm.joint_names:
+            raise ModelError(f"friction: the model is of {model.arm}, not of {arm.name}")
+        if model.dynamics is None:
+            raise ModelError(
+                "friction: the model was identified from poses, which tell nothing of friction; give a motion's"
+            )
+        effects = model.dynamics.effects
+        return cls.of(arm, [e.effect for e in effects], [e.value for e in effects])
+
+    @property
+    def rows(self) -> NDArray[np.float64]:
+        """(k, n) what the coordinate of each effect moves by per joint; f along it is row' f on the joints."""
+        return np.array([joint_row(self.arm, e.coordinate) for e in self.effects]).reshape(-1, self.arm.num_joints)
+
+    @property
+    def holds(self) -> NDArray[np.bool_]:
+        """(k,) whether the effect holds the arm at rest, within `HOLDING_TRAVEL`."""
+        return np.array(
+            [e.kind == "coulomb" or (e.kind == "presliding" and e.scale <= HOLDING_TRAVEL) for e in self.effects], bool
+        )
+
+    @property
+    def of_joints(self) -> NDArray[np.float64]:
+        """(n,) friction that holds each joint at rest if it alone moves [N m, N]."""
+        return np.abs(self.rows[self.holds]).T @ self.coefficients[self.holds]
+
+
+def safe_ratios(friction: Friction, ratio: float, holding_error: ArrayLike) -> NDArray[np.float64]:
+    """The share of each effect that may be compensated: at most `ratio`, and never so much that the arm creeps.
+
+    What remains of the friction that holds the arm at rest must hold whatever the gravity compensation may be wrong by:
+    for every torque e in the box |e_i| <= holding_error_i there must be forces f_k along the coordinates with
+    sum row_k' f_k = e and |f_k| <= (1 - ratio_k) coefficient_k. The box is convex, so its corners suffice; the largest
+    such ratios are a linear program. Joints that share no coordinate are looked at apart. Where not even all the
+    friction could hold the error, none is compensated.
+
+    Args:
+        friction: of the arm.
+        ratio: wanted, 0..1.
+        holding_error: (n,) by which the gravity compensation may be wrong [N m, N].
+
+    Returns:
+        (k,) one ratio for each effect; effects of one coordinate have the same.
+
+    Raises:
+        ControllerError: a ratio outside 0..1, or an error that is none.
+    """
+    error = np.asarray(holding_error, float)
+    arm = friction.arm
+    if not 0 <= ratio <= 1:
+        raise ControllerError(f"friction ratio must be between 0 and 1; got {ratio:g}")
+    if error.shape != (arm.num_joints,) or not np.all((error >= 0) & np.isfinite(error)):
+        raise ControllerError(f"holding_error must be {arm.num_joints} numbers from 0; got {error.tolist()}")
+    names = list(dict.fromkeys(effect.coordinate for effect in friction.effects))
+    rows = np.array([joint_row(arm, name) for name in names]).reshape(-1, arm.num_joints)
+    index = np.array([names.index(effect.coordinate) for effect in friction.effects], np.intp)
+    holding = np.bincount(index, friction.coefficients * friction.holds, len(names)).astype(float)
+    ratios = np.zeros(len(names))
+    _, block_of = connected_components(np.abs(rows).T @ np.abs(rows))
+    for block in range(block_of.max() + 1):
+        joints = block_of == block
+        along = np.any(rows[:, joints] != 0, axis=1)
+        ratios[along] = _largest(rows[np.ix_(along, joints)], holding[along], error[joints], ratio)
+    return ratios[index]
+
+
+def _largest(
+    rows: NDArray[np.float64], holding: NDArray[np.float64], error: NDArray[np.float64], most: float
+) -> NDArray[np.float64]:
+    """(c,) largest ratios in 0..most of the coordinates whose remaining friction holds every corner of the box."""
+    # Of opposite corners one suffices.
+    corners = [np.array([1.0, *signs]) * error for signs in product((1.0, -1.0), repeat=len(error) - 1)]
+    m, c = len(corners), len(rows)
+    # Unknowns: the ratios, then the forces along the coordinates at each corner.
+    identity, limits = csr_matrix(np.eye(m * c)), csr_matrix(np.tile(np.diag(holding), (m, 1)))
+    done = linprog(
+        np.concatenate([-np.ones(c), np.zeros(m * c)]),
+        A_ub=vstack([hstack([limits, identity]), hstack([limits, -identity])]),
+        b_ub=np.tile(holding, 2 * m),
+        A_eq=hstack([csr_matrix((m * len(error), c)), block_diag([rows.T] * m)]),
+        b_eq=np.concatenate(corners),
+        bounds=[*[(0.0, most)] * c, *[(None, None)] * (m * c)],
+    )
+    return done.x[:c] if done.success else np.zeros(c)
+
+
+def holding_error(model: IdentifiedModel) -> NDArray[np.float64]:
+    """(n,) by which the model's gravity torque may be wrong [N m, N]: how well it predicts poses that it was not told.
+
+    Measured efforts of poses have friction in them, so this is rather too much. Zero for a model that was not
+    identified from poses.
+    """
+    return np.array([joint.rms_leave_one_out_undoubted for joint in model.joints])

@@ -1,0 +1,152 @@
+"""Takes a part of an arm's friction off the hand that moves it."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, effect_step
+from dvrk_drake.dynamics.friction_compensation import Friction, safe_ratios
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.systems.gravity_pid_step import ABSURD
+
+
+class FrictionCompensator(LeafSystem):
+    """Adds to a controller's effort what a share of the identified friction would need, and never enough to move alone.
+
+    .. pydrake_system::
+
+        name: FrictionCompensator
+        input_ports:
+        - state_estimated
+        - effort_wanted
+        output_ports:
+        - effort
+        - friction_effort
+
+    Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
+
+    - `state_estimated` (2n): q, then v.
+    - `effort_wanted` (n): of a controller, e.g. GravityPidController.
+    - `effort` (n): effort_wanted + friction_effort, inside the effort limits.
+    - `friction_effort` (n): sum of ratio_k coefficient_k shape_k row_k'. The same elements as the identified friction,
+      see `dvrk_drake.dynamics.actuator_effects`: dry friction is compensated by the hysteresis that it is, from the
+      travel of the joint and not from a sign of its velocity, which is noise near zero.
+
+    **Why it is passive.** An elasto-plastic element takes c |slip|. One that starts later (`widening` >= 1 times the
+    travel until it slips) slips no more than the arm's own, so ratio times it gives back at most `ratio` of what the
+    arm's friction takes, beside what it can store, ratio c d / 2. Viscous and smoothed Coulomb terms are at most
+    `ratio` of the arm's at every speed. A delay turns such a term's phase, but not beyond that of the arm's own, which
+    stays larger. What remains is friction of its own: no cycle can feed on it. And it holds the arm against errors of
+    the gravity compensation, as `safe_ratios` sees to.
+
+    **Time.** State (the elements' stretch, the last position) changes every `period`, at initialization, when the
+    elements are relaxed, and by a forced update. While `state_estimated` is not finite `friction_effort` is zero; then
+    the elements start relaxed.
+    """
+
+    def __init__(
+        self,
+        friction: Friction,
+        *,
+        ratio: float = 0.5,
+        holding_error: ArrayLike | None = None,
+        widening: float = 1.5,
+        period: float = 1e-3,
+    ) -> None:
+        """Of an arm's friction.
+
+        Args:
+            friction: as identified.
+            ratio: share of it that is compensated, 0..0.9; above, an error of a tenth in the friction would be enough
+                to move the arm.
+            holding_error: (n,) by which the gravity compensation may be wrong [N m, N]; lowers the ratio where needed.
+            widening: the compensation's scales over the identified ones, from 1.
+            period: of the update [s].
+
+        Raises:
+            ControllerError: a number that is none of these.
+        """
+        super().__init__()
+        if not 0 <= ratio <= 0.9:
+            raise ControllerError(f"friction ratio must be between 0 and 0.9; got {ratio:g}")
+        if not (1 <= widening <= 10 and 0 < period < 1):
+            raise ControllerError(f"widening must be 1..10 and period 0..1 s; got {widening:g}, {period:g}")
+        n = friction.arm.num_joints
+        error = np.zeros(n) if holding_error is None else holding_error
+        self._ratios = safe_ratios(friction, ratio, error)
+        self._limits = friction.arm.effort_limits
+        kinds = [EFFECT_KINDS[effect.kind] for effect in friction.effects]
+        self._constants = (
+            friction.rows,
+            np.array([kind.code for kind in kinds], np.int64),
+            widening * np.array([effect.scale for effect in friction.effects]),
+            self._ratios * friction.coefficients,
+        )
+        self._state_port = self.DeclareVectorInputPort("state_estimated", 2 * n)
+        self._wanted_port = self.DeclareVectorInputPort("effort_wanted", n)
+        # Stretch of the elements, last positions of their coordinates, friction effort, whether positions are known.
+        self._memory = self.DeclareDiscreteState(2 * len(kinds) + n + 1)
+        self._at = slice(2 * len(kinds), 2 * len(kinds) + n)
+        ticket = self.discrete_state_ticket(self._memory)
+        self.DeclareVectorOutputPort("effort", n, self._calc_effort, {ticket, self._wanted_port.ticket()})
+        self.DeclareVectorOutputPort("friction_effort", n, self._calc_friction_effort, {ticket})
+        self.DeclareInitializationDiscreteUpdateEvent(self._restart)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclareForcedDiscreteUpdateEvent(self._update)
+
+    @property
+    def ratios(self) -> NDArray[np.float64]:
+        """(k,) share of each effect of the friction that is compensated."""
+        return self._ratios.copy()
+
+    def _restart(self, context: Context, state: DiscreteValues) -> None:
+        state.get_mutable_value(int(self._memory))[-1] = 0.0
+        self._update(context, state)
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        _advance(self._state_port.Eval(context), *self._constants, state.get_mutable_value(int(self._memory)))
+
+    def _calc_effort(self, context: Context, output: BasicVector) -> None:
+        effort = self._wanted_port.Eval(context) + self._friction_effort(context)
+        output.SetFromVector(np.clip(effort, -self._limits, self._limits))
+
+    def _calc_friction_effort(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._friction_effort(context))
+
+    def _friction_effort(self, context: Context) -> NDArray[np.float64]:
+        return np.asarray(context.get_discrete_state(int(self._memory)).get_value()[self._at])
+
+
+@numba.njit(cache=True)
+def _advance(
+    state: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    codes: NDArray[np.int64],
+    scales: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    memory: NDArray[np.float64],
+) -> None:
+    """One step of all elements, in place in `memory`, see FrictionCompensator."""
+    k, n = rows.shape
+    stretch, last, effort = memory[:k], memory[k : 2 * k], memory[2 * k : 2 * k + n]
+    effort[:] = 0.0
+    known = memory[-1] == 1.0
+    memory[-1] = 0.0
+    for i in range(2 * n):
+        if not abs(state[i]) < ABSURD:  # also true of NaN
+            return
+    memory[-1] = 1.0
+    for j in range(k):
+        x, v = 0.0, 0.0
+        for i in range(n):
+            x += rows[j, i] * state[i]
+            v += rows[j, i] * state[n + i]
+        if not known:
+            stretch[j], last[j] = 0.0, x
+        stretch[j], shape = effect_step(codes[j], stretch[j], x - last[j], v, scales[j])
+        last[j] = x
+        for i in range(n):
+            effort[i] += weights[j] * shape * rows[j, i]

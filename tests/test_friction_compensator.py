@@ -1,0 +1,218 @@
+"""Friction compensation: the same elements as the identified friction, passive, and no creep."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from scipy.optimize import linprog
+
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates
+from dvrk_drake.dynamics.friction_compensation import Friction, safe_ratios
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.closed_loop import add_closed_loop
+from dvrk_drake.systems.friction_compensator import FrictionCompensator
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+
+ARM = load_arm("mtml")
+EFFECTS = [
+    *(ActuatorEffect(f"actuator.{name}", "presliding", d) for name in ARM.joint_names for d in (0.003, 0.02)),
+    *(ActuatorEffect(f"actuator.{name}", "coulomb", 0.05) for name in ARM.joint_names),
+    *(ActuatorEffect(f"actuator.{name}", "viscous") for name in ARM.joint_names),
+    ActuatorEffect("joint.elbow_pitch", "presliding", 0.01),
+]
+SIZES = np.array([0.09, 0.12, 0.11, 0.06, 0.008, 0.005, 0.001])
+COEFFICIENTS = np.concatenate([np.repeat(SIZES, 2) / 2, SIZES / 3, SIZES / 2, [0.03]])
+FRICTION = Friction.of(ARM, EFFECTS, COEFFICIENTS)
+NO_EFFORT = np.zeros(7)
+
+
+def motion(seed, steps=6000, period=1e-3):
+    """A hand's rambling: q and v (steps, 7), with stretches of fine trembling, where presliding matters most."""
+    generator = np.random.default_rng(seed)
+    t = period * np.arange(steps)
+    q, v = np.zeros((steps, 7)), np.zeros((steps, 7))
+    for frequency in (0.2, 0.7, 3.0, 11.0):
+        amplitude = generator.uniform(0.0, 0.2, 7) / (1 + frequency**1.5)
+        phase = generator.uniform(0, 2 * np.pi, 7)
+        w = 2 * np.pi * frequency
+        q += amplitude * np.sin(w * t[:, None] + phase)
+        v += amplitude * w * np.cos(w * t[:, None] + phase)
+    return q, v
+
+
+def friction_of_arm(q, v):
+    """(m, n) efforts that the arm's own friction takes, by the columns that the identification uses."""
+    rows = effect_coordinates(ARM)
+    a, a_dot = ARM.transmission.position(q), ARM.transmission.velocity(v)
+    efforts = np.zeros(a.shape)
+    for effect, coefficient in zip(EFFECTS, COEFFICIENTS, strict=True):
+        h = rows[effect.coordinate]
+        efforts += coefficient * effect.column(a @ h, a_dot @ h)[:, None] * h
+    return ARM.transmission.pull_back_effort(efforts)
+
+
+class Compensator:
+    """The system by itself, stepped by hand."""
+
+    def __init__(self, **options):
+        self.system = FrictionCompensator(FRICTION, **options)
+        self.context = self.system.CreateDefaultContext()
+        self.system.GetInputPort("effort_wanted").FixValue(self.context, NO_EFFORT)
+        self.new = self.system.AllocateDiscreteVariables()
+
+    def step(self, q, v, port="friction_effort"):
+        self.system.GetInputPort("state_estimated").FixValue(self.context, np.concatenate([q, v]))
+        self.system.CalcForcedDiscreteVariableUpdate(self.context, self.new)
+        self.context.get_mutable_discrete_state().SetFrom(self.new)
+        return self.system.GetOutputPort(port).Eval(self.context).copy()
+
+    def run(self, q, v):
+        return np.array([self.step(*row) for row in zip(q, v, strict=True)])
+
+
+def test_all_of_it_without_widening_is_a_share_of_the_identified_friction():
+    q, v = motion(1, 1000)
+    np.testing.assert_allclose(Compensator(ratio=0.9, widening=1.0).run(q, v), 0.9 * friction_of_arm(q, v), atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("delay", [0, 2])
+def test_no_motion_gets_energy_from_it(seed, delay):
+    """Of friction and compensation together, in any motion, also two periods late, in counts, and noisy."""
+    q, v = motion(seed)
+    generator = np.random.default_rng(seed)
+    seen_q = 5e-6 * np.round(q / 5e-6)
+    seen_v = v + 1e-3 * generator.standard_normal(v.shape)
+    late = np.concatenate([np.repeat(seen_q[:1], delay, 0), seen_q])[: len(q)]
+    late_v = np.concatenate([np.repeat(seen_v[:1], delay, 0), seen_v])[: len(q)]
+    given = Compensator(ratio=0.9).run(late, late_v)
+    dq = np.diff(q, axis=0)
+    taken = friction_of_arm(q, v)
+    energy = np.cumsum(np.einsum("mi,mi->m", (taken - given)[1:], dq))
+    # What the compensation's elements can store, and so give back once: ratio c d / 2, d wider by a half.
+    stored = sum(
+        0.9 * c * 1.5 * e.scale / 2 for e, c in zip(EFFECTS, COEFFICIENTS, strict=True) if e.kind == "presliding"
+    )
+    assert energy.min() > -stored
+    assert energy[-1] > 0.05 * np.sum(taken[1:] * dq) > 0
+
+
+def test_a_hand_feels_less():
+    q, v = motion(5)
+    given = Compensator(ratio=0.7).run(q, v)
+    taken = friction_of_arm(q, v)
+    work, left = (np.abs(np.sum(f[1:] * np.diff(q, axis=0))) for f in (taken, taken - given))
+    assert 0.25 * work < left < 0.5 * work
+
+
+@pytest.mark.parametrize("ratio", [0.5, 0.9])
+def test_the_friction_that_remains_holds_any_error_of_the_gravity_compensation(ratio):
+    error = np.array([0.02, 0.03, 0.02, 0.01, 0.003, 0.002, 0.0004])
+    ratios = safe_ratios(FRICTION, ratio, error)
+    assert np.all((ratios >= 0) & (ratios <= ratio)) and np.any(ratios > 0.3)
+    left = ((1 - ratios) * COEFFICIENTS)[FRICTION.holds]
+    rows = FRICTION.rows[FRICTION.holds]
+    generator = np.random.default_rng(3)
+    for _ in range(50):
+        corner = error * generator.choice([-1.0, 1.0], 7)
+        holds = linprog(np.zeros(len(left)), A_eq=rows.T, b_eq=corner, bounds=[(-f, f) for f in left * (1 + 1e-9)])
+        assert holds.success
+
+
+def test_joints_that_creep_anyway_keep_all_their_friction():
+    error = np.zeros(7)
+    error[5] = 0.02  # more than its friction
+    ratios = safe_ratios(FRICTION, 0.7, error)
+    touches = FRICTION.rows[:, 5] != 0
+    assert np.all(ratios[touches] == 0) and np.all(ratios[~touches] == 0.7)
+    error[5], error[1], error[2] = 0.0, 0.1, 0.1  # each alone could be held, not both with opposite signs
+    assert np.all(FRICTION.of_joints > error)
+    ratios = safe_ratios(FRICTION, 0.7, error)
+    touches = np.any(FRICTION.rows[:, 1:4] != 0, axis=1)
+    assert np.all(ratios[touches] == 0) and np.all(ratios[~touches] == 0.7)
+
+
+def test_without_friction_to_spare_nothing_is_compensated():
+    assert np.all(safe_ratios(FRICTION, 0.9, FRICTION.of_joints) == 0)
+    assert np.all(safe_ratios(FRICTION, 0.9, 0.999 * FRICTION.of_joints) < 0.5)
+
+
+def test_it_begins_with_nothing_and_after_a_nan_again():
+    compensator = Compensator(ratio=0.9)
+    q = np.full(7, 0.2)
+    still = np.zeros(7)
+    assert np.all(compensator.step(q, still) == 0)
+    assert np.all(np.abs(compensator.step(q + 0.1, still)) > 0)
+    assert np.all(compensator.step(np.full(7, np.nan), still) == 0)
+    assert np.all(compensator.step(q - 0.3, still) == 0)
+
+
+def test_the_sum_stays_inside_the_effort_limits():
+    compensator = Compensator(ratio=0.9)
+    compensator.system.GetInputPort("effort_wanted").FixValue(compensator.context, 0.999 * ARM.effort_limits)
+    compensator.step(np.zeros(7), np.zeros(7))
+    effort = compensator.step(np.full(7, 0.1), np.full(7, 1.0), "effort")
+    assert np.all(effort <= ARM.effort_limits) and np.any(effort == ARM.effort_limits)
+
+
+def test_it_restarts_relaxed():
+    builder = DiagramBuilder()
+    system = builder.AddSystem(FrictionCompensator(FRICTION))
+    builder.ExportInput(system.GetInputPort("state_estimated"))
+    builder.ExportInput(system.GetInputPort("effort_wanted"))
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    context.get_mutable_discrete_state(0).SetFromVector(np.ones(context.get_discrete_state(0).size()))
+    diagram.get_input_port(0).FixValue(context, np.concatenate([np.full(7, 0.1), NO_EFFORT]))
+    diagram.get_input_port(1).FixValue(context, NO_EFFORT)
+    diagram.ExecuteInitializationEvents(context)
+    assert np.all(system.GetOutputPort("friction_effort").Eval(system.GetMyContextFromRoot(context)) == 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"ratio": 0.95}, "ratio must be between 0 and 0.9"),
+        ({"ratio": np.nan}, "ratio must be"),
+        ({"widening": 0.9}, "widening must be 1..10"),
+        ({"holding_error": [0.1]}, "must be 7 numbers from 0"),
+    ],
+)
+def test_numbers_that_are_none_are_refused(options, what):
+    with pytest.raises(ControllerError, match=what):
+        FrictionCompensator(FRICTION, **options)
+
+
+def test_friction_that_gives_energy_is_refused():
+    with pytest.raises(ControllerError, match="must be 0 or more"):
+        Friction.of(ARM, EFFECTS, -COEFFICIENTS)
+    with pytest.raises(ControllerError, match=r"allowed: actuator\.outer_yaw"):
+        Friction.of(ARM, [ActuatorEffect("actuator.nose", "viscous")], [1.0])
+
+
+def released(ratio, error, holding_error, seconds=1.5):
+    """(7,) how far each joint of an arm with real friction, encoders and delays moves under compensation [rad]."""
+    station = ArmStation(ARM, effects=ARM.effects.without("cables").without("springs"))
+    friction = FrictionCompensator(Friction.of_arm(ARM), ratio=ratio, holding_error=holding_error)
+    builder = DiagramBuilder()
+    controller = GravityPidController(IdentifiedModel.from_arm(ARM), mode="gravity")
+    add_closed_loop(builder, station, controller, friction=friction)
+    simulator = Simulator(builder.Build())
+    context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    start = [0.1, 0.3, -0.1, 0.5, 0.4, 0.1, 0.3]
+    station.set_positions(context, start)
+    station.GetInputPort("mtml.effort_disturbance").FixValue(context, error)
+    simulator.AdvanceTo(seconds)
+    return np.abs(station.GetOutputPort("mtml.state_true").Eval(context)[:7] - start)
+
+
+@pytest.mark.slow
+def test_a_released_arm_stays_though_its_gravity_is_not_known_exactly_and_would_not_with_less_care():
+    error = np.array([0.01, 0.015, -0.015, 0.01, 0.003, 0.002, 0.0004])
+    assert np.all(released(0.9, error, np.abs(error)) < 0.015)
+    more = np.array([1, 2, 2, 2, 1, 1, 1]) * error
+    assert np.any(released(0.9, more, np.zeros(7)) > 0.1)
+    assert np.all(released(0.9, more, np.abs(more)) < 0.04)  # as without any: the fine friction cannot hold as much

@@ -1,0 +1,95 @@
+"""The real arm as a whole: parts that can be switched, scenarios, and what is refused."""
+
+import dataclasses
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from real_arm import ARMS
+
+from dvrk_drake.analysis.scenario import load_scenario
+from dvrk_drake.analysis.simulation import simulate
+from dvrk_drake.errors import ArmError, ScenarioError, StationError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.effects_schema import EFFECT_NAMES, ArmEffects, FrictionEffect
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
+from dvrk_drake.systems.arm_station import ArmStation
+
+
+def scenario(arm, *settings):
+    parts = ["duration=0.3", "real_arm=[all]", "sample_period=0.001"]
+    return load_scenario(arm, [*parts, *settings])
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_a_seed_gives_the_same_bits(name):
+    one, two, other = (simulate(scenario(name, f"seed={seed}")).recording for seed in (5, 5, 6))
+    for field in ("q", "qd", "tau"):
+        np.testing.assert_array_equal(getattr(one, field), getattr(two, field))
+    assert np.any(one.tau != other.tau)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_a_controller_that_knows_only_gravity_holds_the_real_arm(name):
+    arm = load_arm(name)
+    path = simulate(load_scenario(name, ["duration=2", "real_arm=[all]"])).recording.q
+    # Cables and springs, which it does not know, pull it by their torque over its gain until its integral has grown.
+    assert np.abs(path - path[0]).max() < 0.1
+    rest = [part for part in EFFECT_NAMES if part not in ("cables", "springs")]
+    recording = simulate(load_scenario(name, ["duration=2", f"real_arm={rest}"])).recording
+    resolution = np.array([arm.effects.encoder.resolution[joint] for joint in arm.joint_names])
+    counts = arm.transmission.position(recording.q - recording.q[0]) / resolution
+    # Presliding alone is some counts of the fine encoders: 3 mrad under its load.
+    assert np.all(np.abs(counts * resolution) < np.maximum(2 * resolution, 0.003))
+    assert np.all(np.abs(recording.tau) <= 1.1 * arm.effort_limits)
+
+
+def test_every_part_can_be_switched():
+    arm = load_arm("mtml")
+    for name in EFFECT_NAMES:
+        assert getattr(arm.effects, name) or name == "stretch"
+        alone, rest = arm.effects.only([name]), arm.effects.without(name)
+        for other in EFFECT_NAMES:
+            kept, dropped = (alone, rest) if other == name else (rest, alone)
+            assert getattr(kept, other) == getattr(arm.effects, other)
+            assert getattr(dropped, other) == getattr(ArmEffects(), other)
+    with pytest.raises(ArmError, match="unknown effect frction; allowed: all, friction"):
+        arm.effects.only(["frction"])
+
+
+def test_a_typo_is_an_error(tmp_path):
+    with pytest.raises(ScenarioError, match="real_arm: unknown effect frction"):
+        load_scenario("mtml", ["real_arm=[frction]"])
+    text = (MODELS_FOLDER / "mechanisms" / "mtm.yaml").read_text()
+    arm_text = (MODELS_FOLDER / "arms" / "mtml.yaml").read_text().replace("mechanism: mtm", "mechanism: m.yaml")
+    (tmp_path / "a.yaml").write_text(arm_text)
+    for old, new, message in (
+        ("stops: true", "stopps: true", "stopps"),
+        ("outer_yaw: 1.861", "outer_jaw: 1.861", "effects.saturation: unknown actuator outer_jaw"),
+        ("outer_yaw: 1.861", "outer_yaw: -1.861", "effects.saturation.outer_yaw = -1.861 must be"),
+        ("measurement: 1", "measurement: -1", "effects.delay.measurement = -1"),
+        ("presliding, scale: 0.015", "stiction, scale: 0.015", 'effects.friction: kind "stiction"; allowed'),
+        ("scale: 0.015", "scale: 0.0", "has scale 0"),
+        ("coefficient: 0.0019", "coefficient: -0.0019", "has coefficient -0.0019"),
+    ):
+        assert old in text
+        (tmp_path / "m.yaml").write_text(text.replace(old, new))
+        load_arm.__globals__["_load_arm"].cache_clear()
+        with pytest.raises(ArmError, match=message):
+            load_arm(str(tmp_path / "a.yaml"))
+
+
+def test_a_coordinate_that_is_none_is_refused():
+    arm = load_arm("mtml")
+    nowhere = ArmEffects(friction=[FrictionEffect("actuator.elbow", "presliding", 0.01, 0.1)])
+    with pytest.raises(StationError, match=r'coordinate is "actuator\.elbow"; allowed: actuator\.outer_yaw'):
+        ArmStation(arm, effects=nowhere)
+    with pytest.raises(StationError, match="effects are of a simulation"):
+        ArmStation(arm, hardware=True, effects=arm.effects)
+
+
+def test_no_sdf_has_friction_tags():
+    """Drake drops them without a word: friction is stated in the YAML files."""
+    for path in (MODELS_FOLDER / "sdf").glob("*.sdf"):
+        assert not list(ElementTree.parse(path).iter("friction")), path
+    assert dataclasses.is_dataclass(ArmEffects)
