@@ -34,13 +34,16 @@ class ControllerScenario:
     """`mode` is "hold" or "gravity"; `model` the file of an identified model, or empty for what the SDF states.
 
     `gains` replaces the arm's own (kp, kd, ki: one number a joint). `friction_ratio` is the share of the friction that
-    the arm's files state which is compensated, 0..0.9; in mode "gravity" only.
+    the arm's files state which is compensated, 0..0.9; in mode "gravity" only. `parameter_error` makes the model wrong:
+    each of its base parameters is multiplied by a factor of its own from 1 - `parameter_error`..1 + `parameter_error`,
+    drawn by the scenario's seed.
     """
 
     mode: str = "hold"
     model: str = ""
     gains: Gains | None = None
     friction_ratio: float = 0.0
+    parameter_error: float = 0.0
 
 
 @dataclass
@@ -94,7 +97,7 @@ class Scenario:
         stretch: actuator -> cable of the simulated arm that stretches, beside those of `real_arm`.
         real_arm: parts of the arm's own `effects` that the simulation has, by name; ["all"] for all of them.
         effort_noise: standard deviation of recorded efforts, as a share of the effort limits.
-        seed: of all noise.
+        seed: of all noise, and of the controller's parameter error.
     """
 
     arm: str = ""
@@ -122,9 +125,13 @@ class Scenario:
     @cached_property
     def model(self) -> IdentifiedModel:
         """What the controller believes."""
-        if self.controller.model:
-            return IdentifiedModel.load(self.controller.model)
-        return IdentifiedModel.from_arm(self.mounted_arm)
+        file, error = self.controller.model, self.controller.parameter_error
+        model = IdentifiedModel.load(file) if file else IdentifiedModel.from_arm(self.mounted_arm)
+        if error == 0.0:
+            return model
+        # A stream of its own: the seed alone is the noise's.
+        generator = np.random.default_rng([self.seed, 1])
+        return model.with_scaled_parameters(generator.uniform(1 - error, 1 + error, len(model.base_parameters)))
 
     @property
     def all_effects(self) -> ArmEffects | None:
@@ -161,6 +168,7 @@ class Scenario:
         _check_number("sample_period", self.sample_period, LEAST_SAMPLE_PERIOD, LONGEST)
         _check_number("duration", self.duration, self.sample_period, LONGEST)
         _check_number("effort_noise", self.effort_noise, 0.0, 1.0)
+        _check_number("controller.parameter_error", self.controller.parameter_error, 0.0, 1.0)
         _check_number("seed", self.seed, 0, 2**63)
         try:
             arm.effects.only(self.real_arm)
@@ -168,7 +176,7 @@ class Scenario:
         except ArmError as error:
             raise ScenarioError(f"simulated arm: {error}") from error
         if self.start is not None:
-            _check_pose("start", self.start, arm)
+            check_pose("start", self.start, arm)
         self._check_targets("targets", self.targets, 0.0)
         self._check_targets("hand.path", self.hand.path, -1.0)
         self._check_hand()
@@ -187,7 +195,7 @@ class Scenario:
 
     def _check_targets(self, name: str, targets: list[Target], after: float) -> None:
         for i, target in enumerate(targets):
-            _check_pose(f"{name}[{i}].pose", target.pose, self.mounted_arm)
+            check_pose(f"{name}[{i}].pose", target.pose, self.mounted_arm)
             if not after < target.time <= self.duration:
                 earliest = "0 s or later" if after < 0 else f"after {after:g} s"
                 raise ScenarioError(
@@ -291,7 +299,12 @@ def _check_number(name: str, value: float, least: float, most: float) -> None:
         raise ScenarioError(f"{name} is {value:g}; allowed: {least:g}..{most:g}")
 
 
-def _check_pose(name: str, pose: list[float], arm: Arm) -> None:
+def check_pose(name: str, pose: list[float], arm: Arm) -> None:
+    """Refuses a pose that `arm` cannot take; `name` begins the message.
+
+    Raises:
+        ScenarioError: not n finite numbers, or outside the limits.
+    """
     n, q = arm.num_joints, np.array(pose, float)
     if len(q) != n:
         raise ScenarioError(
