@@ -71,7 +71,7 @@ def test_port_names_and_sizes(name):
     assert expected.inputs.items() <= inputs.items()
     assert expected.outputs.items() <= outputs.items()
     assert set(inputs) - set(expected.inputs) == {f"{name}.effort_disturbance"}
-    assert set(outputs) - set(expected.outputs) == {"plant_state", "body_poses", "query_object"}
+    assert set(outputs) - set(expected.outputs) == {f"{name}.state_true", "plant_state", "body_poses", "query_object"}
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
@@ -296,8 +296,8 @@ def test_collision_shapes_are_there_when_something_can_be_touched():
 
 
 def test_errors_say_what_to_do():
-    for of_a_simulation in ({"plant_arm": ARM}, {"closure": "ball"}, {"time_step": 2e-3}):
-        with pytest.raises(StationError, match="plant_arm and modify_plant are of a simulation"):
+    for of_a_simulation in ({"plant_arm": ARM}, {"closure": "ball"}, {"time_step": 2e-3}, {"effects": ARM.effects}):
+        with pytest.raises(StationError, match="modify_plant and effects are of a simulation"):
             ArmStation(ARM, hardware=True, **of_a_simulation)
     with pytest.raises(StationError, match="driver and lcm are of hardware"):
         ArmStation(ARM, driver=DvrkDriver())

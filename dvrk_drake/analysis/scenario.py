@@ -16,9 +16,10 @@ from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import ScenarioError
+from dvrk_drake.errors import ArmError, ScenarioError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.plant import Closure
 from dvrk_drake.systems.gravity_pid_controller import Mode
 
@@ -76,8 +77,9 @@ class Scenario:
         start: pose at the start, at rest; zero, or the nearest pose inside the limits, if left out.
         targets: where the arm shall be when; before, between and after them it is at rest at each. Mode "hold" only.
         effects: in the drive of the simulated arm; the controller does not know them.
+        real_arm: parts of the arm's own `effects` that the simulation has, by name; ["all"] for all of them.
         effort_noise: standard deviation of recorded efforts, as a share of the effort limits.
-        seed: of the noise.
+        seed: of all noise.
     """
 
     arm: str = ""
@@ -90,6 +92,7 @@ class Scenario:
     start: list[float] | None = None
     targets: list[Target] = field(default_factory=list)
     effects: list[TrueEffect] = field(default_factory=list)
+    real_arm: list[str] = field(default_factory=list)
     effort_noise: float = 0.0
     seed: int = 0
 
@@ -105,6 +108,15 @@ class Scenario:
         if self.controller.model:
             return IdentifiedModel.load(self.controller.model)
         return IdentifiedModel.from_arm(self.mounted_arm)
+
+    @property
+    def real_effects(self) -> ArmEffects | None:
+        """The effects that `real_arm` names.
+
+        Raises:
+            ArmError: a name that is no part.
+        """
+        return self.mounted_arm.effects.only(self.real_arm) if self.real_arm else None
 
     def knots(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Times (m,) and poses (m, n) that the arm shall rest at: the start, then the targets."""
@@ -130,6 +142,10 @@ class Scenario:
         _check_number("duration", self.duration, self.sample_period, LONGEST)
         _check_number("effort_noise", self.effort_noise, 0.0, 1.0)
         _check_number("seed", self.seed, 0, 2**63)
+        try:
+            arm.effects.only(self.real_arm)
+        except ArmError as error:
+            raise ScenarioError(f"real_arm: {error}") from error
         if self.start is not None:
             _check_pose("start", self.start, arm)
         before = 0.0

@@ -28,7 +28,8 @@ class Simulation:
     """What a scenario gave.
 
     Attributes:
-        recording: t, q, qd, tau (m, n): exact, but for the scenario's noise on tau.
+        recording: t, q, qd, tau (m, n) as the arm measures them: exact without `real_arm`, but for the scenario's noise
+            on tau.
         desired: (m, n) where the arm was wanted; None in "gravity" mode.
     """
 
@@ -62,7 +63,14 @@ def simulate(
     name = arm.name.lower()
     times, poses = scenario.knots()
     holds = scenario.controller.mode == "hold"
-    station = ArmStation(arm, closure=cast(Closure, scenario.closure), time_step=scenario.time_step, meshcat=meshcat)
+    station = ArmStation(
+        arm,
+        closure=cast(Closure, scenario.closure),
+        time_step=scenario.time_step,
+        meshcat=meshcat,
+        effects=scenario.real_effects,
+        seed=scenario.seed,
+    )
     controller = GravityPidController(
         scenario.model,
         period=scenario.time_step,

@@ -67,7 +67,7 @@ POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.of_po
 
 @numba.njit(cache=True)
 def effect_step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float, float]:
-    """The next state and the shape of the kind with this code."""
+    """The next state and the shape of the kind with this code, compiled; NaN for a kind of position alone."""
     if code == 1:
         return z, v
     if code == 2:

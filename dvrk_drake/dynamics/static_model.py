@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -54,13 +54,20 @@ class StaticModel:
 
 def symbolic_regressor(gravity: SymbolicGravity, effects: tuple[ActuatorEffect, ...]) -> sympy.Matrix:
     """The regressor (n, b + e) as sympy, with the number of |gravity| put in."""
-    columns = [sympy.Matrix(gravity.regressor).subs(GRAVITY, sympy.Float(gravity.gravity_magnitude))]
+    of_links = sympy.Matrix(gravity.regressor).subs(GRAVITY, sympy.Float(gravity.gravity_magnitude))
+    return sympy.Matrix.hstack(of_links, *_effect_columns(gravity.arm, gravity.q, effects))
+
+
+def _effect_columns(
+    arm: Arm, joint_positions: Sequence[sympy.Symbol], effects: Sequence[ActuatorEffect]
+) -> list[sympy.Matrix]:
+    columns = []
     for effect in effects:
-        row = [_number(r) for r in joint_row(gravity.arm, effect.coordinate).tolist()]
-        offset = effect_coordinates(gravity.arm)[effect.coordinate] @ gravity.arm.transmission.offset
-        x = sum((r * q for r, q in zip(row, gravity.q, strict=True)), _number(float(offset)))
+        row = [_number(r) for r in joint_row(arm, effect.coordinate).tolist()]
+        offset = effect_coordinates(arm)[effect.coordinate] @ arm.transmission.offset
+        x = sum((r * q for r, q in zip(row, joint_positions, strict=True)), _number(float(offset)))
         columns.append(sympy.Matrix(row) * effect.of_position(x))
-    return sympy.Matrix.hstack(*columns)
+    return columns
 
 
 def _number(x: float) -> sympy.Expr:
@@ -85,3 +92,18 @@ def compile_static_model(arm: Arm, effects: tuple[ActuatorEffect, ...] = ()) -> 
         codegen.compile_batch(regressor, 1, Y.shape),
         codegen.compile_batch(torque, 2, (Y.shape[0],)),
     )
+
+
+@cache
+def compile_effect_torque(arm: Arm, effects: tuple[ActuatorEffect, ...]) -> Callable[..., None]:
+    """Compiled f(q, coefficients, out), float64 C-contiguous (n,), (e,), (n,): what motors need to hold the effects.
+
+    They are of kinds in `POSITION_KINDS`; [rad, m], units of the kinds, [N m, N].
+    """
+    q = sympy.symbols(f"q1:{arm.num_joints + 1}", real=True)
+    coefficients = sympy.symbols(f"c0:{len(effects)}")
+    total = sympy.zeros(arm.num_joints, 1)
+    for coefficient, column in zip(coefficients, _effect_columns(arm, q, effects), strict=True):
+        total += coefficient * column
+    arguments = [("q", q), ("coefficients", coefficients)]
+    return codegen.compile_function("effect_torque", arguments, codegen.share_terms(sympy.Array(list(total))))

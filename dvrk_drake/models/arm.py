@@ -23,6 +23,7 @@ from dvrk_drake.models.arm_schema import (
     Mechanism,
     MotionSettings,
 )
+from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, compose_sdf, read_sdf_facts
 
@@ -55,6 +56,7 @@ class Arm:
         friction_coordinates: name -> (n,) coefficients of the joints: where parts rub beside joints and actuators.
         motion: how the signals of a recorded motion are treated, one value a joint.
         effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].
+        effects: what the real arm has beside all that; only a simulation that asks for them has them.
     """
 
     name: str
@@ -75,6 +77,7 @@ class Arm:
     friction_coordinates: dict[str, NDArray[np.float64]]
     motion: MotionSettings
     effort_cut_off: float
+    effects: ArmEffects
 
     @property
     def num_joints(self) -> int:
@@ -240,6 +243,7 @@ def _build_arm(
         },
         motion=motion,
         effort_cut_off=_checked_cut_off(path, mechanism),
+        effects=_checked_effects(path, mechanism.effects.joined(instrument.effects), joints),
     )
 
 
@@ -280,6 +284,14 @@ def _checked_cut_off(path: Path, mechanism: Mechanism) -> float:
             f"{path}: effort_cut_off = {mechanism.effort_cut_off:g} Hz of its mechanism; 0.1..1000 Hz is allowed"
         )
     return mechanism.effort_cut_off
+
+
+def _checked_effects(path: Path, effects: ArmEffects, joints: list[str]) -> ArmEffects:
+    try:
+        effects.check(joints)
+    except ArmError as error:
+        raise ArmError(f"{path}: effects.{error}") from error
+    return effects
 
 
 def _checked_gravity(gravity: Sequence[float]) -> NDArray[np.float64]:

@@ -5,6 +5,8 @@ No postponed annotations here: yaml_load_typed reads the types at run time.
 
 from dataclasses import dataclass, field
 
+from dvrk_drake.models.effects_schema import ArmEffects
+
 
 @dataclass
 class CoupledLimit:
@@ -51,7 +53,8 @@ class MotionSettings:
 class Mechanism:
     """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common.
 
-    `effort_cut_off` [Hz] is that of the low-pass behind which measured and modelled efforts are compared.
+    `effort_cut_off` [Hz] is that of the low-pass behind which measured and modelled efforts are compared. `effects` are
+    what a real arm has beside all that, for its simulation.
     """
 
     sdf: str = ""
@@ -62,6 +65,7 @@ class Mechanism:
     loop_closures: list[LoopClosure] = field(default_factory=list)
     motion: MotionSettings = field(default_factory=MotionSettings)
     effort_cut_off: float = 10.0
+    effects: ArmEffects = field(default_factory=ArmEffects)
 
 
 @dataclass
@@ -80,6 +84,7 @@ class Instrument:
     gains: Gains = field(default_factory=Gains)
     friction_coordinates: dict[str, dict[str, float]] = field(default_factory=dict)
     motion: MotionSettings = field(default_factory=MotionSettings)
+    effects: ArmEffects = field(default_factory=ArmEffects)
 
 
 @dataclass

@@ -10,14 +10,20 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.lcm import DrakeLcmInterface
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.primitives import MatrixGain, PassThrough, Saturation
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import Adder, MatrixGain, PassThrough, Saturation
 
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.plant import Closure, add_arm, set_arm_positions, tree_selector
+from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 from dvrk_drake.systems.lcm.arm_connection import connect_arm
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.real_arm.encoder import Encoder
+from dvrk_drake.systems.real_arm.motor_channel import add_motor_channel
+from dvrk_drake.systems.real_arm.plant_effects import PlantEffects
 from dvrk_drake.systems.station_ports import station_ports
 
 
@@ -35,6 +41,7 @@ class ArmStation(Diagram):
         - mtml.velocity_estimated
         - mtml.state_estimated
         - mtml.effort_measured
+        - mtml.state_true
         - plant_state
         - body_poses
         - query_object
@@ -47,13 +54,18 @@ class ArmStation(Diagram):
     - `effort_disturbance`: added behind the motors and not clamped: friction, cables, a hand. Unconnected:
       zero.
     - `effort_measured`: what the motors apply, the command after the clamp.
-    - `plant_state`, `body_poses`, `query_object`: the plant's own, of the whole tree. Simulation only, as is
-      `effort_disturbance`; all others are those of `station_ports`.
+    - `state_true` (2n): q, then v as they are, whatever `effects` make of what is measured.
+    - `plant_state`, `body_poses`, `query_object`: the plant's own, of the whole tree. Simulation only, as are
+      `state_true` and `effort_disturbance`; all others are those of `station_ports`.
 
-    All of it is C++ and has no state but the plant's. Measured values are exact and undelayed. Drake's solver
-    holds the linkage to about 1e-8 m at 1 ms with either `closure`, and each joint in its position limits; the
-    coupled limits of the linkage are not there. An arm's shapes never touch each other: they are collision shapes
-    only where `modify_plant` adds one that they can touch.
+    Without `effects` all of it is C++ and has no state but the plant's, and measured values are exact and undelayed.
+    `effects` are those of a real arm, see `ArmEffects`: friction, cables, stops, encoders, motors and delays as
+    `arm.effects` states them. With them (be they empty) a discrete controller beside the station sees the arm before
+    the step that its command is for: the command is a period late, as on hardware.
+
+    Drake's solver holds the linkage to about 1e-8 m at 1 ms with either `closure`, and each joint in its position
+    limits; the coupled limits of the linkage are there with the effect `stops`. An arm's shapes never touch each other:
+    they are collision shapes only where `modify_plant` adds one that they can touch.
 
     **On hardware** the ports of `station_ports` are all there are. Measured values are those of the last DVRK_STATUS
     message, NaN before the first. Efforts go out in DVRK_COMMAND messages every `driver.status_period` and on forced
@@ -70,6 +82,8 @@ class ArmStation(Diagram):
         closure: Closure = "mimic",
         plant_arm: Arm | None = None,
         modify_plant: Callable[[MultibodyPlant], None] | None = None,
+        effects: ArmEffects | None = None,
+        seed: int = 0,
         driver: DvrkDriver | None = None,
         lcm: DrakeLcmInterface | None = None,
     ) -> None:
@@ -88,6 +102,9 @@ class ArmStation(Diagram):
             other effort limits.
                 Drake can change the inertia of links that are already there only in a Context:
                 `set_link_inertias`.
+            effects: of the real arm that the simulation shall have, e.g. `arm.effects` or
+            `arm.effects.only(["friction"])`; none by default.
+            seed: of the effects' noise.
             driver: how the hardware is driven; `DvrkDriver()` by default.
             lcm: whose `HandleSubscriptions` somebody else calls, for loops that are driven by messages; by default one
                 at `driver.lcm_url` that a Simulator of this station handles.
@@ -100,17 +117,20 @@ class ArmStation(Diagram):
         self._arm = arm
         self._true_arm = plant_arm or arm
         self._plant: MultibodyPlant | None = None
+        self._encoder: Encoder | None = None
         builder = DiagramBuilder()
         if hardware:
-            if (time_step, meshcat, closure, plant_arm, modify_plant) != (1e-3, None, "mimic", None, None):
+            of_a_simulation = (time_step, meshcat, closure, plant_arm, modify_plant, effects)
+            if of_a_simulation != (1e-3, None, "mimic", None, None, None):
                 raise StationError(
-                    "time_step, meshcat, closure, plant_arm and modify_plant are of a simulation: use hardware=False"
+                    "time_step, meshcat, closure, plant_arm, modify_plant and effects are of a simulation: "
+                    "use hardware=False"
                 )
             self._connect_hardware(builder, driver or DvrkDriver(), lcm)
         else:
             if driver is not None or lcm is not None:
                 raise StationError("driver and lcm are of hardware; apply_driver_config puts a simulation behind LCM")
-            self._simulate(builder, time_step, meshcat, closure, modify_plant)
+            self._simulate(builder, time_step, meshcat, closure, modify_plant, effects, seed)
         builder.BuildInto(self)
         self.set_name(f"{arm.name.lower()}_station")
 
@@ -128,6 +148,8 @@ class ArmStation(Diagram):
         meshcat: Meshcat | None,
         closure: Closure,
         modify_plant: Callable[[MultibodyPlant], None] | None,
+        effects: ArmEffects | None,
+        seed: int,
     ) -> None:
         arm, true_arm = self._arm, self._true_arm
         if not 0 < time_step <= 0.01:
@@ -143,15 +165,21 @@ class ArmStation(Diagram):
         self._instance = add_arm(self.plant, true_arm, closure)
         if modify_plant is not None:
             modify_plant(self.plant)
+        if effects is not None:
+            # Otherwise Drake steps the plant before all discrete updates, and what they measure is from after the step.
+            self.plant.SetUseSampledOutputPorts(False)
+        effects = effects or ArmEffects()
+        self._plant_effects = PlantEffects(self.plant, true_arm, self._instance, effects)
         self.plant.Finalize()
+        self._plant_effects.connect(builder)
         self._drop_idle_shapes()
         self._set_default_pose()
         if meshcat is not None:
             # The visualizer deletes its prefix when it starts: one level down, so that a SetTransform stays.
             parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
             MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
-        self._export_inputs(builder)
-        self._export_outputs(builder)
+        state_true = self._export_outputs(builder, effects)
+        self._export_inputs(builder, effects, seed, state_true)
 
     @property
     def arm(self) -> Arm:
@@ -184,11 +212,18 @@ class ArmStation(Diagram):
             raise StationError(f"a pose of {self._arm.name} is {self._arm.num_joints} finite numbers; got {q.tolist()}")
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
         set_arm_positions(self.plant, plant_context, self._true_arm, q)
+        q_plant = self.plant.GetPositions(plant_context)
+        self._plant_effects.drive.set_positions(q_plant, q)
+        self.plant.SetPositions(plant_context, q_plant)
+        if self._encoder is not None:
+            self._encoder.set_at_rest(self.GetMutableSubsystemContext(self._encoder, context), q)
         self.plant.SetVelocities(plant_context, np.zeros(self.plant.num_velocities()))
 
     def get_positions(self, context: Context) -> NDArray[np.float64]:
         """Pose (n,) of the independent joints in this station's context."""
-        return self.GetOutputPort(f"{self._arm.name.lower()}.position_measured").Eval(context)
+        plant_context = self.GetSubsystemContext(self.plant, context)
+        q: NDArray[np.float64] = self.plant.GetPositions(plant_context)[self._independent()]
+        return q
 
     def set_link_inertias(self, context: Context, inertias: Mapping[str, SpatialInertia]) -> None:
         """Gives links another inertia in this station's context: an arm that differs from its model.
@@ -223,14 +258,18 @@ class ArmStation(Diagram):
             for shape in plant.GetCollisionGeometriesForBody(body):
                 self._scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
+    def _home(self) -> NDArray[np.float64]:
+        return np.clip(0.0, self._true_arm.position_lower, self._true_arm.position_upper)
+
     def _set_default_pose(self) -> None:
-        home = np.clip(0.0, self._true_arm.position_lower, self._true_arm.position_upper)
+        home = self._home()
         q_plant = self.plant.GetDefaultPositions()
         tree = tree_selector(self.plant, self._true_arm, self._instance)
         q_plant[tree] = self._true_arm.linkage.position(home)
+        self._plant_effects.drive.set_positions(q_plant, home)
         self.plant.SetDefaultPositions(q_plant)
 
-    def _export_inputs(self, builder: DiagramBuilder) -> None:
+    def _export_inputs(self, builder: DiagramBuilder, effects: ArmEffects, seed: int, state_true: OutputPort) -> None:
         plant, name, n = self.plant, self._arm.name.lower(), self._arm.num_joints
         # The plant clamps as well, but silently: clamp here, at the plant's limits, to know what is applied.
         actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(self._instance)]
@@ -249,32 +288,56 @@ class ArmStation(Diagram):
         clamp = builder.AddNamedSystem("effort_clamp", Saturation(min_value=-limits, max_value=limits))
         to_actuators = builder.AddNamedSystem("to_actuators", MatrixGain(D=B))
         builder.Connect(commanded.get_output_port(), clamp.get_input_port())
-        builder.Connect(clamp.get_output_port(), to_actuators.get_input_port())
+        applied, measured = add_motor_channel(
+            builder, self._arm, effects, clamp.get_output_port(), plant.time_step(), seed
+        )
+        builder.Connect(applied, to_actuators.get_input_port())
         builder.Connect(to_actuators.get_output_port(), plant.get_actuation_input_port(self._instance))
         builder.ExportInput(commanded.get_input_port(), f"{name}.effort_commanded")
-        builder.ExportOutput(clamp.get_output_port(), f"{name}.effort_measured")
+        builder.ExportOutput(measured, f"{name}.effort_measured")
 
         disturbance = builder.AddNamedSystem("effort_disturbance", PassThrough(n))
         to_tree = builder.AddNamedSystem("to_tree", MatrixGain(D=self._tree_selection()))
-        builder.Connect(disturbance.get_output_port(), to_tree.get_input_port())
+        behind_motors = disturbance.get_output_port()
+        if effects.cables or effects.springs:
+            laws = [*effects.cables, *effects.springs]
+            kinds = [ActuatorEffect(law.coordinate, law.kind, law.scale) for law in laws]
+            torque = JointEffectTorque(self._true_arm, kinds, [law.coefficient for law in laws])
+            builder.AddNamedSystem("position_torque", torque)
+            builder.Connect(state_true, torque.get_input_port())
+            total = builder.AddNamedSystem("behind_motors", Adder(2, n))
+            builder.Connect(behind_motors, total.get_input_port(0))
+            builder.Connect(torque.get_output_port(), total.get_input_port(1))
+            behind_motors = total.get_output_port()
+        builder.Connect(behind_motors, to_tree.get_input_port())
         builder.Connect(to_tree.get_output_port(), plant.get_applied_generalized_force_input_port())
         builder.ExportInput(disturbance.get_input_port(), f"{name}.effort_disturbance")
 
-    def _export_outputs(self, builder: DiagramBuilder) -> None:
-        plant, name = self.plant, self._arm.name.lower()
+    def _export_outputs(self, builder: DiagramBuilder, effects: ArmEffects) -> OutputPort:
+        """Returns the port of the independent joints' true state."""
+        plant, name, n = self.plant, self._arm.name.lower(), self._arm.num_joints
         S = self._tree_selection().T
         zero = np.zeros_like(S)
-        for port, D in {
-            "position_measured": np.hstack([S, zero]),
-            "velocity_estimated": np.hstack([zero, S]),
-            "state_estimated": np.block([[S, zero], [zero, S]]),
-        }.items():
+        true = builder.AddNamedSystem("state_true", MatrixGain(D=np.block([[S, zero], [zero, S]])))
+        builder.Connect(plant.get_state_output_port(), true.get_input_port())
+        state_true = state = true.get_output_port()
+        builder.ExportOutput(state_true, f"{name}.state_true")
+        if effects.encoder is not None or effects.delay is not None:
+            delay = effects.delay.measurement if effects.delay else 0
+            self._encoder = Encoder(self._arm, effects.encoder, delay, plant.time_step(), self._home())
+            builder.AddNamedSystem("encoder", self._encoder)
+            builder.Connect(state, self._encoder.get_input_port())
+            state = self._encoder.get_output_port()
+        builder.ExportOutput(state, f"{name}.state_estimated")
+        halves = np.split(np.eye(2 * n), 2)
+        for port, D in zip(("position_measured", "velocity_estimated"), halves, strict=True):
             select = builder.AddNamedSystem(port, MatrixGain(D=D))
-            builder.Connect(plant.get_state_output_port(), select.get_input_port())
+            builder.Connect(state, select.get_input_port())
             builder.ExportOutput(select.get_output_port(), f"{name}.{port}")
         builder.ExportOutput(plant.get_state_output_port(), "plant_state")
         builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
         builder.ExportOutput(self._scene_graph.get_query_output_port(), "query_object")
+        return state_true
 
     def _tree_selection(self) -> NDArray[np.float64]:
         """(nv, n): efforts on the independent joints to efforts on the plant; its transpose picks their

@@ -36,5 +36,5 @@ def add_closed_loop(
         builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
     if effects is not None:
         builder.AddSystem(effects)
-        builder.Connect(state, effects.get_input_port())
+        builder.Connect(station.GetOutputPort(f"{name}.state_true"), effects.get_input_port())
         builder.Connect(effects.get_output_port(), station.GetInputPort(f"{name}.effort_disturbance"))

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
-from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.dynamics.static_model import compile_effect_torque
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.systems.gravity_pid_step import entry_point
 
 
 class JointEffectTorque(LeafSystem):
@@ -47,22 +48,23 @@ class JointEffectTorque(LeafSystem):
             if fault := effect_fault(arm, effect, POSITION_KINDS):
                 raise StationError(f"effects[{i}]: {fault}")
         n = arm.num_joints
-        model = compile_static_model(arm, tuple(effects))
-        gravity_free = np.zeros(model.num_parameters)
-        gravity_free[model.num_parameters - len(effects) :] = -coefficients
-        self._theta = gravity_free
-        self._torque_into = model.torque_into
-        self._num_joints = n
+        self._coefficients = -coefficients
+        self._dispatcher = compile_effect_torque(arm, tuple(effects))  # owns the compiled code
         self.DeclareVectorInputPort(name="state_estimated", size=2 * n)
         self.DeclareVectorOutputPort(
             name="effort_disturbance",
             size=n,
-            calc=self._calc_effort,
-            prerequisites_of_calc={self.input_port_ticket(self.get_input_port(0).get_index())},
+            calc=self._make_calc(n),
+            prerequisites_of_calc={self.all_input_ports_ticket()},
         )
 
-    def _calc_effort(self, context: Context, output: BasicVector) -> None:
-        q = np.array(self.EvalVectorInput(context, 0).get_value()[: self._num_joints])
-        effort = np.empty(self._num_joints)
-        self._torque_into(q, self._theta, effort)
-        output.SetFromVector(effort)
+    def _make_calc(self, n: int) -> Callable[[Context, BasicVector], None]:
+        """The handler of the port, with all that it needs at hand: see GravityPidController."""
+        eval_vector_input, torque_into = self.EvalVectorInput, entry_point(self._dispatcher)
+        coefficients, q = self._coefficients, np.empty(n)
+
+        def calc(context: Context, output: BasicVector) -> None:
+            q[:] = eval_vector_input(context, 0).get_value()[:n]
+            torque_into(q, coefficients, output.get_mutable_value())
+
+        return calc

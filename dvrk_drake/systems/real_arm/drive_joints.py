@@ -1,0 +1,150 @@
+"""Coordinates of an arm's drive as joints of its plant, so that Drake's solver can have friction and stops there."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    Joint,
+    ModelInstanceIndex,
+    RevoluteJoint,
+    RigidBody,
+    RotationalInertia,
+    SpatialInertia,
+)
+
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
+
+#: Of each body that is added: its inertia, as a share of what the arm shows at the coordinate, and its mass [kg]. Drake
+#: makes a tie as stiff as the lighter of its bodies allows at the time step: so an MTM's parallelogram gives 1 mrad for
+#: 3 N m.
+SHARE, MASS = 2e-3, 1e-6
+#: Where bodies that turn together are tied, from their axis [m].
+RADIUS = 0.1
+
+
+class DriveJoints:
+    """Finds or makes, before a plant is finalized, the joint of a coordinate x = row q of an arm's joints.
+
+    If x is one joint's position times a number, that joint is it. A sum has none: a body is added that turns by x, on a
+    joint of its own. It is tied to a link that turns by x about the same axis where the arm has one (the crank of an
+    MTM's parallelogram, against the yaw link); else to the last of a chain of bodies on the world, each of which turns
+    against the one before by one joint's share.
+    """
+
+    def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex) -> None:
+        """Of the `arm` that `add_arm` added to `plant` as `instance`."""
+        self._plant, self._arm, self._instance = plant, arm, instance
+        self._added: list[tuple[Joint, NDArray[np.float64]]] = []
+
+    def joint(self, row: NDArray[np.float64]) -> tuple[Joint, float]:
+        """The joint of x = row q, row (n,), and the number by which its position must be multiplied to be x."""
+        terms = np.flatnonzero(np.abs(row) > 1e-12)
+        if len(terms) == 1:
+            (i,) = terms
+            return self._plant.GetJointByName(self._arm.joint_names[i], self._instance), float(row[i])
+        for joint, known in self._added:
+            if np.allclose(known, row, atol=1e-12):
+                return joint, 1.0
+        joint = self._coaxial(row) or self._chain(row)
+        self._added.append((joint, row))
+        return joint, 1.0
+
+    def set_positions(self, q_plant: NDArray[np.float64], q: ArrayLike) -> None:
+        """Writes the positions that joints which were added have at the pose q (n,) into q_plant."""
+        q = np.asarray(q, float)
+        for i, (joint, row) in enumerate(self._added):
+            q_plant[joint.position_start()] = row @ q
+            for k in np.flatnonzero(row):
+                name = _chain_name(i, self._arm.joint_names[k])
+                if self._plant.HasJointNamed(name, self._instance):
+                    q_plant[self._plant.GetJointByName(name, self._instance).position_start()] = row[k] * q[k]
+
+    def _coaxial(self, row: NDArray[np.float64]) -> Joint | None:
+        """A new joint beside a path of coaxial joints whose angles add up to `row` q, if the arm has one."""
+        plant, names = self._plant, self._arm.tree_joint_names
+        above = {plant.GetJointByName(name, self._instance).child_body().index(): name for name in names}
+        for name in names:
+            last = joint = plant.GetJointByName(name, self._instance)
+            total, along = np.zeros_like(row), np.zeros(3)
+            while isinstance(joint, RevoluteJoint):
+                sign = float(joint.revolute_axis() @ last.revolute_axis())
+                if abs(abs(sign) - 1.0) > 1e-12:
+                    break
+                total = total + sign * self._arm.linkage.matrix[names.index(joint.name())]
+                if joint is not last and np.allclose(total, row, atol=1e-12):
+                    origin = _offset(joint.frame_on_parent()) + along
+                    return self._beside(row, joint.parent_body(), origin, last)
+                parent = joint.parent_body()
+                if parent.index() not in above:
+                    break
+                upper = plant.GetJointByName(above[parent.index()], self._instance)
+                step = _offset(joint.frame_on_parent()) - _offset(upper.frame_on_child())
+                if np.linalg.norm(np.cross(step, last.revolute_axis())) > 1e-9:
+                    break
+                along, joint = along + step, upper
+        return None
+
+    def _beside(
+        self, row: NDArray[np.float64], parent: RigidBody, p_PR: NDArray[np.float64], last: RevoluteJoint
+    ) -> Joint:
+        """A joint from `parent` about the axis of `last` at p_PR, whose body turns with the child of `last`."""
+        plant, name = self._plant, f"drive_{len(self._added)}"
+        body = self._body(name, row)
+        frame = plant.AddFrame(FixedOffsetFrame(f"{name}_base", parent, RigidTransform(p_PR)))
+        joint = plant.AddJoint(RevoluteJoint(name, frame, body.body_frame(), last.revolute_axis()))
+        self._tie(last.child_body(), _offset(last.frame_on_child()), body, last.revolute_axis())
+        return joint
+
+    def _chain(self, row: NDArray[np.float64]) -> Joint:
+        plant, i = self._plant, len(self._added)
+        axis, end = np.array([0.0, 0.0, 1.0]), plant.world_body()
+        for k in np.flatnonzero(row):
+            leader = self._arm.joint_names[k]
+            body = self._body(_chain_name(i, leader), row)
+            link = RevoluteJoint(_chain_name(i, leader), end.body_frame(), body.body_frame(), axis)
+            follower = plant.AddJoint(link)
+            plant.AddCouplerConstraint(follower, plant.GetJointByName(leader, self._instance), float(row[k]))
+            end = body
+        body = self._body(f"drive_{i}", row)
+        joint = plant.AddJoint(RevoluteJoint(f"drive_{i}", plant.world_frame(), body.body_frame(), axis))
+        self._tie(end, np.zeros(3), body, axis)
+        return joint
+
+    def _tie(self, A: RigidBody, p_AAxis: NDArray[np.float64], B: RigidBody, axis: NDArray[np.float64]) -> None:
+        """Lets B turn with A about an axis that they share: a rod between points a quarter of a turn apart."""
+        e = np.eye(3)[np.argmin(np.abs(axis))]
+        f = np.cross(axis, e)
+        self._plant.AddDistanceConstraint(A, p_AAxis + RADIUS * e, B, RADIUS * f, float(np.sqrt(2.0)) * RADIUS)
+
+    def _body(self, name: str, row: NDArray[np.float64]) -> RigidBody:
+        about_axis = SHARE / float(row @ np.linalg.solve(_mass_matrix(self._arm), row))
+        M_BBo_B = SpatialInertia.MakeFromCentralInertia(MASS, np.zeros(3), RotationalInertia(*np.full(3, about_axis)))
+        return self._plant.AddRigidBody(name, self._instance, M_BBo_B)
+
+
+@cache
+def _mass_matrix(arm: Arm) -> NDArray[np.float64]:
+    """(n, n) of the joints, in the middle of their ranges."""
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    set_arm_positions(plant, context, arm, 0.5 * (arm.position_lower + arm.position_upper))
+    tree = tree_selector(plant, arm)
+    M: NDArray[np.float64] = plant.CalcMassMatrix(context)[np.ix_(tree, tree)]
+    G = arm.linkage.matrix
+    return G.T @ M @ G
+
+
+def _chain_name(i: int, leader: str) -> str:
+    return f"drive_{i}_{leader}"
+
+
+def _offset(frame: FixedOffsetFrame) -> NDArray[np.float64]:
+    p: NDArray[np.float64] = frame.GetFixedPoseInBodyFrame().translation()
+    return p
