@@ -31,12 +31,15 @@ LONGEST, LEAST_SAMPLE_PERIOD = 3600.0, 1e-3
 class ControllerScenario:
     """`mode` is "hold" or "gravity"; `model` the file of an identified model, or empty for what the SDF states.
 
-    `gains` replaces the arm's own (kp, kd, ki: one number a joint).
+    `gains` replaces the arm's own (kp, kd, ki: one number a joint). `parameter_error` makes the model wrong: each of
+    its base parameters is multiplied by a factor of its own from 1 - `parameter_error`..1 + `parameter_error`, drawn by
+    the scenario's seed.
     """
 
     mode: str = "hold"
     model: str = ""
     gains: Gains | None = None
+    parameter_error: float = 0.0
 
 
 @dataclass
@@ -79,7 +82,7 @@ class Scenario:
         effects: in the drive of the simulated arm; the controller does not know them.
         real_arm: parts of the arm's own `effects` that the simulation has, by name; ["all"] for all of them.
         effort_noise: standard deviation of recorded efforts, as a share of the effort limits.
-        seed: of all noise.
+        seed: of all noise, and of the controller's parameter error.
     """
 
     arm: str = ""
@@ -105,9 +108,13 @@ class Scenario:
     @cached_property
     def model(self) -> IdentifiedModel:
         """What the controller believes."""
-        if self.controller.model:
-            return IdentifiedModel.load(self.controller.model)
-        return IdentifiedModel.from_arm(self.mounted_arm)
+        file, error = self.controller.model, self.controller.parameter_error
+        model = IdentifiedModel.load(file) if file else IdentifiedModel.from_arm(self.mounted_arm)
+        if error == 0.0:
+            return model
+        # A stream of its own: the seed alone is the noise's.
+        generator = np.random.default_rng([self.seed, 1])
+        return model.with_scaled_parameters(generator.uniform(1 - error, 1 + error, len(model.base_parameters)))
 
     @property
     def real_effects(self) -> ArmEffects | None:
@@ -141,16 +148,17 @@ class Scenario:
         _check_number("sample_period", self.sample_period, LEAST_SAMPLE_PERIOD, LONGEST)
         _check_number("duration", self.duration, self.sample_period, LONGEST)
         _check_number("effort_noise", self.effort_noise, 0.0, 1.0)
+        _check_number("controller.parameter_error", self.controller.parameter_error, 0.0, 1.0)
         _check_number("seed", self.seed, 0, 2**63)
         try:
             arm.effects.only(self.real_arm)
         except ArmError as error:
             raise ScenarioError(f"real_arm: {error}") from error
         if self.start is not None:
-            _check_pose("start", self.start, arm)
+            check_pose("start", self.start, arm)
         before = 0.0
         for i, target in enumerate(self.targets):
-            _check_pose(f"targets[{i}].pose", target.pose, arm)
+            check_pose(f"targets[{i}].pose", target.pose, arm)
             if not before < target.time <= self.duration:
                 raise ScenarioError(
                     f"targets[{i}].time = {target.time:g} s must be after {before:g} s and at most the duration, "
@@ -245,7 +253,12 @@ def _check_number(name: str, value: float, least: float, most: float) -> None:
         raise ScenarioError(f"{name} is {value:g}; allowed: {least:g}..{most:g}")
 
 
-def _check_pose(name: str, pose: list[float], arm: Arm) -> None:
+def check_pose(name: str, pose: list[float], arm: Arm) -> None:
+    """Refuses a pose that `arm` cannot take; `name` begins the message.
+
+    Raises:
+        ScenarioError: not n finite numbers, or outside the limits.
+    """
     n, q = arm.num_joints, np.array(pose, float)
     if len(q) != n:
         raise ScenarioError(
