@@ -24,6 +24,7 @@ from dvrk_drake.cli import (
     record,
     simulate,
     study,
+    tune,
 )
 from dvrk_drake.cli.support import import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
@@ -58,6 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("dvrk-drake"))
     verbs = parser.add_subparsers(required=True, metavar="VERB")
-    for module in (model, check, identify, recalibrate, payload, export, simulate, study, demo, lcm, record, collect):
+    offline = (model, check, identify, recalibrate, payload, export, simulate, study, tune, demo)
+    for module in (*offline, lcm, record, collect):
         module.add_verbs(verbs)
     return parser

@@ -13,7 +13,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.analysis.tuning.settings import known_model
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect
@@ -32,7 +32,7 @@ class Condition:
     Attributes:
         name: of the condition, in tables.
         gravity: the true gravity torque over the modelled one.
-        inertia: the true mass matrix over the modelled one; the gravity torque is not touched.
+        inertia: every true mass and inertia over the modelled one; the controller is told how much heavier the arm is.
         ticks: time steps of delay beyond the arm's own.
     """
 
@@ -65,7 +65,7 @@ class Response:
 
 
 class Bench:
-    """An arm with all of its `effects` under GravityPidController, whose model is what the arm's SDF states."""
+    """An arm with all of its `effects` under GravityPidController, which knows what an identification would find."""
 
     def __init__(self, arm: Arm, condition: Condition = NOMINAL) -> None:
         """Builds the loop; the first one of an arm in a process compiles its controller, which takes seconds."""
@@ -78,7 +78,7 @@ class Bench:
             effects=_later(arm.effects, condition.ticks),
             modify_plant=lambda plant: _scale_rotors(plant, condition.inertia),
         )
-        model = IdentifiedModel.from_arm(arm)
+        model = known_model(arm)
         model = model.with_scaled_parameters(np.full(len(model.base_parameters), believed))
         self._controller = GravityPidController(model, period=PERIOD)
         builder = DiagramBuilder()

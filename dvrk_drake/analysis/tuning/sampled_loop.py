@@ -76,8 +76,8 @@ class SampledLoop:
         self._plant = cont2discrete((A, np.vstack([zero, M_inverse]), np.eye(2 * n), 0), sampling.period)[:2]
 
     def closed_loop(self, gains: Gains) -> NDArray[np.float64]:
-        """A with x[k+1] = A x[k]; x is `at_rest` (2n + 2n + 2n ticks + n): q, v; the last reading and velocity estimate;
-        the measurements under way, oldest first; the integral as an effort."""
+        """A with x[k+1] = A x[k]. x (n (5 + 2 ticks),) is q, v; the last reading and velocity estimate; the
+        measurements under way, oldest first; the integral as an effort: see `at_rest`."""
         size = self._n * (5 + 2 * self._sampling.ticks)
         return np.column_stack([self._advance(x, gains) for x in np.eye(size)])
 
@@ -100,7 +100,7 @@ class SampledLoop:
         return np.concatenate([A @ plant + B @ effort, measured, queue[2 * n :], integral])
 
     def poles(self, gains: Gains) -> NDArray[np.complex128]:
-        """Of the closed loop, in s [rad/s]: log(z) / period, the slowest to decay first. Delays are at minus infinity."""
+        """Of the closed loop, in s [rad/s]: log(z) / period, the slowest to decay first; of a delay -infinity."""
         z = np.linalg.eigvals(self.closed_loop(gains)).astype(complex)
         with np.errstate(divide="ignore"):
             s = np.log(z) / self._sampling.period
@@ -134,20 +134,23 @@ class SampledLoop:
         return Margins(float(margins[least]), float(w[crossings[least]]), float(min(amplify, default=np.inf)))
 
 
-def place(inertia: float, frequency: float, damping_ratio: float, sampling: Sampling) -> tuple[float, float]:
-    """kp and kd with which one joint without friction has this natural frequency and damping, delay included.
+def place(
+    inertia: float, frequency: float, damping_ratio: float, sampling: Sampling, viscous: float = 0.0
+) -> tuple[float, float]:
+    """kp and kd with which one joint has this natural frequency and damping, delay included.
 
     To second order in s a lag T of position takes Kp T of the damping and a lag T_v of velocity takes Kd T_v of the
-    inertia: (M - Kd T_v + Kp T^2 / 2) s^2 + (Kd - Kp T) s + Kp = 0. That is m (s^2 + 2 z w s + w^2) if
-    m (1 + (2 z w + w^2 T) T_v - w^2 T^2 / 2) = M, Kp = m w^2, Kd = 2 z w m + Kp T.
+    inertia: (M - Kd T_v + Kp T^2 / 2) s^2 + (b + Kd - Kp T) s + Kp = 0. That is m (s^2 + 2 z w s + w^2) if
+    m (1 + (2 z w + w^2 T) T_v - w^2 T^2 / 2) = M + b T_v, Kp = m w^2, Kd = 2 z w m + Kp T - b; kd is never negative.
 
     Args:
         inertia: M [kg m^2; kg].
         frequency: w [rad/s]; far below the inverse of the lags, or the gains place it only roughly.
         damping_ratio: z.
         sampling: gives the lags.
+        viscous: friction b of the joint [N m s/rad; N s/m].
     """
     w, z, T, T_v = frequency, damping_ratio, sampling.position_lag, sampling.velocity_lag
-    m = inertia / (1.0 + (2.0 * z * w + w**2 * T) * T_v - 0.5 * (w * T) ** 2)
+    m = (inertia + viscous * T_v) / (1.0 + (2.0 * z * w + w**2 * T) * T_v - 0.5 * (w * T) ** 2)
     kp = m * w**2
-    return kp, 2.0 * z * w * m + kp * T
+    return kp, max(2.0 * z * w * m + kp * T - viscous, 0.0)
