@@ -74,9 +74,9 @@ def print_comparison(console: Console, comparison: Comparison) -> None:
     arm, poses = comparison.arm, len(comparison.poses)
     console.print(
         f"All joints of {arm.name} step at once, from {poses} poses. Settling time [s]: afterwards the joint stays\n"
-        f"inside its band, 2 % of the step or a count of its encoder; the slowest pose; n/{poses}: from n poses it has\n"
-        f"not settled in {DURATION - REST:g} s. Overshoot, error left, unrest (peak to peak of the effort at rest, over\n"
-        "its limit): the worst pose, arm as modelled.\n"
+        f"inside its band, 2 % of the step or a count of its encoder; the slowest pose; n/{poses}: from n poses it\n"
+        f"has not settled in {DURATION - REST:g} s. Overshoot, error left, unrest (peak to peak of effort at rest,\n"
+        "over its limit): the worst pose, arm as modelled.\n"
     )
     for j, joint in enumerate(arm.joint_names):
         unit, size = ("mm", step_size(arm)[j]) if arm.prismatic[j] else ("mrad", step_size(arm)[j])
