@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
+from dvrk_drake.dynamics.arm_frame import ArmFrame
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, ScenarioError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
-from dvrk_drake.models.effects_schema import ArmEffects
+from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.gains_file import load_gains
 from dvrk_drake.models.plant import Closure
 from dvrk_drake.systems.gravity_pid_controller import Mode
+from dvrk_drake.systems.hand import Grip
 
 #: Longest simulation [s] and finest recording that are taken for meant.
 LONGEST, LEAST_SAMPLE_PERIOD = 3600.0, 1e-3
@@ -35,12 +37,15 @@ class ControllerScenario:
     `gains` replaces the arm's own (kp, kd, ki: one number a joint; in a file also the name of a file of gains).
     `parameter_error` makes the model wrong: each of its base parameters is multiplied by a factor of its own from
     1 - `parameter_error`..1 + `parameter_error`, drawn by the scenario's seed.
+    `friction_ratio` is the share of the friction that the arm's files state which is compensated, 0..0.9; in mode
+    "gravity" only.
     """
 
     mode: str = "hold"
     model: str = ""
     gains: Gains | None = None
     parameter_error: float = 0.0
+    friction_ratio: float = 0.0
 
 
 @dataclass
@@ -52,18 +57,27 @@ class Target:
 
 
 @dataclass
-class TrueEffect:
-    """An effect in the simulated arm's drive, see dvrk_drake.dynamics.actuator_effects; coefficient in its unit."""
+class HandScenario:
+    """A person who takes the arm at `frame` and pulls it about, as firmly as the numbers say: see `systems.hand`.
 
-    coordinate: str = ""
-    kind: str = ""
-    scale: float = 0.0
-    coefficient: float = 0.0
+    The hand goes where the frame is while the joints pass the poses of `path` at their times; it holds on from the
+    first to the last. Empty: nobody touches the arm. `frame` is one of the arm's SDF: an MTM's handle is dh_7, a PSM's
+    instrument dh_6.
+    """
+
+    path: list[Target] = field(default_factory=list)
+    frame: str = "dh_7"
+    stiffness: float = Grip.stiffness
+    damping: float = Grip.damping
+    rotational_stiffness: float = Grip.rotational_stiffness
+    rotational_damping: float = Grip.rotational_damping
+    max_force: float = Grip.max_force
+    max_torque: float = Grip.max_torque
 
     @property
-    def effect(self) -> ActuatorEffect:
-        """What it is the coefficient of."""
-        return ActuatorEffect(self.coordinate, self.kind, self.scale)
+    def grip(self) -> Grip:
+        """How firmly it holds."""
+        return Grip(**{f.name: getattr(self, f.name) for f in dataclasses.fields(Grip)})
 
 
 @dataclass
@@ -80,7 +94,8 @@ class Scenario:
         controller: what drives the arm.
         start: pose at the start, at rest; zero, or the nearest pose inside the limits, if left out.
         targets: where the arm shall be when; before, between and after them it is at rest at each. Mode "hold" only.
-        effects: in the drive of the simulated arm; the controller does not know them.
+        hand: a person who moves the arm.
+        effects: more of them in the drive of the simulated arm, of position alone; the controller does not know them.
         real_arm: parts of the arm's own `effects` that the simulation has, by name; ["all"] for all of them.
         effort_noise: standard deviation of recorded efforts, as a share of the effort limits.
         seed: of all noise, and of the controller's parameter error.
@@ -95,7 +110,8 @@ class Scenario:
     controller: ControllerScenario = field(default_factory=ControllerScenario)
     start: list[float] | None = None
     targets: list[Target] = field(default_factory=list)
-    effects: list[TrueEffect] = field(default_factory=list)
+    hand: HandScenario = field(default_factory=HandScenario)
+    effects: list[DriveEffect] = field(default_factory=list)
     real_arm: list[str] = field(default_factory=list)
     effort_noise: float = 0.0
     seed: int = 0
@@ -118,13 +134,15 @@ class Scenario:
         return model.with_scaled_parameters(generator.uniform(1 - error, 1 + error, len(model.base_parameters)))
 
     @property
-    def real_effects(self) -> ArmEffects | None:
-        """The effects that `real_arm` names.
+    def all_effects(self) -> ArmEffects | None:
+        """What the simulated arm has beside its links: what `real_arm` names, and `effects`; None if there is nothing.
 
         Raises:
             ArmError: a name that is no part.
         """
-        return self.mounted_arm.effects.only(self.real_arm) if self.real_arm else None
+        if not self.real_arm and not self.effects:
+            return None
+        return self.mounted_arm.effects.only(self.real_arm).joined(ArmEffects(cables=self.effects))
 
     def knots(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Times (m,) and poses (m, n) that the arm shall rest at: the start, then the targets."""
@@ -157,23 +175,41 @@ class Scenario:
             raise ScenarioError(f"real_arm: {error}") from error
         if self.start is not None:
             check_pose("start", self.start, arm)
-        before = 0.0
-        for i, target in enumerate(self.targets):
-            check_pose(f"targets[{i}].pose", target.pose, arm)
-            if not before < target.time <= self.duration:
-                raise ScenarioError(
-                    f"targets[{i}].time = {target.time:g} s must be after {before:g} s and at most the duration, "
-                    f"{self.duration:g} s"
-                )
-            before = target.time
+        self._check_targets("targets", self.targets, 0.0)
+        self._check_targets("hand.path", self.hand.path, -1.0)
+        self._check_hand()
+        _check_number("controller.friction_ratio", self.controller.friction_ratio, 0.0, 0.9)
+        if self.controller.friction_ratio and self.controller.mode != "gravity":
+            raise ScenarioError(f'controller.friction_ratio needs mode "gravity"; it is "{self.controller.mode}"')
         if self.targets and self.controller.mode != "hold":
             raise ScenarioError(f'targets need controller.mode "hold"; it is "{self.controller.mode}"')
         for i, effect in enumerate(self.effects):
-            if fault := effect_fault(arm, effect.effect, POSITION_KINDS):
+            law = ActuatorEffect(effect.coordinate, effect.kind, effect.scale)
+            if fault := effect_fault(arm, law, POSITION_KINDS):
                 raise ScenarioError(f"effects[{i}].{fault}")
             _check_number(f"effects[{i}].coefficient", effect.coefficient, -1e3, 1e3)
         if self.model.load_arm().joint_names != arm.joint_names:
             raise ScenarioError(f"controller.model {self.controller.model} is of {self.model.arm}, not of {self.arm}")
+
+    def _check_targets(self, name: str, targets: list[Target], after: float) -> None:
+        for i, target in enumerate(targets):
+            check_pose(f"{name}[{i}].pose", target.pose, self.mounted_arm)
+            if not after < target.time <= self.duration:
+                earliest = "0 s or later" if after < 0 else f"after {after:g} s"
+                raise ScenarioError(
+                    f"{name}[{i}].time = {target.time:g} s must be {earliest} and at most the duration, "
+                    f"{self.duration:g} s"
+                )
+            after = target.time
+
+    def _check_hand(self) -> None:
+        if not self.hand.path:
+            return
+        ArmFrame(self.mounted_arm, self.hand.frame)
+        if len(self.hand.path) < 2:
+            raise ScenarioError("hand.path needs two poses or more: from when to when the hand holds on")
+        for grip in dataclasses.fields(Grip):
+            _check_number(f"hand.{grip.name}", getattr(self.hand, grip.name), 1e-6, 1e6)
 
 
 def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
@@ -248,7 +284,13 @@ def _known_keys() -> str:
     def names(schema: type) -> str:
         return ", ".join(f.name for f in dataclasses.fields(schema))
 
-    groups = {"controller": ControllerScenario, "controller.gains": Gains, "targets": Target, "effects": TrueEffect}
+    groups = {
+        "controller": ControllerScenario,
+        "controller.gains": Gains,
+        "targets": Target,
+        "effects": DriveEffect,
+        "hand": HandScenario,
+    }
     return f"allowed: {names(Scenario)}; " + "; ".join(f"in {key}: {names(schema)}" for key, schema in groups.items())
 
 

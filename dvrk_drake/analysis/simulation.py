@@ -15,12 +15,15 @@ from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.analysis.scenario import Scenario
+from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.models.plant import Closure
 from dvrk_drake.models.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
+from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
-from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
+from dvrk_drake.systems.hand import Hand
+from dvrk_drake.systems.hand_path import HandPath
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +33,15 @@ class Simulation:
     Attributes:
         recording: t, q, qd, tau (m, n) as the arm measures them: exact without `real_arm`, but for the scenario's noise
             on tau.
+        state_true: (m, 2n) q, then v as they are.
+        hand: (m, 6) torque [N m], then force [N] of the hand on the arm at the frame that it holds, in the base; zeros
+            without one.
         desired: (m, n) where the arm was wanted; None in "gravity" mode.
     """
 
     recording: Recording
+    state_true: NDArray[np.float64]
+    hand: NDArray[np.float64]
     desired: NDArray[np.float64] | None
 
     @property
@@ -68,7 +76,7 @@ def simulate(
         closure=cast(Closure, scenario.closure),
         time_step=scenario.time_step,
         meshcat=meshcat,
-        effects=scenario.real_effects,
+        effects=scenario.all_effects,
         seed=scenario.seed,
     )
     controller = GravityPidController(
@@ -80,7 +88,8 @@ def simulate(
     trajectory = _trajectory(times, poses, scenario.duration)
     desired = TrajectorySource(trajectory, output_derivative_order=1) if holds else None
     builder = DiagramBuilder()
-    add_closed_loop(builder, station, controller, desired, _effect_torque(scenario))
+    add_closed_loop(builder, station, controller, desired, friction=_friction(scenario))
+    hand = _add_hand(builder, station, scenario)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     station.set_positions(context, poses[0])
@@ -90,22 +99,28 @@ def simulate(
 
     samples = 1 + int(scenario.duration / scenario.sample_period + 1e-9)
     t = scenario.sample_period * np.arange(samples, dtype=np.float64)
-    ports = [station.GetOutputPort(f"{name}.{port}") for port in ("state_estimated", "effort_measured")]
+    names = ("state_estimated", "effort_measured", "state_true")
+    sources = [(station.GetOutputPort(f"{name}.{port}"), context) for port in names]
+    if hand is not None:
+        sources.append((hand.GetOutputPort("spatial_force"), hand.GetMyContextFromRoot(simulator.get_context())))
     rows = []
     simulator.Initialize()
     for sample in t:
         if sample > 0:  # AdvanceTo(0) would make the plant's first step already
             simulator.AdvanceTo(sample)
-        rows.append(np.concatenate([port.Eval(context) for port in ports]))
+        rows.append(np.concatenate([port.Eval(of) for port, of in sources]))
         progress(sample / scenario.duration)
     if meshcat is not None:
         meshcat.StopRecording()
         meshcat.PublishRecording()
-    q, qd, tau = np.split(np.array(rows), 3, axis=1)
+    n = arm.num_joints
+    q, qd, tau, state_true, hand_force = np.split(np.array(rows), [n, 2 * n, 3 * n, 5 * n], axis=1)
     noise = np.random.default_rng(scenario.seed).normal(size=tau.shape)
     tau = tau + scenario.effort_noise * arm.effort_limits * noise
     recording = Recording(q=q, qd=qd, tau=tau, t=t, source="simulation")
-    return Simulation(recording, trajectory.vector_values(t).T if holds else None)
+    if hand is None:
+        hand_force = np.zeros((samples, 6))
+    return Simulation(recording, state_true, hand_force, trajectory.vector_values(t).T if holds else None)
 
 
 def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration: float) -> PiecewisePolynomial:
@@ -114,8 +129,24 @@ def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration
     return PiecewisePolynomial.CubicHermite(times, poses.T, np.zeros_like(poses.T))
 
 
-def _effect_torque(scenario: Scenario) -> JointEffectTorque | None:
-    if not scenario.effects:
+def _friction(scenario: Scenario) -> FrictionCompensator | None:
+    ratio = scenario.controller.friction_ratio
+    if not ratio:
         return None
-    effects = [effect.effect for effect in scenario.effects]
-    return JointEffectTorque(scenario.mounted_arm, effects, [effect.coefficient for effect in scenario.effects])
+    return FrictionCompensator(Friction.of_arm(scenario.mounted_arm), ratio=ratio, period=scenario.time_step)
+
+
+def _add_hand(builder: DiagramBuilder, station: ArmStation, scenario: Scenario) -> Hand | None:
+    path, frame, arm = scenario.hand.path, scenario.hand.frame, scenario.mounted_arm
+    if not path:
+        return None
+    poses = np.array([target.pose for target in path])
+    times = [target.time for target in path]
+    way = PiecewisePolynomial.CubicHermite(times, poses.T, np.zeros_like(poses.T))
+    hand = builder.AddNamedSystem("hand", Hand(arm, frame, scenario.hand.grip, scenario.time_step))
+    wants = builder.AddNamedSystem("hand_path", HandPath(arm, frame, way))
+    builder.Connect(wants.get_output_port(), hand.GetInputPort("X_BG_desired"))
+    name = arm.name.lower()
+    builder.Connect(station.GetOutputPort(f"{name}.state_true"), hand.GetInputPort("state_estimated"))
+    builder.Connect(hand.GetOutputPort("effort_disturbance"), station.GetInputPort(f"{name}.effort_disturbance"))
+    return hand

@@ -51,6 +51,7 @@ EFFECT_KINDS: dict[str, EffectKind] = {
     "coulomb forward": EffectKind("N m", _WIDTH, code=3),
     "stribeck": EffectKind("N m", _WIDTH, code=4),
     "presliding": EffectKind("N m", "travel until it slips [rad, m]", dissipative=True, code=5),
+    "presliding forward": EffectKind("N m", "travel until it slips [rad, m]", code=6),
     # It pulls no more than at the travel that a recording covered: a straight line runs away outside of it.
     "spring": EffectKind(
         "N m/rad",
@@ -83,6 +84,10 @@ def effect_step(code: int, z: float, dx: float, v: float, scale: float) -> tuple
         # An elasto-plastic element (Prandtl): a spring that gives way when it is stretched by `scale`. Several in
         # parallel are a generalised Maxwell slip model, which has the hysteresis of dry friction before it slides.
         z = min(max(z + dx / scale, -1.0), 1.0)
+        return z, z
+    if code == 6:
+        # What dry friction towards +x has more than towards -x.
+        z = min(max(z + dx / scale, 0.0), 1.0)
         return z, z
     return z, math.nan
 
@@ -119,7 +124,7 @@ class ActuatorEffect:
         """The next state, and the shape there: for a simulation.
 
         Args:
-            state: dimensionless, 0 at the start; only `presliding` has one.
+            state: dimensionless, 0 at the start; only the kinds of presliding have one.
             dx: travel of the coordinate since the last step [rad, m].
             x, v: its position [rad, m] and velocity now.
         """

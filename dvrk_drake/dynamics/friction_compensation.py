@@ -10,14 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
 from scipy.sparse import block_diag, csr_matrix, hstack, vstack
+from scipy.sparse.csgraph import connected_components
 
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_fault, joint_row
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError, ModelError
 from dvrk_drake.models.arm import Arm
 
-#: Friction that holds an arm at rest.
-_DRY = ("presliding", "coulomb")
+#: Travel within which friction must hold the arm [rad, m]: an element that is stretched further before it slips lets
+#: the arm move that far. The smoothed sign of an identification stands for friction that holds at once.
+HOLDING_TRAVEL = 0.015
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,20 @@ class Friction:
         return cls(arm, tuple(effects[k] for k in kept), values[kept])
 
     @classmethod
+    def of_arm(cls, arm: Arm) -> Friction:
+        """What the arm's files state.
+
+        Raises:
+            ControllerError: they state none.
+        """
+        effects = arm.effects.friction
+        if not effects:
+            raise ControllerError(f"friction: the files of {arm.name} state none")
+        return cls.of(
+            arm, [ActuatorEffect(e.coordinate, e.kind, e.scale) for e in effects], [e.coefficient for e in effects]
+        )
+
+    @classmethod
     def of_model(cls, arm: Arm, model: IdentifiedModel) -> Friction:
         """What a model that was identified from a motion says.
 
@@ -76,24 +92,26 @@ class Friction:
         return np.array([joint_row(self.arm, e.coordinate) for e in self.effects]).reshape(-1, self.arm.num_joints)
 
     @property
-    def is_dry(self) -> NDArray[np.bool_]:
-        """(k,) whether the effect holds the arm at rest."""
-        return np.array([effect.kind in _DRY for effect in self.effects], bool)
+    def holds(self) -> NDArray[np.bool_]:
+        """(k,) whether the effect holds the arm at rest, within `HOLDING_TRAVEL`."""
+        return np.array(
+            [e.kind == "coulomb" or (e.kind == "presliding" and e.scale <= HOLDING_TRAVEL) for e in self.effects], bool
+        )
 
     @property
     def of_joints(self) -> NDArray[np.float64]:
-        """(n,) dry friction that each joint feels when it alone moves [N m, N]."""
-        dry = self.is_dry
-        return np.abs(self.rows[dry]).T @ self.coefficients[dry]
+        """(n,) friction that holds each joint at rest if it alone moves [N m, N]."""
+        return np.abs(self.rows[self.holds]).T @ self.coefficients[self.holds]
 
 
 def safe_ratios(friction: Friction, ratio: float, holding_error: ArrayLike) -> NDArray[np.float64]:
     """The share of each effect that may be compensated: at most `ratio`, and never so much that the arm creeps.
 
-    What remains of dry friction must hold whatever the gravity compensation may be wrong by: for every torque e in the
-    box |e_i| <= holding_error_i there must be forces f_k along the coordinates with sum row_k' f_k = e and
-    |f_k| <= (1 - ratio_k) coefficient_k. The box is convex, so its corners suffice; the largest such ratios are a
-    linear program. A joint whose friction cannot hold the error even uncompensated gets no compensation at all.
+    What remains of the friction that holds the arm at rest must hold whatever the gravity compensation may be wrong by:
+    for every torque e in the box |e_i| <= holding_error_i there must be forces f_k along the coordinates with
+    sum row_k' f_k = e and |f_k| <= (1 - ratio_k) coefficient_k. The box is convex, so its corners suffice; the largest
+    such ratios are a linear program. Joints that share no coordinate are looked at apart. Where not even all the
+    friction could hold the error, none is compensated.
 
     Args:
         friction: of the arm.
@@ -115,32 +133,32 @@ def safe_ratios(friction: Friction, ratio: float, holding_error: ArrayLike) -> N
     names = list(dict.fromkeys(effect.coordinate for effect in friction.effects))
     rows = np.array([joint_row(arm, name) for name in names]).reshape(-1, arm.num_joints)
     index = np.array([names.index(effect.coordinate) for effect in friction.effects], np.intp)
-    dry = np.bincount(index, friction.coefficients * friction.is_dry, len(names)).astype(float)
-    creeps = friction.of_joints <= error
-    # A coordinate that moves a joint which creeps anyway keeps all its friction, and need not hold that joint.
-    most = np.where(np.any(rows[:, creeps] != 0, axis=1), 0.0, ratio)
-    return _largest(rows, dry, np.where(creeps, 0.0, error), most)[index]
+    holding = np.bincount(index, friction.coefficients * friction.holds, len(names)).astype(float)
+    ratios = np.zeros(len(names))
+    _, block_of = connected_components(np.abs(rows).T @ np.abs(rows))
+    for block in range(block_of.max() + 1):
+        joints = block_of == block
+        along = np.any(rows[:, joints] != 0, axis=1)
+        ratios[along] = _largest(rows[np.ix_(along, joints)], holding[along], error[joints], ratio)
+    return ratios[index]
 
 
 def _largest(
-    rows: NDArray[np.float64], dry: NDArray[np.float64], error: NDArray[np.float64], most: NDArray[np.float64]
+    rows: NDArray[np.float64], holding: NDArray[np.float64], error: NDArray[np.float64], most: float
 ) -> NDArray[np.float64]:
-    """(c,) largest ratios in 0..most of the coordinates whose remaining dry friction holds every corner of the box."""
-    held = np.flatnonzero(error)
-    if not len(rows) or not len(held):
-        return most
+    """(c,) largest ratios in 0..most of the coordinates whose remaining friction holds every corner of the box."""
     # Of opposite corners one suffices.
-    corners = [np.array([1.0, *signs]) * error[held] for signs in product((1.0, -1.0), repeat=len(held) - 1)]
+    corners = [np.array([1.0, *signs]) * error for signs in product((1.0, -1.0), repeat=len(error) - 1)]
     m, c = len(corners), len(rows)
     # Unknowns: the ratios, then the forces along the coordinates at each corner.
-    identity, limits = csr_matrix(np.eye(m * c)), csr_matrix(np.tile(np.diag(dry), (m, 1)))
+    identity, limits = csr_matrix(np.eye(m * c)), csr_matrix(np.tile(np.diag(holding), (m, 1)))
     done = linprog(
         np.concatenate([-np.ones(c), np.zeros(m * c)]),
         A_ub=vstack([hstack([limits, identity]), hstack([limits, -identity])]),
-        b_ub=np.tile(dry, 2 * m),
-        A_eq=hstack([csr_matrix((m * len(held), c)), block_diag([rows[:, held].T] * m)]),
+        b_ub=np.tile(holding, 2 * m),
+        A_eq=hstack([csr_matrix((m * len(error), c)), block_diag([rows.T] * m)]),
         b_eq=np.concatenate(corners),
-        bounds=[*((0.0, high) for high in most), *[(None, None)] * (m * c)],
+        bounds=[*[(0.0, most)] * c, *[(None, None)] * (m * c)],
     )
     return done.x[:c] if done.success else np.zeros(c)
 

@@ -32,6 +32,26 @@ class DriveEffect:
 
 
 @dataclass
+class FrictionEffect(DriveEffect):
+    """One effect of friction, see `dvrk_drake.systems.real_arm.dry_friction.add_friction`.
+
+    Attributes:
+        fall_speed: of "presliding": the speed at which it holds 1/e of what it holds at rest, Stribeck's effect
+            [rad/s, m/s]; 0: it holds the same at all speeds.
+    """
+
+    fall_speed: float = 0.0
+
+
+@dataclass
+class Cable:
+    """Between an actuator's motor and the arm, at the actuator: [N m/rad], and [N m s/rad] of its damping."""
+
+    stiffness: float = 0.0
+    damping: float = 0.0
+
+
+@dataclass
 class EncoderEffect:
     """`resolution`: actuator -> one count [rad, m]; one that is not named is exact. `velocity_cut_off` [Hz] of the
     first-order low-pass behind the difference of two readings."""
@@ -66,20 +86,23 @@ class ArmEffects:
     """Each field is a part that can be switched, and its name the name of the part.
 
     Attributes:
-        friction: "presliding", "coulomb" and "viscous" effects, as elements of the plant's own solver.
+        friction: as elements of the plant's own solver.
         cables: torques of cables that depend on position.
         springs: the same of springs.
         stops: the arm's coupled limits are hard stops.
+        stretch: actuator -> the cable that it pulls, behind which are motor, encoder and the actuator's own friction;
+            one that is not named is stiff.
         saturation: actuator -> largest effort of its motor [N m, N]; one that is not named has none.
         encoder: positions are counts, velocities are estimated from them.
         effort: steps and noise of the motor currents.
         delay: of measurement and command.
     """
 
-    friction: list[DriveEffect] = field(default_factory=list)
+    friction: list[FrictionEffect] = field(default_factory=list)
     cables: list[DriveEffect] = field(default_factory=list)
     springs: list[DriveEffect] = field(default_factory=list)
     stops: bool = False
+    stretch: dict[str, Cable] = field(default_factory=dict)
     saturation: dict[str, float] = field(default_factory=dict)
     encoder: EncoderEffect | None = None
     effort: EffortEffect | None = None
@@ -132,23 +155,33 @@ class ArmEffects:
         for which, ticks in vars(self.delay or DelayEffect()).items():
             if not 0 <= ticks <= 100:
                 raise ArmError(f"delay.{which} = {ticks}; allowed: 0..100 time steps")
+        for actuator, cable in self.stretch.items():
+            if actuator not in joint_names:
+                raise ArmError(f"stretch: unknown actuator {actuator}; actuators: {', '.join(joint_names)}")
+            if not (0 < cable.stiffness < 1e6 and 0 <= cable.damping < 1e3):
+                raise ArmError(f"stretch.{actuator} must have a stiffness in 0..1e6 and a damping in 0..1000")
         for effect in self.friction:
             where = f"friction: {effect.coordinate} {effect.kind}"
             if effect.kind not in FRICTION_KINDS:
                 raise ArmError(f'friction: kind "{effect.kind}"; allowed: {", ".join(FRICTION_KINDS)}')
-            if not 0 <= effect.coefficient < 1e3:
+            least = -1e3 if effect.kind == "presliding forward" else 0.0
+            if not least <= effect.coefficient < 1e3:
                 raise ArmError(f"{where} has coefficient {effect.coefficient:g}; it must not be negative")
             if effect.kind != "viscous" and not 1e-9 < effect.scale < 1e3:
                 raise ArmError(f"{where} has scale {effect.scale:g}; it must be positive")
-        for effect in [*self.cables, *self.springs]:
-            if effect.kind not in POSITION_KINDS:
-                raise ArmError(f'cables, springs: kind "{effect.kind}"; allowed: {", ".join(POSITION_KINDS)}')
-            if not (np.isfinite(effect.coefficient) and np.isfinite(effect.scale)):
-                raise ArmError(f"cables, springs: {effect.coordinate} {effect.kind} must have finite numbers")
+            if not 0 <= effect.fall_speed < 1e3 or (effect.fall_speed and effect.kind != "presliding"):
+                raise ArmError(
+                    f"{where} has fall_speed {effect.fall_speed:g}; allowed: 0, and up to 1000 of presliding"
+                )
+        for law in [*self.cables, *self.springs]:
+            if law.kind not in POSITION_KINDS:
+                raise ArmError(f'cables, springs: kind "{law.kind}"; allowed: {", ".join(POSITION_KINDS)}')
+            if not (np.isfinite(law.coefficient) and np.isfinite(law.scale)):
+                raise ArmError(f"cables, springs: {law.coordinate} {law.kind} must have finite numbers")
 
 
 #: What `friction` can hold: what a solver can take at the end of a step and what never gives energy.
-FRICTION_KINDS = ("presliding", "coulomb", "viscous")
+FRICTION_KINDS = ("presliding", "presliding forward", "coulomb", "viscous")
 #: What `cables` and `springs` can hold: each has a potential.
 POSITION_KINDS = ("offset", "spring", "cable sine", "cable cosine")
 #: The parts that can be switched.

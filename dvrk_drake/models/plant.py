@@ -21,11 +21,19 @@ from dvrk_drake.models.sdf_model import DRAKE, MODELS_FOLDER, compose_sdf
 Closure = Literal["mimic", "ball"]
 
 
-def add_arm(plant: MultibodyPlant, arm: Arm, closure: Closure = "mimic") -> ModelInstanceIndex:
+def add_arm(
+    plant: MultibodyPlant, arm: Arm, closure: Closure = "mimic", collision_shapes: bool = True
+) -> ModelInstanceIndex:
     """Adds `arm` to a plant that is not finalized, welds its base to the world and sets gravity and limits.
 
     A discrete plant gets the SAP solver, which all of Drake's joint couplings and pins need. A continuous one can only
     be simulated with the integrator CENIC (its pins need drake 1.56 or newer).
+
+    Args:
+        plant: with or without a scene graph.
+        arm: what to add.
+        closure: how the linkage's loops are held.
+        collision_shapes: without them nothing can touch the arm, and a step of a plant with a scene graph is cheaper.
 
     Raises:
         ArmError: no such closure.
@@ -39,6 +47,10 @@ def add_arm(plant: MultibodyPlant, arm: Arm, closure: Closure = "mimic") -> Mode
     model = compose_sdf(arm.sdf)
     if closure == "ball":
         _remove_loop_mimics(model, arm)
+    if not collision_shapes:
+        for link in model.iter("link"):
+            for shape in link.findall("collision"):
+                link.remove(shape)
     (instance,) = parser.AddModelsFromString(ElementTree.tostring(model, encoding="unicode"), "sdf")
     if closure == "ball":
         for loop in arm.loop_closures:

@@ -10,20 +10,20 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.lcm import DrakeLcmInterface
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import Adder, MatrixGain, PassThrough, Saturation
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import MatrixGain
 
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.plant import Closure, add_arm, set_arm_positions, tree_selector
-from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
+from dvrk_drake.systems.ideal_drive import DrivePorts, add_ideal_drive
 from dvrk_drake.systems.lcm.arm_connection import connect_arm
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.real_arm.encoder import Encoder
-from dvrk_drake.systems.real_arm.motor_channel import add_motor_channel
+from dvrk_drake.systems.plant_joints import PlantJoints
+from dvrk_drake.systems.real_arm.drive_step import DriveStep
 from dvrk_drake.systems.real_arm.plant_effects import PlantEffects
+from dvrk_drake.systems.real_arm.real_drive import RealDrive, add_real_drive
 from dvrk_drake.systems.station_ports import station_ports
 
 
@@ -60,8 +60,8 @@ class ArmStation(Diagram):
 
     Without `effects` all of it is C++ and has no state but the plant's, and measured values are exact and undelayed.
     `effects` are those of a real arm, see `ArmEffects`: friction, cables, stops, encoders, motors and delays as
-    `arm.effects` states them. With them (be they empty) a discrete controller beside the station sees the arm before
-    the step that its command is for: the command is a period late, as on hardware.
+    `arm.effects` states them. A discrete controller beside the station sees the arm as it is when the period starts,
+    and its command acts from the next one on: it is a period late, as on hardware.
 
     Drake's solver holds the linkage to about 1e-8 m at 1 ms with either `closure`, and each joint in its position
     limits; the coupled limits of the linkage are there with the effect `stops`. An arm's shapes never touch each other:
@@ -117,7 +117,8 @@ class ArmStation(Diagram):
         self._arm = arm
         self._true_arm = plant_arm or arm
         self._plant: MultibodyPlant | None = None
-        self._encoder: Encoder | None = None
+        self._parts: PlantEffects | None = None
+        self._drive_step: DriveStep | None = None
         builder = DiagramBuilder()
         if hardware:
             of_a_simulation = (time_step, meshcat, closure, plant_arm, modify_plant, effects)
@@ -162,24 +163,30 @@ class ArmStation(Diagram):
                 f"{true_arm.name} has {', '.join(true_arm.joint_names)}"
             )
         self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=time_step)
-        self._instance = add_arm(self.plant, true_arm, closure)
+        # Nothing else is in the plant, so nothing touches the arm unless somebody adds it.
+        self._instance = add_arm(self.plant, true_arm, closure, collision_shapes=modify_plant is not None)
         if modify_plant is not None:
             modify_plant(self.plant)
+        # Otherwise Drake steps the plant before all discrete updates, and what they measure is from after the step.
+        self.plant.SetUseSampledOutputPorts(False)
         if effects is not None:
-            # Otherwise Drake steps the plant before all discrete updates, and what they measure is from after the step.
-            self.plant.SetUseSampledOutputPorts(False)
-        effects = effects or ArmEffects()
-        self._plant_effects = PlantEffects(self.plant, true_arm, self._instance, effects)
+            self._parts = PlantEffects(self.plant, true_arm, self._instance, effects)
         self.plant.Finalize()
-        self._plant_effects.connect(builder)
         self._drop_idle_shapes()
+        self._joints = PlantJoints(self.plant, true_arm, self._instance)
         self._set_default_pose()
         if meshcat is not None:
             # The visualizer deletes its prefix when it starts: one level down, so that a SetTransform stays.
             parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
             MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
-        state_true = self._export_outputs(builder, effects)
-        self._export_inputs(builder, effects, seed, state_true)
+        if effects is None or self._parts is None:
+            ports = add_ideal_drive(builder, self.plant, self._joints, self._instance)
+        else:
+            drive = RealDrive(
+                true_arm, self.plant, self._instance, self._joints, self._parts, effects, seed, self._home()
+            )
+            ports, self._drive_step = add_real_drive(builder, drive)
+        self._export(builder, ports)
 
     @property
     def arm(self) -> Arm:
@@ -213,16 +220,17 @@ class ArmStation(Diagram):
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
         set_arm_positions(self.plant, plant_context, self._true_arm, q)
         q_plant = self.plant.GetPositions(plant_context)
-        self._plant_effects.drive.set_positions(q_plant, q)
+        if self._parts is not None:
+            self._parts.drive.set_positions(q_plant, q)
         self.plant.SetPositions(plant_context, q_plant)
-        if self._encoder is not None:
-            self._encoder.set_at_rest(self.GetMutableSubsystemContext(self._encoder, context), q)
+        if self._drive_step is not None:
+            self._drive_step.set_at_rest(self.GetMutableSubsystemContext(self._drive_step, context), q)
         self.plant.SetVelocities(plant_context, np.zeros(self.plant.num_velocities()))
 
     def get_positions(self, context: Context) -> NDArray[np.float64]:
         """Pose (n,) of the independent joints in this station's context."""
         plant_context = self.GetSubsystemContext(self.plant, context)
-        q: NDArray[np.float64] = self.plant.GetPositions(plant_context)[self._independent()]
+        q: NDArray[np.float64] = self.plant.GetPositions(plant_context)[self._joints.index]
         return q
 
     def set_link_inertias(self, context: Context, inertias: Mapping[str, SpatialInertia]) -> None:
@@ -243,12 +251,6 @@ class ArmStation(Diagram):
         for name, M_LLo_L in inertias.items():
             self.plant.get_body(bodies[name]).SetSpatialInertiaInBodyFrame(plant_context, M_LLo_L)
 
-    def _independent(self) -> NDArray[np.int_]:
-        """Index into the plant's q and v of each independent joint."""
-        names = list(self._true_arm.tree_joint_names)
-        tree = tree_selector(self.plant, self._true_arm, self._instance)
-        return tree[[names.index(joint) for joint in self._arm.joint_names]]
-
     def _drop_idle_shapes(self) -> None:
         """Takes the collision shapes out if no two of them may touch: they would cost a sixth of a step for nothing."""
         if self._scene_graph.model_inspector().GetCollisionCandidates():
@@ -266,84 +268,22 @@ class ArmStation(Diagram):
         q_plant = self.plant.GetDefaultPositions()
         tree = tree_selector(self.plant, self._true_arm, self._instance)
         q_plant[tree] = self._true_arm.linkage.position(home)
-        self._plant_effects.drive.set_positions(q_plant, home)
+        if self._parts is not None:
+            self._parts.drive.set_positions(q_plant, home)
         self.plant.SetDefaultPositions(q_plant)
 
-    def _export_inputs(self, builder: DiagramBuilder, effects: ArmEffects, seed: int, state_true: OutputPort) -> None:
-        plant, name, n = self.plant, self._arm.name.lower(), self._arm.num_joints
-        # The plant clamps as well, but silently: clamp here, at the plant's limits, to know what is applied.
-        actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(self._instance)]
-        driven = [actuator.joint().name() for actuator in actuators]
-        if undriven := [joint for joint in self._arm.joint_names if joint not in driven]:
-            raise StationError(
-                f"{' '.join(self._true_arm.sdf)}: joint {', '.join(undriven)} has no <effort>, so no motor"
-            )
-        columns = [driven.index(joint) for joint in self._arm.joint_names]
-        limits = np.array([actuators[i].effort_limit() for i in columns])
-        # Motors of other joints (massless rotors that ride on a linkage) get zero: their inertia is all they
-        # are for.
-        B = np.zeros((len(actuators), n))
-        B[columns, range(n)] = 1.0
-        commanded = builder.AddNamedSystem("effort_commanded", PassThrough(n))
-        clamp = builder.AddNamedSystem("effort_clamp", Saturation(min_value=-limits, max_value=limits))
-        to_actuators = builder.AddNamedSystem("to_actuators", MatrixGain(D=B))
-        builder.Connect(commanded.get_output_port(), clamp.get_input_port())
-        applied, measured = add_motor_channel(
-            builder, self._arm, effects, clamp.get_output_port(), plant.time_step(), seed
-        )
-        builder.Connect(applied, to_actuators.get_input_port())
-        builder.Connect(to_actuators.get_output_port(), plant.get_actuation_input_port(self._instance))
-        builder.ExportInput(commanded.get_input_port(), f"{name}.effort_commanded")
-        builder.ExportOutput(measured, f"{name}.effort_measured")
-
-        disturbance = builder.AddNamedSystem("effort_disturbance", PassThrough(n))
-        to_tree = builder.AddNamedSystem("to_tree", MatrixGain(D=self._tree_selection()))
-        behind_motors = disturbance.get_output_port()
-        if effects.cables or effects.springs:
-            laws = [*effects.cables, *effects.springs]
-            kinds = [ActuatorEffect(law.coordinate, law.kind, law.scale) for law in laws]
-            torque = JointEffectTorque(self._true_arm, kinds, [law.coefficient for law in laws])
-            builder.AddNamedSystem("position_torque", torque)
-            builder.Connect(state_true, torque.get_input_port())
-            total = builder.AddNamedSystem("behind_motors", Adder(2, n))
-            builder.Connect(behind_motors, total.get_input_port(0))
-            builder.Connect(torque.get_output_port(), total.get_input_port(1))
-            behind_motors = total.get_output_port()
-        builder.Connect(behind_motors, to_tree.get_input_port())
-        builder.Connect(to_tree.get_output_port(), plant.get_applied_generalized_force_input_port())
-        builder.ExportInput(disturbance.get_input_port(), f"{name}.effort_disturbance")
-
-    def _export_outputs(self, builder: DiagramBuilder, effects: ArmEffects) -> OutputPort:
-        """Returns the port of the independent joints' true state."""
-        plant, name, n = self.plant, self._arm.name.lower(), self._arm.num_joints
-        S = self._tree_selection().T
-        zero = np.zeros_like(S)
-        true = builder.AddNamedSystem("state_true", MatrixGain(D=np.block([[S, zero], [zero, S]])))
-        builder.Connect(plant.get_state_output_port(), true.get_input_port())
-        state_true = state = true.get_output_port()
-        builder.ExportOutput(state_true, f"{name}.state_true")
-        if effects.encoder is not None or effects.delay is not None:
-            delay = effects.delay.measurement if effects.delay else 0
-            self._encoder = Encoder(self._arm, effects.encoder, delay, plant.time_step(), self._home())
-            builder.AddNamedSystem("encoder", self._encoder)
-            builder.Connect(state, self._encoder.get_input_port())
-            state = self._encoder.get_output_port()
-        builder.ExportOutput(state, f"{name}.state_estimated")
+    def _export(self, builder: DiagramBuilder, ports: DrivePorts) -> None:
+        name, n = self._arm.name.lower(), self._arm.num_joints
+        builder.ExportInput(ports.effort_commanded, f"{name}.effort_commanded")
+        builder.ExportInput(ports.effort_disturbance, f"{name}.effort_disturbance")
+        builder.ExportOutput(ports.effort_measured, f"{name}.effort_measured")
+        builder.ExportOutput(ports.state_true, f"{name}.state_true")
+        builder.ExportOutput(ports.state_estimated, f"{name}.state_estimated")
         halves = np.split(np.eye(2 * n), 2)
         for port, D in zip(("position_measured", "velocity_estimated"), halves, strict=True):
             select = builder.AddNamedSystem(port, MatrixGain(D=D))
-            builder.Connect(state, select.get_input_port())
+            builder.Connect(ports.state_estimated, select.get_input_port())
             builder.ExportOutput(select.get_output_port(), f"{name}.{port}")
-        builder.ExportOutput(plant.get_state_output_port(), "plant_state")
-        builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
+        builder.ExportOutput(self.plant.get_state_output_port(), "plant_state")
+        builder.ExportOutput(self.plant.get_body_poses_output_port(), "body_poses")
         builder.ExportOutput(self._scene_graph.get_query_output_port(), "query_object")
-        return state_true
-
-    def _tree_selection(self) -> NDArray[np.float64]:
-        """(nv, n): efforts on the independent joints to efforts on the plant; its transpose picks their
-        positions."""
-        if self.plant.num_positions() != self.plant.num_velocities():
-            raise StationError("modify_plant must not add floating bodies: weld them to the arm")
-        selection = np.zeros((self.plant.num_velocities(), self._arm.num_joints))
-        selection[self._independent(), range(self._arm.num_joints)] = 1.0
-        return selection

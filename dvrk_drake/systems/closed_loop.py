@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydrake.systems.framework import DiagramBuilder, System
 
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 
@@ -15,6 +16,7 @@ def add_closed_loop(
     controller: GravityPidController,
     desired: System | None = None,
     effects: JointEffectTorque | None = None,
+    friction: FrictionCompensator | None = None,
 ) -> None:
     """Adds all that is given to `builder` and connects it.
 
@@ -24,13 +26,20 @@ def add_closed_loop(
         controller: of an arm with the same joints.
         desired: a source with one output port: q_d, then v_d (2n,). Without it the controller holds where it starts.
         effects: torques at the joints beside the plant's own.
+        friction: takes a share of the arm's friction off a hand.
     """
     name = station.arm.name.lower()
     builder.AddSystem(station)
     builder.AddSystem(controller)
     state = station.GetOutputPort(f"{name}.state_estimated")
     builder.Connect(state, controller.GetInputPort("state_estimated"))
-    builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))
+    effort = controller.GetOutputPort("effort")
+    if friction is not None:
+        builder.AddSystem(friction)
+        builder.Connect(state, friction.GetInputPort("state_estimated"))
+        builder.Connect(effort, friction.GetInputPort("effort_wanted"))
+        effort = friction.GetOutputPort("effort")
+    builder.Connect(effort, station.GetInputPort(f"{name}.effort_commanded"))
     if desired is not None:
         builder.AddSystem(desired)
         builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))

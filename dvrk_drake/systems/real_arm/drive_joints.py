@@ -11,6 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
     Joint,
+    JointActuator,
     ModelInstanceIndex,
     RevoluteJoint,
     RigidBody,
@@ -18,7 +19,10 @@ from pydrake.multibody.tree import (
     SpatialInertia,
 )
 
+from dvrk_drake.dynamics.actuator_effects import joint_row
+from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import Cable
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 
 #: Of each body that is added: its inertia, as a share of what the arm shows at the coordinate, and its mass [kg]. Drake
@@ -27,6 +31,8 @@ from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_sele
 SHARE, MASS = 2e-3, 1e-6
 #: Where bodies that turn together are tied, from their axis [m].
 RADIUS = 0.1
+#: A cable that does not stretch, but for what Drake's solver gives.
+STIFF = Cable(stiffness=float("inf"))
 
 
 class DriveJoints:
@@ -36,12 +42,44 @@ class DriveJoints:
     joint of its own. It is tied to a link that turns by x about the same axis where the arm has one (the crank of an
     MTM's parallelogram, against the yaw link); else to the last of a chain of bodies on the world, each of which turns
     against the one before by one joint's share.
+
+    Attributes:
+        motors: actuator -> the motor that `add_motor` made.
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex) -> None:
         """Of the `arm` that `add_arm` added to `plant` as `instance`."""
         self._plant, self._arm, self._instance = plant, arm, instance
         self._added: list[tuple[Joint, NDArray[np.float64]]] = []
+        self.motors: dict[str, JointActuator] = {}
+
+    def add_motor(self, name: str, cable: Cable) -> None:
+        """Puts the motor of an actuator on a joint of its own, tied to the arm by a cable that stretches.
+
+        What `along` says of that actuator is then the motor's. A rotor that the SDF states at the joint of that name
+        goes to the motor.
+
+        Raises:
+            StationError: the actuator slides: its cable is not known.
+        """
+        plant, i = self._plant, self._arm.joint_names.index(name)
+        if self._arm.prismatic[i]:
+            raise StationError(f"{self._arm.name}: effects.stretch: {name} slides; allowed are actuators that turn")
+        row = joint_row(self._arm, f"actuator.{name}")
+        joint = self._new(row, cable)
+        motor = plant.AddJointActuator(f"motor_{name}", joint)
+        at_joint = plant.GetJointActuatorByName(name, self._instance)
+        motor.set_default_rotor_inertia(at_joint.default_rotor_inertia())
+        motor.set_default_gear_ratio(at_joint.default_gear_ratio())
+        at_joint.set_default_rotor_inertia(0.0)
+        self.motors[name] = motor
+
+    def along(self, coordinate: str) -> tuple[Joint, float]:
+        """As `joint`, of a coordinate of the drive by its name."""
+        owner, _, name = coordinate.partition(".")
+        if owner == "actuator" and name in self.motors:
+            return self.motors[name].joint(), 1.0
+        return self.joint(joint_row(self._arm, coordinate))
 
     def joint(self, row: NDArray[np.float64]) -> tuple[Joint, float]:
         """The joint of x = row q, row (n,), and the number by which its position must be multiplied to be x."""
@@ -50,11 +88,14 @@ class DriveJoints:
             (i,) = terms
             return self._plant.GetJointByName(self._arm.joint_names[i], self._instance), float(row[i])
         for joint, known in self._added:
-            if np.allclose(known, row, atol=1e-12):
+            if np.allclose(known, row, atol=1e-12) and joint not in [motor.joint() for motor in self.motors.values()]:
                 return joint, 1.0
-        joint = self._coaxial(row) or self._chain(row)
+        return self._new(row, STIFF), 1.0
+
+    def _new(self, row: NDArray[np.float64], cable: Cable) -> Joint:
+        joint = self._coaxial(row, cable) or self._chain(row, cable)
         self._added.append((joint, row))
-        return joint, 1.0
+        return joint
 
     def set_positions(self, q_plant: NDArray[np.float64], q: ArrayLike) -> None:
         """Writes the positions that joints which were added have at the pose q (n,) into q_plant."""
@@ -66,7 +107,7 @@ class DriveJoints:
                 if self._plant.HasJointNamed(name, self._instance):
                     q_plant[self._plant.GetJointByName(name, self._instance).position_start()] = row[k] * q[k]
 
-    def _coaxial(self, row: NDArray[np.float64]) -> Joint | None:
+    def _coaxial(self, row: NDArray[np.float64], cable: Cable) -> Joint | None:
         """A new joint beside a path of coaxial joints whose angles add up to `row` q, if the arm has one."""
         plant, names = self._plant, self._arm.tree_joint_names
         above = {plant.GetJointByName(name, self._instance).child_body().index(): name for name in names}
@@ -78,9 +119,9 @@ class DriveJoints:
                 if abs(abs(sign) - 1.0) > 1e-12:
                     break
                 total = total + sign * self._arm.linkage.matrix[names.index(joint.name())]
-                if joint is not last and np.allclose(total, row, atol=1e-12):
+                if np.allclose(total, row, atol=1e-12):
                     origin = _offset(joint.frame_on_parent()) + along
-                    return self._beside(row, joint.parent_body(), origin, last)
+                    return self._beside(row, cable, joint.parent_body(), origin, last)
                 parent = joint.parent_body()
                 if parent.index() not in above:
                     break
@@ -92,17 +133,22 @@ class DriveJoints:
         return None
 
     def _beside(
-        self, row: NDArray[np.float64], parent: RigidBody, p_PR: NDArray[np.float64], last: RevoluteJoint
+        self,
+        row: NDArray[np.float64],
+        cable: Cable,
+        parent: RigidBody,
+        p_PR: NDArray[np.float64],
+        last: RevoluteJoint,
     ) -> Joint:
         """A joint from `parent` about the axis of `last` at p_PR, whose body turns with the child of `last`."""
         plant, name = self._plant, f"drive_{len(self._added)}"
         body = self._body(name, row)
         frame = plant.AddFrame(FixedOffsetFrame(f"{name}_base", parent, RigidTransform(p_PR)))
         joint = plant.AddJoint(RevoluteJoint(name, frame, body.body_frame(), last.revolute_axis()))
-        self._tie(last.child_body(), _offset(last.frame_on_child()), body, last.revolute_axis())
+        self._tie(last.child_body(), _offset(last.frame_on_child()), body, last.revolute_axis(), cable)
         return joint
 
-    def _chain(self, row: NDArray[np.float64]) -> Joint:
+    def _chain(self, row: NDArray[np.float64], cable: Cable) -> Joint:
         plant, i = self._plant, len(self._added)
         axis, end = np.array([0.0, 0.0, 1.0]), plant.world_body()
         for k in np.flatnonzero(row):
@@ -114,14 +160,19 @@ class DriveJoints:
             end = body
         body = self._body(f"drive_{i}", row)
         joint = plant.AddJoint(RevoluteJoint(f"drive_{i}", plant.world_frame(), body.body_frame(), axis))
-        self._tie(end, np.zeros(3), body, axis)
+        self._tie(end, np.zeros(3), body, axis, cable)
         return joint
 
-    def _tie(self, A: RigidBody, p_AAxis: NDArray[np.float64], B: RigidBody, axis: NDArray[np.float64]) -> None:
+    def _tie(
+        self, A: RigidBody, p_AAxis: NDArray[np.float64], B: RigidBody, axis: NDArray[np.float64], cable: Cable
+    ) -> None:
         """Lets B turn with A about an axis that they share: a rod between points a quarter of a turn apart."""
         e = np.eye(3)[np.argmin(np.abs(axis))]
         f = np.cross(axis, e)
-        self._plant.AddDistanceConstraint(A, p_AAxis + RADIUS * e, B, RADIUS * f, float(np.sqrt(2.0)) * RADIUS)
+        # The rod is `RADIUS` over the square root of 2 from the axis.
+        lever, length = 0.5 * RADIUS**2, float(np.sqrt(2.0)) * RADIUS
+        p_AP, p_BQ = p_AAxis + RADIUS * e, RADIUS * f
+        self._plant.AddDistanceConstraint(A, p_AP, B, p_BQ, length, cable.stiffness / lever, cable.damping / lever)
 
     def _body(self, name: str, row: NDArray[np.float64]) -> RigidBody:
         about_axis = SHARE / float(row @ np.linalg.solve(_mass_matrix(self._arm), row))

@@ -1,0 +1,53 @@
+"""The drive of an arm that is nothing but its links: what is commanded acts, and what is measured is so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.primitives import MatrixGain, PassThrough, Saturation
+
+from dvrk_drake.systems.plant_joints import PlantJoints
+
+
+@dataclass(frozen=True)
+class DrivePorts:
+    """What a drive offers to the station around it, see `ArmStation`; vectors of the joints, in the arm's order."""
+
+    effort_commanded: InputPort
+    effort_disturbance: InputPort
+    effort_measured: OutputPort
+    state_true: OutputPort
+    state_estimated: OutputPort
+
+
+def add_ideal_drive(
+    builder: DiagramBuilder, plant: MultibodyPlant, joints: PlantJoints, instance: ModelInstanceIndex
+) -> DrivePorts:
+    """Connects a finalized plant's inputs; all that is added is C++ and has no state."""
+    n = len(joints.index)
+    commanded = builder.AddNamedSystem("effort_commanded", PassThrough(n))
+    # The plant clamps as well, but silently: clamp here, at the plant's limits, to know what is applied.
+    limits = joints.effort_limits
+    clamp = builder.AddNamedSystem("effort_clamp", Saturation(min_value=-limits, max_value=limits))
+    to_actuators = builder.AddNamedSystem("to_actuators", MatrixGain(D=joints.actuation))
+    builder.Connect(commanded.get_output_port(), clamp.get_input_port())
+    builder.Connect(clamp.get_output_port(), to_actuators.get_input_port())
+    builder.Connect(to_actuators.get_output_port(), plant.get_actuation_input_port(instance))
+    state = add_true_state(builder, plant, joints)
+    disturbance = builder.AddNamedSystem("effort_disturbance", PassThrough(n))
+    to_tree = builder.AddNamedSystem("to_tree", MatrixGain(D=joints.selection))
+    builder.Connect(disturbance.get_output_port(), to_tree.get_input_port())
+    builder.Connect(to_tree.get_output_port(), plant.get_applied_generalized_force_input_port())
+    return DrivePorts(commanded.get_input_port(), disturbance.get_input_port(), clamp.get_output_port(), state, state)
+
+
+def add_true_state(builder: DiagramBuilder, plant: MultibodyPlant, joints: PlantJoints) -> OutputPort:
+    """Of q, then v of the independent joints (2n)."""
+    S = joints.selection.T
+    true = builder.AddNamedSystem("state_true", MatrixGain(D=np.kron(np.eye(2), S)))
+    builder.Connect(plant.get_state_output_port(), true.get_input_port())
+    return true.get_output_port()

@@ -1,0 +1,160 @@
+"""Drive joints, stops, cables and springs of a real arm: mechanics that must hold whatever the values are."""
+
+import numpy as np
+import pytest
+from real_arm import ARMS, Run, middle, weightless
+
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.effects_schema import ArmEffects, Cable, FrictionEffect
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_joints_of_drive_coordinates_follow_the_arm(name):
+    arm = load_arm(name)
+    run = Run(arm, arm.effects.only(["friction", "stops"]))
+    plant = run.station.plant
+    plant_context = plant.GetMyContextFromRoot(run.context)
+    added = run.station._parts.drive._added
+    assert len(added) == {"mtml": 2, "mtmr": 2, "psm": 4}[name]
+    moved = run.q
+    for _ in range(100):
+        run.advance(10)
+        for joint, row in added:
+            # What near-rigid ties of light bodies give by under the friction's load.
+            assert plant.GetPositions(plant_context)[joint.position_start()] == pytest.approx(row @ run.q, abs=3e-4)
+    assert np.abs(run.q - moved).max() > 0.1  # the arm fell
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_the_coupled_stop_stops(which):
+    arm = weightless("mtml")
+    limit = arm.coupled_limits[0]
+    push = (-3.0, 3.0)[which] * np.array([limit.coefficients.get(j, 0.0) for j in arm.joint_names]) / 2
+    q = middle(arm)
+    q[1:3] = 0.2, 0.0
+    ends = []
+    for effects in (ArmEffects(), arm.effects.only(["stops"])):
+        run = Run(arm, effects, q)
+        run.fix("effort_disturbance", push)
+        sums = []
+        for _ in range(600):
+            run.advance()
+            sums.append(run.q[1] + run.q[2])
+        ends.append(np.array(sums))
+    free, stopped = ends
+    outside = {0: lambda s: limit.lower - s.min(), 1: lambda s: s.max() - limit.upper}[which]
+    assert outside(free) > 0.05
+    assert outside(stopped) < 2e-3
+    assert np.abs(np.diff(stopped[-50:])).max() < 1e-5  # it rests there
+
+
+@pytest.mark.parametrize("direction", [-1.0, 1.0])
+def test_the_coupled_stop_gives_no_energy(direction):
+    arm = weightless("mtml")
+    energy = {}
+    for parts in ([], ["stops"]):
+        run = Run(arm, arm.effects.only(parts), [0.0, 0.2, 0.0, *middle(arm)[3:]])
+        plant = run.station.plant
+        plant_context = plant.GetMyContextFromRoot(run.context)
+        run.fix("effort_disturbance", direction * np.array([0.0, 1.5, 1.5, 0.0, 0.0, 0.0, 0.0]))
+        run.advance(120)
+        run.fix("effort_disturbance", np.zeros(7))
+        path = []
+        for _ in range(500):
+            run.advance()
+            path.append(plant.CalcKineticEnergy(plant_context))
+        energy[len(parts)] = np.array(path)
+    # Flying free, steps of 1 ms change it by 2e-4; the stop takes it, and never gives any.
+    assert np.all(energy[1] <= energy[1][0] * (1 + 1e-3))
+    assert energy[1][-1] < 0.8 * energy[1][0] < energy[0][100]
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_cables_and_springs_give_back_what_they_take(name):
+    """Round a closed path of the joints their work is nothing."""
+    arm = weightless(name)
+    run = Run(arm, arm.effects.only(["cables", "springs"]))
+    system = run.station.GetSubsystemByName("drive_force")
+    context, index = system.CreateDefaultContext(), run.station._joints.index
+    phase = np.linspace(0, 2 * np.pi, 4001)
+    ranges = 0.4 * (arm.position_upper - arm.position_lower)
+    q = middle(arm) + ranges * np.sin(np.outer(phase, np.arange(1, arm.num_joints + 1)) + 0.3)
+    forces = []
+    state = np.zeros(run.station.plant.num_multibody_states())
+    for pose in q:
+        state[index] = pose
+        system.GetInputPort("plant_state").FixValue(context, state)
+        forces.append(system.get_output_port().Eval(context)[index])
+    f = np.array(forces)
+    work = np.sum(0.5 * (f[1:] + f[:-1]) * np.diff(q, axis=0), axis=1)
+    assert abs(work.sum()) < 1e-4 * np.abs(work).sum()
+    assert np.abs(f).max() > 1e-3
+
+
+CABLES = {"outer_yaw": Cable(80.0, 0.05), "elbow_pitch": Cable(60.0, 0.02), "wrist_roll": Cable(0.5, 1e-4)}
+
+
+def stretched(friction=()):
+    arm = weightless("mtml")
+    return arm, Run(arm, ArmEffects(stretch=CABLES, friction=list(friction)))
+
+
+def test_a_cable_stretches_by_its_load():
+    """A motor that holds against an effort on the joints turns by what the cable gives; the encoder sits on it."""
+    brakes = [FrictionEffect(f"actuator.{joint}", "viscous", 0.0, 0.5) for joint in load_arm("mtml").joint_names]
+    arm, run = stretched(brakes)
+    load = dict.fromkeys(arm.joint_names, 0.0) | {"outer_yaw": 0.8, "elbow_pitch": -0.6, "wrist_roll": 0.01}
+    effort = arm.transmission.pull_back_effort(list(load.values()))
+    run.fix("effort_commanded", -effort)
+    run.fix("effort_disturbance", effort)
+    run.advance(2500)
+    stretch = arm.transmission.position(run.get("position_measured") - run.q)
+    for i, joint in enumerate(arm.joint_names):
+        expected = -load[joint] / CABLES[joint].stiffness if joint in CABLES else 0.0
+        # The tie is a rod whose length is as good as linear in the angle: 1 % at 10 mrad.
+        assert stretch[i] == pytest.approx(expected, rel=0.02, abs=2e-4)
+    assert np.abs(run.v).max() < 1e-3
+
+
+def test_cables_that_stretch_give_back_no_more_than_they_hold():
+    """Motion and stretch together never gain energy once nothing pushes any more."""
+    arm, run = stretched()
+    plant = run.station.plant
+    plant_context = plant.GetMyContextFromRoot(run.context)
+    stiffness = np.array([CABLES[joint].stiffness if joint in CABLES else 0.0 for joint in arm.joint_names])
+
+    def energy():
+        stretch = arm.transmission.position(run.get("position_measured") - run.q)
+        return plant.CalcKineticEnergy(plant_context) + 0.5 * stiffness @ stretch**2
+
+    run.fix("effort_commanded", np.array([0.5, 0.3, -0.3, 0.0, 0.0, 0.0, 0.005]))
+    run.advance(60)
+    run.fix("effort_commanded", np.zeros(7))
+    path = []
+    for _ in range(400):
+        run.advance()
+        path.append(energy())
+    path = np.array(path)
+    # Drake steps what Coriolis and centrifugal forces do explicitly: 2e-4 of the energy, as without cables.
+    assert np.all(np.maximum.accumulate(path[::-1])[::-1] <= path * (1 + 1e-3))
+    assert path[-1] < 0.9 * path[0]
+
+
+def test_a_rotor_behind_a_cable_is_the_one_that_the_sdf_states():
+    arm, run = stretched()
+    plant = run.station.plant
+    plant_context = plant.GetMyContextFromRoot(run.context)
+    rigid = Run(arm, ArmEffects()).station.plant
+    M = plant.CalcMassMatrix(plant_context)
+    rigid = Run(arm, ArmEffects())
+    M_rigid = rigid.station.plant.CalcMassMatrix(rigid.station.plant.GetMyContextFromRoot(rigid.context))
+    for joint in ("outer_yaw", "wrist_roll"):
+        motor = plant.GetJointActuatorByName(f"motor_{joint}").joint().velocity_start()
+        at_joint = plant.GetJointByName(joint).velocity_start()
+        was = rigid.station.plant.GetJointByName(joint).velocity_start()
+        rotor = rigid.station.plant.GetJointActuatorByName(joint)
+        reflected = rotor.default_rotor_inertia() * rotor.default_gear_ratio() ** 2
+        # The bodies that are added have 0.2 % of what the arm shows at their coordinates.
+        share = 4e-3 * M_rigid[was, was]
+        assert reflected <= M[motor, motor] <= reflected + share
+        assert abs(M[at_joint, at_joint] - (M_rigid[was, was] - reflected)) <= share

@@ -1,0 +1,118 @@
+"""What a computer knows of a real arm, and what the motors make of its commands."""
+
+import itertools
+
+import numpy as np
+import pytest
+from real_arm import ARMS, STEP, Run, weightless
+
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, EffortEffect, EncoderEffect
+
+
+@pytest.mark.parametrize("ticks", [0, 1, 2, 5])
+def test_measurement_is_late_by_exactly_its_ticks(ticks):
+    arm = load_arm("mtml")
+    run = Run(arm, ArmEffects(delay=DelayEffect(measurement=ticks)))
+    true, measured = [run.get("state_true")], [run.get("state_estimated")]
+    for _ in range(40):
+        run.advance()
+        true.append(run.get("state_true"))
+        measured.append(run.get("state_estimated"))
+    for k in range(41):
+        np.testing.assert_array_equal(measured[k], true[max(k - ticks, 0)])
+    assert np.ptp(true, axis=0).max() > 1e-4
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 5])
+def test_command_is_late_by_exactly_its_ticks(ticks):
+    arm = weightless("psm")
+    q = {}
+    for n in (0, ticks):
+        run = Run(arm, ArmEffects(delay=DelayEffect(command=n)))
+        run.fix("effort_commanded", 0.5 * arm.effort_limits)
+        path = [run.q]
+        for _ in range(30):
+            run.advance()
+            path.append(run.q)
+        q[n] = np.array(path)
+    np.testing.assert_allclose(q[ticks][ticks:], q[0][: 31 - ticks], atol=1e-13)
+    assert np.abs(q[0] - q[0][0]).max() > 1e-4
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_positions_are_counts_of_the_encoders(name):
+    arm = load_arm(name)
+    run = Run(arm, arm.effects.only(["encoder"]))
+    n = arm.num_joints
+    resolution = np.array([arm.effects.encoder.resolution[joint] for joint in arm.joint_names])
+    for _ in range(300):
+        run.advance()
+        counts = arm.transmission.position(run.get("position_measured")) / resolution
+        np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
+        error = arm.transmission.position(run.get("position_measured") - run.q)
+        assert np.all(np.abs(error) <= 0.5 * resolution * (1 + 1e-9))
+        np.testing.assert_array_equal(run.get("state_estimated")[:n], run.get("position_measured"))
+        np.testing.assert_array_equal(run.get("state_estimated")[n:], run.get("velocity_estimated"))
+    assert np.abs(run.v).max() > 0.1
+
+
+def test_velocity_is_what_the_low_pass_makes_of_the_counts():
+    arm = load_arm("mtml")
+    h, cut_off = STEP, 30.0
+    run = Run(arm, ArmEffects(encoder=EncoderEffect(arm.effects.encoder.resolution, cut_off)))
+    a = np.exp(-2 * np.pi * cut_off * h)
+    q, v = run.get("position_measured"), np.zeros(7)
+    for _ in range(300):
+        run.advance()
+        new = run.get("position_measured")
+        v = a * v + (1 - a) * (new - q) / h
+        q = new
+        np.testing.assert_allclose(run.get("velocity_estimated"), v, atol=1e-9)
+    assert np.abs(v[:3] - run.v[:3]).max() < 0.3 * np.abs(run.v[:3]).max()
+
+
+def test_an_arm_at_rest_measures_no_velocity_from_the_start():
+    arm = weightless("mtml")
+    for delay in (None, DelayEffect(measurement=3)):
+        run = Run(arm, ArmEffects(encoder=arm.effects.encoder, delay=delay), q=np.full(7, 0.2))
+        for _ in range(10):
+            assert np.abs(run.get("position_measured") - 0.2).max() < 6e-3
+            np.testing.assert_array_equal(run.get("velocity_estimated"), 0.0)
+            run.advance()
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_motors_saturate_each_at_its_own_limit(name):
+    arm = load_arm(name)
+    limit = np.array([arm.effects.saturation[joint] for joint in arm.joint_names])
+    run = Run(arm, arm.effects.only(["saturation"]))
+    inverse = np.linalg.inv(arm.transmission.matrix)
+    for signs in itertools.islice(itertools.product([-1.0, 1.0], repeat=arm.num_joints), 0, 128, 5):
+        run.fix("effort_commanded", 10 * np.array(signs) * arm.effort_limits)
+        assert np.all(np.abs(inverse.T @ run.get("effort_measured")) <= limit * (1 + 1e-12))
+    run.fix("effort_commanded", 0.1 * arm.transmission.pull_back_effort(limit))
+    np.testing.assert_allclose(run.get("effort_measured"), 0.1 * arm.transmission.pull_back_effort(limit))
+
+
+def test_efforts_have_steps_and_noise():
+    arm = load_arm("mtml")
+    effort = arm.effects.effort
+    inverse = np.linalg.inv(arm.transmission.matrix)
+    steps = np.array([effort.measured_resolution[joint] for joint in arm.joint_names])
+    deviation = np.array([effort.noise[joint] for joint in arm.joint_names])
+    run = Run(arm, arm.effects.only(["effort"]))
+    command = arm.transmission.pull_back_effort(10.3 * steps)
+    run.fix("effort_commanded", command)
+    seen = []
+    for _ in range(1000):
+        seen.append(inverse.T @ run.get("effort_measured"))
+        run.advance()
+    counts = np.array(seen) / steps
+    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
+    # 1000 samples: standard errors are 3 % of a deviation and 2 % of its size; five of them.
+    assert np.all(np.abs(counts.mean(axis=0) - 10.0) < 5 * 0.033 * deviation / steps)
+    np.testing.assert_allclose(counts.std(axis=0), np.hypot(deviation / steps, 12**-0.5), rtol=0.12)
+    quiet = Run(arm, ArmEffects(effort=EffortEffect(command_resolution=effort.command_resolution)))
+    quiet.fix("effort_commanded", command)
+    np.testing.assert_allclose(inverse.T @ quiet.get("effort_measured"), 10 * steps, rtol=1e-9)
