@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from motions import fourier_motion, recorded, true_dynamics
+from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 
 from dvrk_drake.analysis.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic_statics import base_parameter_map
 from dvrk_drake.analysis.dynamic_validation import predict_motion, validate_motion
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ModelError, RecordingError
@@ -23,19 +22,7 @@ def simulated(name, seed):
     """An arm with friction at every actuator, and its motion: truth, recording, generator."""
     arm, generator = load_arm(name), np.random.default_rng(seed)
     motion = fourier_motion(arm, generator, 10.0, 20.0, RATE)
-    _, q, v, vd = motion
-    without = true_dynamics(arm, np.random.default_rng(seed), [])
-    effort = np.sqrt(np.mean(without.effort(q, v, vd) ** 2, axis=0))
-    speed, travel = arm.transmission.velocity(v).std(axis=0), arm.transmission.position(q).std(axis=0)
-    effects = []
-    for i, joint in enumerate(arm.joint_names):
-        at = f"actuator.{joint}"
-        effects += [
-            ActuatorEffectEstimate(at, "viscous", 0.0, float(0.2 * effort[i] / speed[i])),
-            ActuatorEffectEstimate(at, "coulomb", float(f"{0.1 * speed[i]:.3g}"), float(0.2 * effort[i])),
-            ActuatorEffectEstimate(at, "presliding", float(f"{0.08 * travel[i]:.3g}"), float(0.2 * effort[i])),
-        ]
-    truth = true_dynamics(arm, np.random.default_rng(seed), effects)
+    truth = true_dynamics(arm, np.random.default_rng(seed), friction_everywhere(arm, motion))
     return arm, truth, recorded(truth, motion, NOISE, generator)
 
 

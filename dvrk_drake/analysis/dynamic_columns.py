@@ -13,18 +13,22 @@ from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
     distinct_coordinates,
     effect_coordinates,
+    effect_fault,
     position_along,
     slides,
 )
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 
 #: Widths of the smoothed sign, as shares of the coordinate's standard deviation of speed.
 COULOMB_WIDTHS = (0.03, 0.1, 0.4)
 #: Travel until an elasto-plastic element slips, as shares of the coordinate's standard deviation of position.
 PRESLIDING_TRAVELS = (0.003, 0.01, 0.08, 0.3, 1.0)
-#: Periods in a turn of the cable torques.
-CABLE_PERIODS = (1, 2)
+#: The same width for friction that differs by direction or is more at low speeds.
+DIRECTION_WIDTH = 0.1
+#: Torques by position alone that a drive can have: name in an arm's file -> periods a turn of a sine and a cosine.
+POSITION_TORQUES = {"spring": 0.0, "cable 1": 1.0, "cable 2": 2.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,34 +56,60 @@ class DynamicColumns:
         return np.hstack([self.rigid[:, i], self.shapes[i] * self.rows[:, i]])
 
 
-def friction_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """What every drive may have: offset at the actuators; viscous, Coulomb and presliding friction everywhere."""
+def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
+    """What every drive has.
+
+    Offset and friction that differs by direction at the actuators; viscous, Coulomb and presliding friction everywhere;
+    springs and cables where the arm's file knows of some (`motion.position_torques`).
+
+    Raises:
+        ArmError: the file knows of some where the arm has no such coordinate, or of no such kind.
+    """
     effects = []
     for name, x, v in _coordinates(arm, grid):
-        if name.startswith("actuator."):
+        at_actuator = name.startswith("actuator.")
+        if at_actuator:
             effects.append(ActuatorEffect(name, "offset"))
         effects.append(ActuatorEffect(name, "viscous"))
         if v.std() > 0:
             effects += [ActuatorEffect(name, "coulomb", _rounded(w * v.std())) for w in COULOMB_WIDTHS]
             effects += [ActuatorEffect(name, "presliding", _rounded(d * x.std())) for d in PRESLIDING_TRAVELS]
+            if at_actuator:
+                effects.append(ActuatorEffect(name, "coulomb forward", _rounded(DIRECTION_WIDTH * v.std())))
+            for kind in arm.motion.position_torques.get(name, []):
+                effects += _position_torque(arm, name, kind, x)
+    if unknown := set(arm.motion.position_torques) - set(distinct_coordinates(arm)):
+        known = ", ".join(distinct_coordinates(arm))
+        raise ArmError(f"{arm.source}: motion.position_torques: unknown {', '.join(sorted(unknown))}; known: {known}")
     return effects
 
 
 def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """What some drives have beside friction: springs, cables, friction that differs by direction."""
+    """What some drives have beside that: further springs and cables, more friction at low speeds, or by direction."""
     effects = []
     for name, x, v in _coordinates(arm, grid):
         if v.std() == 0:
             continue
-        width = _rounded(0.1 * v.std())
-        travel = _rounded(np.abs(x).max() * 1.01)
-        effects += [ActuatorEffect(name, "coulomb forward", width), ActuatorEffect(name, "spring", travel)]
-        if not slides(arm, name):
-            effects += [
-                ActuatorEffect(name, kind, float(periods))
-                for periods in CABLE_PERIODS
-                for kind in ("cable sine", "cable cosine")
-            ]
+        width = _rounded(DIRECTION_WIDTH * v.std())
+        effects.append(ActuatorEffect(name, "stribeck", width))
+        if not name.startswith("actuator."):
+            effects.append(ActuatorEffect(name, "coulomb forward", width))
+        # Where some are known, more of them say the same between the poses of a motion, and run apart beyond.
+        if name not in arm.motion.position_torques:
+            kinds = list(POSITION_TORQUES) if not slides(arm, name) else ["spring"]
+            effects += [effect for kind in kinds for effect in _position_torque(arm, name, kind, x)]
+    return effects
+
+
+def _position_torque(arm: Arm, coordinate: str, kind: str, x: NDArray[np.float64]) -> list[ActuatorEffect]:
+    where = f"{arm.source}: motion.position_torques.{coordinate}"
+    if kind not in POSITION_TORQUES:
+        raise ArmError(f'{where}: unknown "{kind}"; known: {", ".join(POSITION_TORQUES)}')
+    if kind == "spring":
+        return [ActuatorEffect(coordinate, kind, _rounded(1.01 * np.abs(x).max()))]
+    effects = [ActuatorEffect(coordinate, k, POSITION_TORQUES[kind]) for k in ("cable sine", "cable cosine")]
+    if fault := effect_fault(arm, effects[0]):
+        raise ArmError(f"{where}: {fault}")
     return effects
 
 

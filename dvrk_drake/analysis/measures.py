@@ -89,7 +89,7 @@ class Measure:
         columns = [arm.joint_names.index(name) for name in self.joints or arm.joint_names]
         times, poses = scenario.knots()
         q = simulation.recording.q
-        reference = np.broadcast_to(q[0], q.shape) if simulation.desired is None else simulation.desired
+        reference = np.broadcast_to(poses[0], q.shape) if simulation.desired is None else simulation.desired
         run = _Run(
             t=simulation.time,
             q=q[:, columns],

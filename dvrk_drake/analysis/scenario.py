@@ -35,17 +35,17 @@ class ControllerScenario:
     """`mode` is "hold" or "gravity"; `model` the file of an identified model, or empty for what the SDF states.
 
     `gains` replaces the arm's own (kp, kd, ki: one number a joint; in a file also the name of a file of gains).
-    `parameter_error` makes the model wrong: each of its base parameters is multiplied by a factor of its own from
-    1 - `parameter_error`..1 + `parameter_error`, drawn by the scenario's seed.
     `friction_ratio` is the share of the friction that the arm's files state which is compensated, 0..0.9; in mode
-    "gravity" only.
+    "gravity" only. `parameter_error` makes the model wrong:
+    each of its base parameters is multiplied by a factor of its own from 1 - `parameter_error`..1 + `parameter_error`,
+    drawn by the scenario's seed.
     """
 
     mode: str = "hold"
     model: str = ""
     gains: Gains | None = None
-    parameter_error: float = 0.0
     friction_ratio: float = 0.0
+    parameter_error: float = 0.0
 
 
 @dataclass

@@ -81,7 +81,7 @@ def run_case(scenario: Scenario, measures: Sequence[Measure]) -> Row:
     try:
         simulation = simulate(scenario)
     except (RuntimeError, ArithmeticError, ValueError) as error:  # what Drake and numpy raise
-        return Row({}, f"{type(error).__name__}: {error}")
+        return Row({}, " ".join(f"{type(error).__name__}: {error}".split()))
     recording = simulation.recording
     lost = ~np.all(np.isfinite(np.hstack([recording.q, recording.measured_effort()])), axis=1)
     if np.any(lost):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -11,12 +13,15 @@ from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExec
 from contextlib import contextmanager
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dvrk_drake.analysis.study import Progress, run_study
-from dvrk_drake.analysis.study_file import Study
+from dvrk_drake.analysis.study_file import Study, versions
 from dvrk_drake.analysis.study_table import Row
 from dvrk_drake.errors import StudyError
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 #: How often a pool is made again whose worker was killed (by the system where memory ends, say).
 MOST_POOLS = 3
@@ -66,24 +71,43 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
 def dask_executor(address: str) -> Iterator[Executor]:
     """The workers of the Dask scheduler at `address`, e.g. "tcp://192.168.0.5:8786"; the extra `dask`.
 
+    The workers need this package in the same versions, and the files that the scenario names at the same paths. One
+    thread each is best (`dask worker --nthreads 1`): simulations of one process wait for each other. The log of the
+    client is silenced: what matters becomes a StudyError.
+
     Raises:
-        StudyError: distributed is not installed, no scheduler answers there, or it has no workers.
+        StudyError: distributed is not installed, no scheduler answers there, or it has no workers or unfit ones.
     """
+    if not re.fullmatch(r"tcp://\S+:\d+", address):
+        raise StudyError(f'"{address}" is no address of a scheduler; allowed: tcp://HOST:PORT')
     try:
         from distributed import Client
     except ImportError as error:
         raise StudyError("--scheduler needs distributed: pip install 'dvrk-drake[dask]'") from error
+    for logger in ("distributed", "distributed.client"):
+        logging.getLogger(logger).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
-        raise StudyError(f"{address}: no Dask scheduler answers there ({error}); e.g. tcp://127.0.0.1:8786") from error
+        raise StudyError(f"{address}: no Dask scheduler answers there: {error}") from error
     with client:
         try:
             client.wait_for_workers(1, timeout=PATIENCE)
         except TimeoutError as error:
-            raise StudyError(f"{address}: the scheduler has no workers; start some with dask worker") from error
+            raise StudyError(f"{address}: the scheduler has no workers; start some: dask worker {address}") from error
+        _check_workers(client)
         # What is pure would be computed once for all studies of the cluster, and kept.
         yield client.get_executor(pure=False)
+
+
+def _check_workers(client: Client) -> None:
+    try:
+        found = client.run(versions)
+    except ImportError as error:
+        raise StudyError(f"the Dask workers cannot import dvrk_drake: {error}") from error
+    for worker, theirs in found.items():
+        if theirs != versions():
+            raise StudyError(f"{worker}: has {theirs}, here is {versions()}; results would differ: install the same")
 
 
 class _SpawningExecutor(ProcessPoolExecutor):

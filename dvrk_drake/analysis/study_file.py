@@ -106,7 +106,7 @@ class Study:
     def fingerprint(self) -> str:
         """Differs between studies whose results may differ: of all inputs, files included, and of versions."""
         content = {
-            "versions": [version(package) for package in ("dvrk-drake", "drake")],
+            "versions": versions(),
             "scenarios": {name: dataclasses.asdict(scenario) for name, scenario in self.scenarios.items()},
             "models": [yaml_dump_typed(scenario.model) for scenario in self.scenarios.values()],
             "arms": [dataclasses.asdict(scenario.mounted_arm) for scenario in self.scenarios.values()],
@@ -119,7 +119,12 @@ class Study:
 
     def scenario_of(self, case: Case) -> Scenario:
         """What `dvrk-drake simulate` would be given to repeat a case."""
-        return dataclasses.replace(self.scenarios[case.variation], start=list(case.start), seed=case.seed)
+        scenario = self.scenarios[case.variation]
+        controller = scenario.controller
+        if controller.model:  # workers may have another working folder
+            controller = dataclasses.replace(controller, model=str(Path(controller.model).resolve()))
+        arm = scenario.mounted_arm.source
+        return dataclasses.replace(scenario, arm=arm, controller=controller, start=list(case.start), seed=case.seed)
 
     def check(self) -> None:
         """Refuses what cannot be run, before anything runs.
@@ -160,7 +165,7 @@ class Study:
         for name, most in (("count", 1_000_000), ("seed", 2**63), ("margin", 0.49)):
             value, least = getattr(self.random_poses, name), int(name == "count")
             if not least <= value <= most:
-                raise StudyError(f"random_poses.{name} is {value:g}; allowed: {least}..{most:g}")
+                raise StudyError(f"random_poses.{name} is {value:g}; allowed: {least}..{most}")
 
     def _starts(self) -> list[list[float]]:
         """Where the arm starts."""
@@ -191,6 +196,11 @@ def load_study(path: str | Path, settings: Sequence[str] = ()) -> Study:
     except DvrkDrakeError as error:
         raise StudyError(f"{path}: {error}") from error
     return study
+
+
+def versions() -> dict[str, str]:
+    """Of what results depend on."""
+    return {package: version(package) for package in ("dvrk-drake", "drake", "numpy")}
 
 
 def _seed_of_run(seed: int, pose: int) -> int:

@@ -20,7 +20,7 @@ from dvrk_drake.models.recording import column_names
 
 @dataclass(frozen=True)
 class Row:
-    """What a run gave: `values` by column of the measures; or none, and the text of the `error` that ended it."""
+    """What a run gave: `values` by column of the measures; or none, and the `error` that ended it, in one line."""
 
     values: Mapping[str, float | bool]
     error: str = ""
@@ -82,7 +82,7 @@ class StudyTable:
     def _cells(self, case: Case, row: Row) -> list[str]:
         key = [self._study.fingerprint, str(case.index), case.variation, str(case.pose), str(case.seed)]
         values = [_text(row.values[name]) if name in row.values else "" for name in self._names]
-        return [*key, *map(repr, case.start), *values, " ".join(row.error.split())]
+        return [*key, *map(repr, case.start), *values, row.error]
 
     def _read(self) -> dict[int, Row]:
         """The whole rows that are there, by the number of their case."""

@@ -24,6 +24,7 @@ from dvrk_drake.cli import (
     record,
     simulate,
     study,
+    transparency,
     tune,
 )
 from dvrk_drake.cli.support import import_interruptibly
@@ -59,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("dvrk-drake"))
     verbs = parser.add_subparsers(required=True, metavar="VERB")
-    offline = (model, check, identify, recalibrate, payload, export, simulate, study, tune, demo)
+    offline = (model, check, identify, recalibrate, payload, export, simulate, study, tune, transparency, demo)
     for module in (*offline, lcm, record, collect):
         module.add_verbs(verbs)
     return parser

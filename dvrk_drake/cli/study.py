@@ -19,7 +19,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from dvrk_drake.cli.support import made_folder, quiet_drake
+from dvrk_drake.cli.support import check_output, made_folder, quiet_drake
+from dvrk_drake.errors import StudyError
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -48,6 +49,9 @@ def _study(options: argparse.Namespace) -> None:
 
     quiet_drake()
     study = load_study(options.study, options.set)
+    if not options.output.endswith((".csv", ".parquet")):
+        raise StudyError(f"{options.output}: must end in .csv or .parquet")
+    check_output(options.output)
     plots = None if options.plots is None else made_folder(options.plots)
     if options.scheduler is None:
         with _progress() as progress:

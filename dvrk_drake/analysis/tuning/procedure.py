@@ -7,17 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.tuning.oscillation import Oscillation, judge_oscillation
 
-#: A release is watched for this long [s]; a step, and what of it is left of the offset, for this long [s].
-RELEASE, STEP = 1.5, 2.0
+#: A release is watched for this long [s], or for so many periods of the last one; steps for this long [s].
+RELEASE, PERIODS, DAMPING_STEP, OFFSET_STEP = 1.5, 7.0, 1.0, 2.0
 #: Kp goes up by this factor until the joint oscillates, then the last factor is halved (in the logarithm) so often.
-RAISE, BISECTIONS = 2.0, 6
+RAISE, BISECTIONS = 2.0, 5
 #: Damped: a step overshoots by no more than this share, and nothing swings in the last fifth.
 OVERSHOOT, OVERSHOOT_WITH_INTEGRAL = 0.05, 0.15
 #: Kv and Ki go up by this factor, Kp comes down by this one if no Kv damps the joint.
@@ -97,12 +97,18 @@ def find_ultimate_gain(joint: JointUnderTest) -> Ultimate:
     motor is at its limit within a twentieth of the step, and more Kp changes nothing.
     """
 
+    watched = RELEASE
+
     def swing(kp: float) -> Oscillation:
-        t, error = joint.respond(kp, 0.0, 0.0, RELEASE)
-        return judge_oscillation(t, error, max(2.0 * joint.count, 0.02 * joint.step))
+        nonlocal watched
+        t, error = joint.respond(kp, 0.0, 0.0, watched)
+        found = judge_oscillation(t, error, max(2.0 * joint.count, 0.02 * joint.step))
+        # More gain swings faster, and a bisection does not go back far.
+        watched = min(RELEASE, PERIODS * found.period)
+        return found
 
     largest = 20.0 * joint.effort_limit / joint.step
-    low, high = largest / 4096.0, largest / 4096.0
+    low, high = largest / 1024.0, largest / 1024.0
     found = swing(high)
     while not found.sustained and high < largest:
         low, high = high, min(RAISE * high, largest)
@@ -132,7 +138,7 @@ def _damp(joint: JointUnderTest, ultimate: Ultimate) -> tuple[float, float, bool
         w = 2.0 * np.pi / period * np.sqrt(kp / ultimate.gain)
         for ratio in _raised(RATIOS):
             kd = 2.0 * ratio * kp / w
-            if _is_damped(joint, kp, kd, 0.0, OVERSHOOT):
+            if _try_step(joint, (kp, kd, 0.0), DAMPING_STEP, OVERSHOOT).damped:
                 return kp, float(kd), True
         kp *= LESS
     return kp, float(kd), False
@@ -140,18 +146,16 @@ def _damp(joint: JointUnderTest, ultimate: Ultimate) -> tuple[float, float, bool
 
 def _remove_offset(joint: JointUnderTest, kp: float, kd: float, period: float) -> tuple[float, float]:
     """The least Ki with which the joint ends inside its band; without one that with which it ends nearest."""
-    best, nearest = 0.0, _offset(joint, kp, kd, 0.0)
-    if nearest <= joint.band:
-        return best, nearest
+    best, nearest = 0.0, _try_step(joint, (kp, kd, 0.0), OFFSET_STEP, OVERSHOOT_WITH_INTEGRAL).offset
     for share in _raised(SHARES):
+        if nearest <= joint.band:
+            break
         ki = share * kp / (period if np.isfinite(period) else 0.1)
-        if not _is_damped(joint, kp, kd, ki, OVERSHOOT_WITH_INTEGRAL):
+        tried = _try_step(joint, (kp, kd, ki), OFFSET_STEP, OVERSHOOT_WITH_INTEGRAL)
+        if not tried.damped:
             break
-        offset = _offset(joint, kp, kd, ki)
-        if offset < nearest:
-            best, nearest = ki, offset
-        if offset <= joint.band:
-            break
+        if tried.offset < nearest:
+            best, nearest = ki, tried.offset
     return best, nearest
 
 
@@ -160,13 +164,15 @@ def _raised(ends: tuple[float, float]) -> list[float]:
     return [ends[0] * FINER**i for i in range(steps + 1)]
 
 
-def _is_damped(joint: JointUnderTest, kp: float, kd: float, ki: float, overshoot: float) -> bool:
-    t, error = joint.respond(kp, kd, ki, STEP)
-    beyond = -np.min(error) * np.sign(joint.step)
-    last = error[t > 0.8 * STEP]
-    return bool(beyond <= overshoot * joint.step + joint.count and np.ptp(last) <= max(2 * joint.count, joint.band))
+class _Step(NamedTuple):
+    damped: bool
+    offset: float
 
 
-def _offset(joint: JointUnderTest, kp: float, kd: float, ki: float) -> float:
-    t, error = joint.respond(kp, kd, ki, STEP)
-    return float(np.abs(error[t > 0.8 * STEP]).mean())
+def _try_step(joint: JointUnderTest, gains: tuple[float, float, float], duration: float, overshoot: float) -> _Step:
+    """Whether a step overshoots by no more than that share and then rests, and how far from the goal it does."""
+    t, error = joint.respond(*gains, duration)
+    last = error[t > 0.8 * duration]
+    rests = np.ptp(last) <= max(2.0 * joint.count, joint.band)
+    damped = rests and -np.min(error) <= overshoot * joint.step + joint.count
+    return _Step(bool(damped), float(np.abs(last).mean()))
