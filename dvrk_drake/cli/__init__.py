@@ -25,6 +25,7 @@ from dvrk_drake.cli import (
     simulate,
     study,
     transparency,
+    tune,
 )
 from dvrk_drake.cli.support import import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
@@ -59,20 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("dvrk-drake"))
     verbs = parser.add_subparsers(required=True, metavar="VERB")
-    for module in (
-        model,
-        check,
-        identify,
-        recalibrate,
-        payload,
-        export,
-        simulate,
-        study,
-        transparency,
-        demo,
-        lcm,
-        record,
-        collect,
-    ):
+    offline = (model, check, identify, recalibrate, payload, export, simulate, study, tune, transparency, demo)
+    for module in (*offline, lcm, record, collect):
         module.add_verbs(verbs)
     return parser
