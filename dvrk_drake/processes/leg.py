@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import PiecewisePolynomial
 
-
 #: Least time of a leg [s]: short ones would begin and end with a jerk.
 LEAST_DURATION = 0.3
 

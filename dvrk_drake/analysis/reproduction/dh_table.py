@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.multibody.plant import MultibodyPlant
@@ -46,9 +48,7 @@ def _transforms(plant: MultibodyPlant, arm: Arm, q: NDArray[np.float64]) -> list
     context = plant.CreateDefaultContext()
     set_arm_positions(plant, context, arm, q)
     frames = [plant.GetFrameByName(f"paper_{i}") for i in range(arm.num_joints + 1)]
-    return [
-        behind.CalcPose(context, before).GetAsMatrix4() for before, behind in zip(frames, frames[1:], strict=False)
-    ]
+    return [behind.CalcPose(context, before).GetAsMatrix4() for before, behind in pairwise(frames)]
 
 
 def _standard(theta: float, d: float, alpha: float, a: float) -> NDArray[np.float64]:
@@ -87,7 +87,17 @@ def reproduce_table_1() -> Section:
         )
     angles = np.abs(np.angle(np.exp(1j * (ours - published)[:, [1, 3]]))).max()
     lengths = np.abs(ours - published)[:, [0, 2, 4]].max()
-    header = ("joint", "theta, paper", "plant", "d [m], paper", "plant", "alpha, paper", "plant", "a [m], paper", "plant")
+    header = (
+        "joint",
+        "theta, paper",
+        "plant",
+        "d [m], paper",
+        "plant",
+        "alpha, paper",
+        "plant",
+        "a [m], paper",
+        "plant",
+    )
     return Section(
         "table1",
         "Table I: DH parameters of the MTM",

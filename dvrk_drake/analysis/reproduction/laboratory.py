@@ -20,7 +20,7 @@ from dvrk_drake.analysis.reproduction.true_arms import KnownTruth, paper_arm, un
 from dvrk_drake.analysis.static_identification import identify_static
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import write_recording
+from dvrk_drake.models.recording import Recording, write_recording
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,10 @@ class Extent:
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """A true arm and the file of the model that was identified from poses collected on it."""
+    """A true arm, poses collected on it, and the model that was identified from them, with its file."""
 
     truth: KnownTruth
+    poses: Recording
     model: IdentifiedModel
     file: Path
 
@@ -93,8 +94,7 @@ class Laboratory:
         if mtm.truth.is_the_papers:
             paper_model(load_arm("mtml")).save(path)
         else:
-            assert self._mtm_poses is not None
-            identify_static(self._mtm_poses, load_arm("mtml"), "paper").model.save(path)
+            identify_static(mtm.poses, load_arm("mtml"), "paper").model.save(path)
         return path
 
     def release(
@@ -105,10 +105,11 @@ class Laboratory:
         poses: NDArray[np.float64],
         what: str,
         parts: Sequence[str] = ("all",),
+        damped: bool = False,
     ) -> Drifts:
-        """Of the arm `name`, at `poses` (m, n), under the model in a file; `parts` of the effects of the true one."""
+        """Of the arm `name`, at `poses` (m, n), under the model in a file; `parts`, `damped`: see `Release`."""
         cases = [
-            Release(name, truth.arm, tuple(parts), str(model), pose, self.extent.duration, self.seed + i)
+            Release(name, truth.arm, tuple(parts), str(model), pose, damped, self.extent.duration, self.seed + i)
             for i, pose in enumerate(poses)
         ]
         positions = release_all(cases, self.executor, lambda share: self.progress(what, share))
@@ -135,8 +136,6 @@ class Laboratory:
             self.executor,
             lambda share: self.progress(f"collecting poses of the {label}", share),
         )
-        if name == "mtml":
-            self._mtm_poses = poses
         recording, file = self.folder / f"{name}_poses.csv", self.folder / f"{name}_model.yaml"
         write_recording(poses, recording)
         identification = identify_static(
@@ -144,6 +143,4 @@ class Laboratory:
         )
         identification.model.provenance.recording = recording.name
         identification.model.save(file)
-        return Identified(truth, identification.model, file)
-
-    _mtm_poses = None
+        return Identified(truth, poses, identification.model, file)

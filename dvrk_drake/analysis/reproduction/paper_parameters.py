@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydrake.multibody.tree import JacobianWrtVariable
 
 from dvrk_drake.analysis.reproduction.published import CONTROLLED_WITH, PARAMETER_PLACES, PARAMETERS
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
-from pydrake.multibody.tree import JacobianWrtVariable
 
 #: More poses than parameters, for the change to our base parameters.
 _POSES = 40
@@ -29,14 +29,14 @@ def paper_torque(arm: Arm, q: ArrayLike, parameters: Sequence[float] = PARAMETER
     world = plant.world_frame()
     tree = [plant.GetJointByName(name).velocity_start() for name in arm.joint_names]
     torque = np.zeros(np.shape(q))
-    for row, pose in zip(torque, np.asarray(q, float), strict=True):
+    for k, pose in enumerate(np.asarray(q, float)):
         set_arm_positions(plant, context, arm, pose)
         for value, (link, axis) in zip(parameters, PARAMETER_PLACES, strict=True):
             frame = plant.GetFrameByName(f"paper_{link}")
             h_W = value * frame.CalcPoseInWorld(context).rotation().matrix()[:, "xyz".index(axis)]
             J = plant.CalcJacobianAngularVelocity(context, JacobianWrtVariable.kV, frame, world, world)
             # In a serial chain: joints of the linkage's other bars turn none of these links.
-            row += CONTROLLED_WITH * np.cross(J[:, tree].T, h_W)[:, 2]
+            torque[k] += CONTROLLED_WITH * np.cross(J[:, tree].T, h_W)[:, 2]
     return torque
 
 
@@ -54,7 +54,5 @@ def paper_model(arm: Arm) -> IdentifiedModel:
 
 def with_zeroed(model: IdentifiedModel, joints: Sequence[int]) -> IdentifiedModel:
     """The model with no torque on `joints` (from 0), as the paper's Fig. 6 has it."""
-    statistics = [
-        dataclasses.replace(s, trust=0.0) if j in joints else s for j, s in enumerate(model.joints)
-    ]
+    statistics = [dataclasses.replace(s, trust=0.0) if j in joints else s for j, s in enumerate(model.joints)]
     return dataclasses.replace(model, joints=statistics)

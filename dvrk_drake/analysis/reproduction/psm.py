@@ -41,13 +41,14 @@ def reproduce_psm(laboratory: Laboratory) -> Section:
         ("ours, share held", *numbers(ours.held.mean(axis=0), "{:.3f}")),
     )
     remarks = (
-        "The paper shows a model and no experiment: its masses are placeholders. The table sets its file's faults beside "
-        "what our plant gives when it is asked.",
-        f"{psm.truth.origin} Ours is identified from {extent.collected} poses collected on it. Each release is at a random "
-        f"pose inside the limits, watched for {extent.duration:g} s under gravity compensation alone. **Every joint stays "
-        f"within {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm) at {share(ours.num_held, len(poses))}** of the poses with "
-        f"ours, at {share(drawn.num_held, len(poses))} with the model as drawn. Its linkage balances it and its friction is "
-        "large beside its wrist's weight, so much of that is friction's doing.",
+        "The paper shows a model and no experiment: its masses are placeholders. The table sets its file's faults "
+        "beside what our plant gives when it is asked.",
+        f"{psm.truth.origin} Ours is identified from {extent.collected} poses collected on it. Each release is at a "
+        f"random pose inside the limits, watched for {extent.duration:g} s under gravity compensation alone. **Every "
+        f"joint stays within {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm) at "
+        f"{share(ours.num_held, len(poses))}** of the poses with ours, at {share(drawn.num_held, len(poses))} with "
+        "the model as drawn. Its linkage balances it and its friction is large beside its wrist's weight, so much "
+        "of that is friction's doing.",
     )
     release = ResultTable("psm_release", "Absolute drift after release [rad; insertion m]", ("", *names), rows)
     shows = "PSM: largest drift of each release, sorted"
@@ -58,10 +59,16 @@ def _facts() -> ResultTable:
     arm = load_arm("psm")
     remote, angle = mechanism_errors(arm)
     plant = make_arm_plant(arm, closure="ball")
-    masses = [plant.get_body(i).default_mass() for i in plant.GetBodyIndices(plant.GetModelInstanceByName(_instance(plant)))]
+    masses = [
+        plant.get_body(i).default_mass() for i in plant.GetBodyIndices(plant.GetModelInstanceByName(_instance(plant)))
+    ]
     yaw = arm.joint_names.index("yaw")
     rows = (
-        ("loops of the linkage", "second parents of links: Finalize() refuses the file", "cut and pinned: it simulates"),
+        (
+            "loops of the linkage",
+            "second parents of links: Finalize() refuses the file",
+            "cut and pinned: it simulates",
+        ),
         (
             "remote centre of motion",
             "none exactly: the front four-bar has bars .530/.535, ends .0370/.0407 m",
@@ -70,7 +77,11 @@ def _facts() -> ResultTable:
         ("wrist yaw axis", "equals the wrist pitch axis", f"{np.degrees(angle):.1f} degrees from the wrist pitch axis"),
         ("yaw", "locked by its limits", f"{arm.position_lower[yaw]:+.3f}..{arm.position_upper[yaw]:+.3f} rad"),
         ("inertias", "1 kg m^2 each, centres of mass at the origins", f"from shapes, {sum(masses):.2f} kg in all"),
-        ("prismatic joint", "all 15 joints revolute in the file, one prismatic in the text", "insertion, one of 7 joints"),
+        (
+            "prismatic joint",
+            "all 15 joints revolute in the file, one prismatic in the text",
+            "insertion, one of 7 joints",
+        ),
     )
     return ResultTable("psm", "The PSM's model", ("", "the paper's file", "ours"), rows)
 

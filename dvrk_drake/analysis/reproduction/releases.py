@@ -15,6 +15,7 @@ from pydrake.systems.primitives import LogVectorOutput
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
@@ -36,6 +37,7 @@ class Release:
         parts: of the true arm's effects that it has, as `ArmEffects.only` takes them.
         model: file of the controller's model.
         start: (n,) pose at which it rests when it is let go, its friction unloaded [rad, m].
+        damped: whether the controller brakes with the damping gains of the arm beside carrying its weight.
         duration: [s].
         seed: of the effects' noise.
     """
@@ -45,6 +47,7 @@ class Release:
     parts: tuple[str, ...]
     model: str
     start: NDArray[np.float64]
+    damped: bool = False
     duration: float = DURATION
     seed: int = 0
 
@@ -56,13 +59,20 @@ def release(case: Release) -> NDArray[np.float64]:
     effects = case.true_arm.effects.only(case.parts)
     station = ArmStation(arm, plant_arm=case.true_arm, effects=effects, seed=case.seed)
     builder = DiagramBuilder()
-    add_closed_loop(builder, station, GravityPidController(_model(case.model), mode="gravity"))
+    add_closed_loop(builder, station, _controller(case, arm))
     log = LogVectorOutput(station.GetOutputPort(f"{name}.state_true"), builder, SAMPLE_PERIOD)
     simulator = Simulator(builder.Build())
     station.set_positions(station.GetMyMutableContextFromRoot(simulator.get_mutable_context()), case.start)
     simulator.AdvanceTo(case.duration)
     positions: NDArray[np.float64] = log.FindLog(simulator.get_context()).data()[: arm.num_joints].T
     return positions.copy()
+
+
+def _controller(case: Release, arm: Arm) -> GravityPidController:
+    none = [0.0] * arm.num_joints
+    return GravityPidController(
+        _model(case.model), gains=Gains(none, arm.gains.kd, none), mode="hold" if case.damped else "gravity"
+    )
 
 
 @cache

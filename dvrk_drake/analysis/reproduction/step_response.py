@@ -57,23 +57,28 @@ def reproduce_figure_7(laboratory: Laboratory, duration: float = DURATION) -> Se
         ("published, read off", "-", f"{published.FIGURE_7_READ['J2 at 59 s']:.3f}", "-", "-", "-", "0.0220", "0.0155"),
         ("the paper's controller, as it was", *numbers(_late(faulty), "{:.4f}")),
         ("the same with velocities in all damping terms", *numbers(_late(damped), "{:.4f}")),
-        (f"ours, from {min(3.0, duration / 2):g} s on", *numbers(_late(ours, from_time=min(3.0, duration / 2)), "{:.1e}")),
+        (
+            f"ours, from {min(3.0, duration / 2):g} s on",
+            *numbers(_late(ours, from_time=min(3.0, duration / 2)), "{:.1e}"),
+        ),
     )
     growth = "J6, J7: amplitude of the second half of the time over that of the first"
     remarks = (
-        "From J5 +3.13, J3 -0.79, J2 -0.22 rad to zero, gains and masses as published, 100 Hz. The paper's node fed the "
-        "positions of joints 5-7 into their damping terms: a second stiffness, and no damping at all. We give each link "
-        f"{LINK_INERTIA:g} kg m^2 as the paper's PSM file does; that this is so for its MTM follows from the period of its "
-        f"J2, {published.FIGURE_7_READ['J2 period']:.0f} s as published and {slowest_swing(theirs_arm):.0f} s here. "
-        f"{growth}: {_growth(faulty[:, 5]):.2f}, {_growth(faulty[:, 6]):.2f} with the fault, {_growth(damped[:, 5]):.2f}, "
-        f"{_growth(damped[:, 6]):.2f} with velocities in all damping terms (published for J7, early against late: "
+        "From J5 +3.13, J3 -0.79, J2 -0.22 rad to zero, gains and masses as published, 100 Hz. The paper's node fed "
+        "the positions of joints 5-7 into their damping terms: a second stiffness, and no damping at all. We give "
+        f"each link {LINK_INERTIA:g} kg m^2 as the paper's PSM file does; that this is so for its MTM follows from "
+        f"the period of its J2, {published.FIGURE_7_READ['J2 period']:.0f} s as published and "
+        f"{slowest_swing(theirs_arm):.0f} s here. {growth}: {_growth(faulty[:, 5]):.2f}, {_growth(faulty[:, 6]):.2f} "
+        f"with the fault, {_growth(damped[:, 5]):.2f}, {_growth(damped[:, 6]):.2f} with velocities in all damping "
+        "terms (published for J7, early against late: "
         f"{published.FIGURE_7_READ['J7 late'] / published.FIGURE_7_READ['J7 early']:.2f}).",
-        "Ours holds another arm: the true MTM of Fig. 5 with all its effects (its stops apart: the start is beyond them), "
-        "its limits of effort, and the model that was identified from poses collected on it; gains of `mechanisms/mtm.yaml`, "
-        f"1 kHz. Its largest error in the last second is {1e3 * np.abs(ours[-round(1 / PERIOD) :]).max():.1f} mrad: friction "
-        "holds what the integrators have not yet taken away.",
-        "What differs: Gazebo's solver and its joints' limits and friction are not ours, so where the undamped joints are "
-        "in their swing at a given time is not comparable, only whether they come to rest.",
+        "Ours holds another arm: the true MTM of Fig. 5 with all its effects (its stops apart: the start is beyond "
+        "them), its limits of effort, and the model that was identified from poses collected on it; gains of "
+        "`mechanisms/mtm.yaml`, 1 kHz. Its largest error in the last second is "
+        f"{1e3 * np.abs(ours[-round(1 / PERIOD) :]).max():.1f} mrad: friction holds what the integrators have not "
+        "yet taken away.",
+        "What differs: Gazebo's solver and its joints' limits and friction are not ours, so where the undamped "
+        "joints are in their swing at a given time is not comparable, only whether they come to rest.",
     )
     table = ResultTable(
         "fig7", "Largest |q| [rad] in the last 10 s (the published: J2 at 59 s, J6, J7 late)", ("", *_JOINTS), rows

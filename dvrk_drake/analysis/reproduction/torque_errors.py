@@ -82,11 +82,11 @@ def reproduce_figure_4(
         f"done again: unweighted, twelve parameters. {same}At the poses that it was fitted to it is worse than "
         f"commanding nothing on {', '.join(worse)}: joints 2 and 3, whose torques are ten to a hundred times larger, "
         "decide what the parameters are, and what they get wrong there the wrist must bear.",
-        "Ours differs: each joint is weighted by its own spread; offsets, springs and cables are terms of their own where "
-        "predictions of left-out poses gain by them; a joint that is better off with zero torque gets that; and "
-        f"{int(np.sum(~undoubted))} measurements that press on the linkage's stop, or that no other pose agrees with, are "
-        "left out (crosses in the figure). With those left in, the paper's reads better on J2: it fits the stop along "
-        "with gravity.",
+        "Ours differs: each joint is weighted by its own spread; offsets, springs and cables are terms of their own "
+        "where predictions of left-out poses gain by them; a joint that is better off with zero torque gets that; "
+        f"and {int(np.sum(~undoubted))} measurements that press on the linkage's stop, or that no other pose agrees "
+        "with, are left out (crosses in the figure). With those left in, the paper's reads better on J2: it fits "
+        "the stop along with gravity.",
     )
     shows = "Squared torque error of joints 2-7 at each of the 72 poses, predicted from the other poses; log scale"
     return Section("fig4", "Fig. 4: torque errors", remarks, (squared, left_out), {_FILE: shows})

@@ -58,10 +58,10 @@ def paper_arm(recording: Recording, folder: Path) -> KnownTruth:
     effects = dataclasses.replace(arm.effects, cables=laws, springs=[])
     true_arm = _with_links(arm, model_bodies(model).links, folder / "true_mtm.sdf", "the paper's recording")
     origin = (
-        "The true arm is the paper's MTM as our identification sees it in the paper's 72 poses (gravity, cables, springs), "
-        "with the friction, stops, encoders, motors and delays of `mechanisms/mtm.yaml`, which are another MTM's. Joint 6 "
-        "shows no torque in that recording beyond friction, and joint 7 a constant one: there the true arm has less to "
-        "compensate than the real one seems to have had."
+        "The true arm is the paper's MTM as our identification sees it in the paper's 72 poses (gravity, cables, "
+        "springs), with the friction, stops, encoders, motors and delays of `mechanisms/mtm.yaml`, which are "
+        "another MTM's. Joint 6 shows no torque in that recording beyond friction, and joint 7 a constant one: "
+        "there the true arm has less to compensate than the real one seems to have had."
     )
     return KnownTruth(dataclasses.replace(true_arm, effects=effects), model, True, origin)
 
@@ -69,8 +69,8 @@ def paper_arm(recording: Recording, folder: Path) -> KnownTruth:
 def unlike_its_drawing(name: str, folder: Path, seed: int) -> KnownTruth:
     """An arm whose links are each up to `SPREAD` heavier or lighter than the SDF's; writes its SDF into `folder`.
 
-    An MTM has no wrist spring then: the identified spring balances an identified wrist, which is heavier than the SDF's,
-    and would exceed the motor's torque at a sixth of all poses.
+    An MTM has no wrist spring then: the identified spring balances an identified wrist, which is heavier than the
+    SDF's, and would exceed the motor's torque at a sixth of all poses.
     """
     arm = load_arm(name)
     generator = np.random.default_rng(seed)
