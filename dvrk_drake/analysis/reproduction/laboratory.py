@@ -106,10 +106,13 @@ class Laboratory:
         what: str,
         parts: Sequence[str] = ("all",),
         damped: bool = False,
+        longest: float = DURATION,
     ) -> Drifts:
-        """Of the arm `name`, at `poses` (m, n), under the model in a file; `parts`, `damped`: see `Release`."""
+        """Of the arm `name`, at `poses` (m, n), under the model in a file, for at most `longest` [s]; `parts` and
+        `damped`: see `Release`."""
+        duration = min(self.extent.duration, longest)
         cases = [
-            Release(name, truth.arm, tuple(parts), str(model), pose, damped, self.extent.duration, self.seed + i)
+            Release(name, truth.arm, tuple(parts), str(model), pose, damped, duration, self.seed + i)
             for i, pose in enumerate(poses)
         ]
         positions = release_all(cases, self.executor, lambda share: self.progress(what, share))
