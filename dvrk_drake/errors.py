@@ -35,3 +35,7 @@ class ScenarioError(DvrkDrakeError):
 
 class CollectionError(DvrkDrakeError):
     """Poses that cannot be visited, or a collection of measurements that cannot go on."""
+
+
+class StudyError(DvrkDrakeError):
+    """A study that cannot be read, run or gone on with."""

@@ -16,6 +16,7 @@ from pydrake.common.yaml import yaml_load_typed
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_schema import (
     ArmDescription,
+    BoundingShapes,
     CoupledLimit,
     Gains,
     Instrument,
@@ -57,6 +58,7 @@ class Arm:
         friction_coordinates: name -> (n,) coefficients of the joints: where parts rub beside joints and actuators.
         motion: how the signals of a recorded motion are treated, one value a joint.
         effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].
+        bounding_shapes: where the mass of the links of each file of `sdf` can be, see `bounding_boxes`.
         effects: what the real arm has beside all that; only a simulation that asks for them has them.
     """
 
@@ -79,6 +81,7 @@ class Arm:
     friction_coordinates: dict[str, NDArray[np.float64]]
     motion: MotionSettings
     effort_cut_off: float
+    bounding_shapes: tuple[BoundingShapes, ...]
     effects: ArmEffects
 
     @property
@@ -247,6 +250,7 @@ def _build_arm(
         },
         motion=motion,
         effort_cut_off=_checked_cut_off(path, mechanism),
+        bounding_shapes=tuple(part.bounding_shapes for part in (mechanism, instrument) if part.sdf),
         effects=_checked_effects(path, mechanism.effects.joined(instrument.effects), joints),
     )
 
@@ -261,7 +265,15 @@ def _motion_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -
             if values and len(values) != len(part.joints):
                 raise ArmError(f"{path}: motion.{which} has {len(values)} numbers for {len(part.joints)} joints")
             both[which] += values or [default] * len(part.joints)
-    return MotionSettings(both["acceleration_cut_off"], both["effort_delay"], mechanism.motion.base_may_tilt)
+    known = {**mechanism.motion.known_effects, **instrument.motion.known_effects}
+    if not all(0 < travel < np.inf for travel in mechanism.motion.presliding_travels):
+        raise ArmError(f"{path}: motion.presliding_travels must be positive numbers")
+    return dataclasses.replace(
+        mechanism.motion,
+        acceleration_cut_off=both["acceleration_cut_off"],
+        effort_delay=both["effort_delay"],
+        known_effects=known,
+    )
 
 
 def _check_limits(path: Path, joint: str, limits: list[float], prismatic: bool) -> None:

@@ -28,12 +28,30 @@ def add_closed_loop(
         effects: torques at the joints beside the plant's own.
         friction: takes a share of the arm's friction off a hand.
     """
-    name = station.arm.name.lower()
     builder.AddSystem(station)
+    connect_controller(builder, station, controller, desired, friction)
+    if effects is not None:
+        name = station.arm.name.lower()
+        builder.AddSystem(effects)
+        builder.Connect(station.GetOutputPort(f"{name}.state_estimated"), effects.get_input_port())
+        builder.Connect(effects.get_output_port(), station.GetInputPort(f"{name}.effort_disturbance"))
+
+
+def connect_controller(
+    builder: DiagramBuilder,
+    station: ArmStation,
+    controller: GravityPidController,
+    desired: System | None = None,
+    friction: FrictionCompensator | None = None,
+) -> None:
+    """Adds a controller and what belongs to it to a `builder` that has the station, and connects them.
+
+    Arguments as of `add_closed_loop`.
+    """
+    name = station.arm.name.lower()
     builder.AddSystem(controller)
-    state = station.GetOutputPort(f"{name}.state_estimated")
+    state, effort = station.GetOutputPort(f"{name}.state_estimated"), controller.GetOutputPort("effort")
     builder.Connect(state, controller.GetInputPort("state_estimated"))
-    effort = controller.GetOutputPort("effort")
     if friction is not None:
         builder.AddSystem(friction)
         builder.Connect(state, friction.GetInputPort("state_estimated"))
@@ -43,7 +61,3 @@ def add_closed_loop(
     if desired is not None:
         builder.AddSystem(desired)
         builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
-    if effects is not None:
-        builder.AddSystem(effects)
-        builder.Connect(station.GetOutputPort(f"{name}.state_true"), effects.get_input_port())
-        builder.Connect(effects.get_output_port(), station.GetInputPort(f"{name}.effort_disturbance"))
