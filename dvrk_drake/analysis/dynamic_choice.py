@@ -1,4 +1,4 @@
-"""Effects in the drives and the direction of gravity, as a motion shows them; how well its phases predict each other."""
+"""Effects in the drives and the direction of gravity, as a motion shows them; how well phases predict each other."""
 
 from __future__ import annotations
 

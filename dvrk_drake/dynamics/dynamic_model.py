@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.dynamics.actuator_effects import effect_coordinates, effect_fault
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
+from dvrk_drake.dynamics.effect_shapes import effect_shapes
 from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES, LinkInertia, pseudo_inertia
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
@@ -55,13 +56,11 @@ class DynamicModel:
 
     def effect_effort(self, q: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
         """(m, n) efforts of the actuators [N m, N] against the effects, over an evenly sampled motion of the joints."""
-        a, a_dot = self.arm.transmission.position(q), self.arm.transmission.velocity(v)
         rows = effect_coordinates(self.arm)
-        tau = np.zeros(a.shape)
-        for effect, coefficient in zip(self.effects, self.coefficients, strict=True):
-            if coefficient:
-                h = rows[effect.coordinate]
-                tau += coefficient * effect.column(a @ h, a_dot @ h)[:, None] * h
+        tau = np.zeros(np.shape(q))
+        shapes = effect_shapes(self.regressor, self.effects, q, v)
+        for effect, coefficient, shape in zip(self.effects, self.coefficients, shapes, strict=True):
+            tau += coefficient * shape[:, None] * rows[effect.coordinate]
         return tau
 
     def effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
