@@ -21,6 +21,7 @@ from dvrk_drake.errors import ArmError, ScenarioError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
+from dvrk_drake.models.gains_file import load_gains
 from dvrk_drake.models.plant import Closure
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.hand import Grip
@@ -33,8 +34,9 @@ LONGEST, LEAST_SAMPLE_PERIOD = 3600.0, 1e-3
 class ControllerScenario:
     """`mode` is "hold" or "gravity"; `model` the file of an identified model, or empty for what the SDF states.
 
-    `gains` replaces the arm's own (kp, kd, ki: one number a joint). `friction_ratio` is the share of the friction that
-    the arm's files state which is compensated, 0..0.9; in mode "gravity" only. `parameter_error` makes the model wrong:
+    `gains` replaces the arm's own (kp, kd, ki: one number a joint; in a file also the name of a file of gains).
+    `friction_ratio` is the share of the friction that the arm's files state which is compensated, 0..0.9; in mode
+    "gravity" only. `parameter_error` makes the model wrong:
     each of its base parameters is multiplied by a factor of its own from 1 - `parameter_error`..1 + `parameter_error`,
     drawn by the scenario's seed. `knows` names those of "cables" and "springs" of the arm's own effects that the model
     has beside the SDF; not for a model from a file.
@@ -247,6 +249,7 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
         content = {"arm": arm_or_file}
     for setting in settings:
         _change(content, setting)
+    _load_gains_of(content)
     for key, value in content.items():
         try:
             yaml_load_typed(schema=Scenario, data=yaml_dump({key: value}))
@@ -259,6 +262,13 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
     except ScenarioError as error:
         raise ScenarioError(f"{arm_or_file}: {error}") from error
     return scenario
+
+
+def _load_gains_of(content: dict[str, Any]) -> None:
+    """Puts what is in a file of gains in the place of its name."""
+    controller = content.get("controller")
+    if isinstance(controller, dict) and isinstance(controller.get("gains"), str):
+        controller["gains"] = dataclasses.asdict(load_gains(controller["gains"]))
 
 
 def _change(content: dict[str, Any], setting: str) -> None:
