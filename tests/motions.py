@@ -42,13 +42,13 @@ def fourier_motion(arm: Arm, generator: np.random.Generator, period: float, seco
 def true_dynamics(
     arm: Arm, generator: np.random.Generator, effects: list[ActuatorEffectEstimate], spread: float = 0.05
 ) -> DynamicModel:
-    """An arm like the SDF's with other links: each is sheared and shifted by this share of its own size."""
+    """An arm like the SDF's with other links: each is sheared and shifted by this share of its own size, or as fits."""
     regressor, boxes = DynamicRegressor(arm), bounding_boxes(arm)
     links = []
     for link in regressor.links:
         size = np.array([*[LinkScale.of(link).length] * 3, 1.0])
-        while True:
-            T = np.eye(4) + spread * generator.normal(size=(4, 4)) * np.outer(size, 1 / size)
+        for share in spread * 0.95 ** np.arange(1000):
+            T = np.eye(4) + share * generator.normal(size=(4, 4)) * np.outer(size, 1 / size)
             T[3, :3] = 0.0
             T[:3, 3] *= link.link not in rotor_links(arm)  # a rotor is balanced
             phi = parameters_from_pseudo_inertia(T @ link.pseudo_inertia() @ T.T)

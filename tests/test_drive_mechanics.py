@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from real_arm import ARMS, Run, middle, weightless
 
+from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, FrictionEffect
+from dvrk_drake.systems.arm_station import ArmStation
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -91,7 +93,7 @@ def test_cables_and_springs_give_back_what_they_take(name):
     assert np.abs(f).max() > 1e-3
 
 
-CABLES = {"outer_yaw": Cable(80.0, 0.05), "elbow_pitch": Cable(60.0, 0.02), "wrist_roll": Cable(0.5, 1e-4)}
+CABLES = {"outer_yaw": Cable(80.0, 0.05), "shoulder_pitch": Cable(60.0, 0.02), "wrist_roll": Cable(0.5, 1e-4)}
 
 
 def stretched(friction=()):
@@ -103,7 +105,7 @@ def test_a_cable_stretches_by_its_load():
     """A motor that holds against an effort on the joints turns by what the cable gives; the encoder sits on it."""
     brakes = [FrictionEffect(f"actuator.{joint}", "viscous", 0.0, 0.5) for joint in load_arm("mtml").joint_names]
     arm, run = stretched(brakes)
-    load = dict.fromkeys(arm.joint_names, 0.0) | {"outer_yaw": 0.8, "elbow_pitch": -0.6, "wrist_roll": 0.01}
+    load = dict.fromkeys(arm.joint_names, 0.0) | {"outer_yaw": 0.8, "shoulder_pitch": -0.6, "wrist_roll": 0.01}
     effort = arm.transmission.pull_back_effort(list(load.values()))
     run.fix("effort_commanded", -effort)
     run.fix("effort_disturbance", effort)
@@ -114,6 +116,12 @@ def test_a_cable_stretches_by_its_load():
         # The tie is a rod whose length is as good as linear in the angle: 1 % at 10 mrad.
         assert stretch[i] == pytest.approx(expected, rel=0.02, abs=2e-4)
     assert np.abs(run.v).max() < 1e-3
+
+
+@pytest.mark.parametrize(("name", "actuator"), [("mtml", "elbow_pitch"), ("psm", "insertion"), ("psm", "jaw")])
+def test_a_cable_whose_rotor_is_not_known_is_refused(name, actuator):
+    with pytest.raises(StationError, match=f"stretch.{actuator}: allowed are actuators that turn one joint alone"):
+        ArmStation(load_arm(name), effects=ArmEffects(stretch={actuator: Cable(100.0)}))
 
 
 def test_cables_that_stretch_give_back_no_more_than_they_hold():

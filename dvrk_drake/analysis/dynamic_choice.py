@@ -1,4 +1,4 @@
-"""The effects that an arm's drives have and the direction of gravity, as a motion shows them; and how well that predicts."""
+"""Effects in the drives and the direction of gravity, as a motion shows them; how well its phases predict each other."""
 
 from __future__ import annotations
 

@@ -23,12 +23,11 @@ from dvrk_drake.models.arm import Arm
 
 #: Widths of the smoothed sign, as shares of the coordinate's standard deviation of speed.
 COULOMB_WIDTHS = (0.03, 0.1, 0.4)
-#: Travel until an elasto-plastic element slips, as shares of the coordinate's standard deviation of position.
-PRESLIDING_TRAVELS = (0.003, 0.01, 0.08, 0.3, 1.0)
 #: The same width for friction that differs by direction or is more at low speeds.
 DIRECTION_WIDTH = 0.1
-#: Torques by position alone that a drive can have: name in an arm's file -> periods a turn of a sine and a cosine.
-POSITION_TORQUES = {"spring": 0.0, "cable 1": 1.0, "cable 2": 2.0}
+ASYMMETRIC = "asymmetric friction"
+#: What an arm's file can say of a drive -> periods a turn of a sine and a cosine.
+NAMED_EFFECTS = {"spring": 0.0, "cable 1": 1.0, "cable 2": 2.0, ASYMMETRIC: 0.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,57 +56,61 @@ class DynamicColumns:
 
 
 def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """What every drive has.
+    """What every drive has, and what the arm's file says that its drives have (`motion.known_effects`).
 
-    Offset and friction that differs by direction at the actuators; viscous, Coulomb and presliding friction everywhere;
-    springs and cables where the arm's file knows of some (`motion.position_torques`).
+    Every actuator has an offset; every coordinate viscous, Coulomb and presliding friction.
 
     Raises:
-        ArmError: the file knows of some where the arm has no such coordinate, or of no such kind.
+        ArmError: the file names a coordinate or a kind that there is not.
     """
-    effects = []
+    known = arm.motion.known_effects
+    if unknown := set(known) - set(distinct_coordinates(arm)):
+        raise ArmError(
+            f"{arm.source}: motion.known_effects: unknown coordinate {', '.join(sorted(unknown))}; "
+            f"known: {', '.join(distinct_coordinates(arm))}"
+        )
+    effects, travels = [], arm.motion.presliding_travels
     for name, x, v in _coordinates(arm, grid):
-        at_actuator = name.startswith("actuator.")
-        if at_actuator:
+        if name.startswith("actuator."):
             effects.append(ActuatorEffect(name, "offset"))
         effects.append(ActuatorEffect(name, "viscous"))
         if v.std() > 0:
             effects += [ActuatorEffect(name, "coulomb", _rounded(w * v.std())) for w in COULOMB_WIDTHS]
-            effects += [ActuatorEffect(name, "presliding", _rounded(d * x.std())) for d in PRESLIDING_TRAVELS]
-            if at_actuator:
-                effects.append(ActuatorEffect(name, "coulomb forward", _rounded(DIRECTION_WIDTH * v.std())))
-            for kind in arm.motion.position_torques.get(name, []):
-                effects += _position_torque(arm, name, kind, x)
-    if unknown := set(arm.motion.position_torques) - set(distinct_coordinates(arm)):
-        known = ", ".join(distinct_coordinates(arm))
-        raise ArmError(f"{arm.source}: motion.position_torques: unknown {', '.join(sorted(unknown))}; known: {known}")
+            effects += [ActuatorEffect(name, "presliding", _rounded(d * x.std())) for d in travels]
+            effects += [effect for which in known.get(name, []) for effect in _named(arm, name, which, x, v)]
     return effects
 
 
 def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """What some drives have beside that: further springs and cables, more friction at low speeds, or by direction."""
+    """What a motion may show beside that: everything that an arm's file can name, and more friction at low speeds."""
     effects = []
     for name, x, v in _coordinates(arm, grid):
         if v.std() == 0:
             continue
-        width = _rounded(DIRECTION_WIDTH * v.std())
-        effects.append(ActuatorEffect(name, "stribeck", width))
-        if not name.startswith("actuator."):
-            effects.append(ActuatorEffect(name, "coulomb forward", width))
-        # Where some are known, more of them say the same between the poses of a motion, and run apart beyond.
-        if name not in arm.motion.position_torques:
-            kinds = list(POSITION_TORQUES) if not slides(arm, name) else ["spring"]
-            effects += [effect for kind in kinds for effect in _position_torque(arm, name, kind, x)]
+        effects.append(ActuatorEffect(name, "stribeck", _rounded(DIRECTION_WIDTH * v.std())))
+        known = arm.motion.known_effects.get(name, [])
+        for which in NAMED_EFFECTS:
+            # Beside known torques by position, others say the same between the poses of a motion, and run apart beyond.
+            by_position = which != ASYMMETRIC
+            if which in known or (by_position and set(known) - {ASYMMETRIC}):
+                continue
+            if which == "spring" or not by_position or not slides(arm, name):
+                effects += _named(arm, name, which, x, v)
     return effects
 
 
-def _position_torque(arm: Arm, coordinate: str, kind: str, x: NDArray[np.float64]) -> list[ActuatorEffect]:
-    where = f"{arm.source}: motion.position_torques.{coordinate}"
-    if kind not in POSITION_TORQUES:
-        raise ArmError(f'{where}: unknown "{kind}"; known: {", ".join(POSITION_TORQUES)}')
-    if kind == "spring":
-        return [ActuatorEffect(coordinate, kind, _rounded(1.01 * np.abs(x).max()))]
-    effects = [ActuatorEffect(coordinate, k, POSITION_TORQUES[kind]) for k in ("cable sine", "cable cosine")]
+def _named(
+    arm: Arm, coordinate: str, which: str, x: NDArray[np.float64], v: NDArray[np.float64]
+) -> list[ActuatorEffect]:
+    """What an arm's file calls `which`."""
+    where = f"{arm.source}: motion.known_effects.{coordinate}"
+    if which not in NAMED_EFFECTS:
+        raise ArmError(f'{where}: unknown "{which}"; known: {", ".join(NAMED_EFFECTS)}')
+    if which == ASYMMETRIC:
+        return [ActuatorEffect(coordinate, "coulomb forward", _rounded(DIRECTION_WIDTH * v.std()))]
+    if which == "spring":
+        return [ActuatorEffect(coordinate, "spring", _rounded(1.01 * np.abs(x).max()))]
+    effects = [ActuatorEffect(coordinate, kind, NAMED_EFFECTS[which]) for kind in ("cable sine", "cable cosine")]
     if fault := effect_fault(arm, effects[0]):
         raise ArmError(f"{where}: {fault}")
     return effects

@@ -33,7 +33,10 @@ def parameter_covariance(
 
     P being what the priors know and Omega_i the covariance of actuator i's error over time, as the residuals show it:
     errors that last (friction that is not modelled quite right) count as few measurements, and those that come again
-    in every period of the motion count once, whatever the number of periods.
+    in every period of the motion count once, whatever the number of periods. Residuals of a fit are smaller than the
+    errors where it could bend to them, those of phases that it has not seen are larger by as much: with H the hat
+    matrix, (1 - H) e and e / (1 - H). The products of one with the other are neither (MacKinnon and White, "Some
+    heteroskedasticity-consistent covariance matrix estimators", 1985: HC2).
 
     Args:
         problem, fit: as solved.
@@ -46,27 +49,47 @@ def parameter_covariance(
     rows = slice(None, None, step)
     A = _inverse(fit.information + fit.prior_precision)
     middle = fit.prior_precision.copy()
+    unseen = _unseen_residuals(problem, fit, residuals)
     for i, weight in enumerate(fit.weights):
-        X = problem.chosen_columns(i, fit.chosen)
+        covariance = error_covariance(residuals[rows, i], unseen[rows, i], rate / step, period)
+        X = problem.chosen_columns(i, fit.chosen)[rows]
         moved = np.flatnonzero(np.any(X, axis=0))
-        X = X[rows, moved]
-        used = weight * step * float(np.sum((X @ A[np.ix_(moved, moved)]) * X))
-        covariance = error_covariance(residuals[rows, i], rate / step, period)
-        # The fit has taken part of the errors away: so many parameters from so many independent measurements.
-        count = independent_measurements(covariance)
-        spread = matmul_toeplitz(covariance, X) / max(1 - used / count, 0.1)
-        middle[np.ix_(moved, moved)] += (weight * step) ** 2 * (X.T @ spread)
+        X = X[:, moved]
+        middle[np.ix_(moved, moved)] += (weight * step) ** 2 * (X.T @ matmul_toeplitz(covariance, X))
     return np.asarray(A @ middle @ A, dtype=np.float64)
 
 
-def error_covariance(error: NDArray[np.float64], rate: float, period: float | None) -> NDArray[np.float64]:
-    """(r,) covariance of an actuator's error (r,) with itself, by how many rows later.
+def _unseen_residuals(
+    problem: DynamicProblem, fit: ConsistentFit, residuals: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(r, n) what is left of each fold by the fit to the others: one step of Newton's, exact but for inequalities."""
+    unseen = residuals.copy()
+    free = np.flatnonzero(fit.x > fit.lower)
+    columns = [problem.chosen_columns(i, fit.chosen)[:, free] for i in range(residuals.shape[1])]
+    known = (fit.information + fit.prior_precision)[np.ix_(free, free)]
+    for fold in range(int(problem.fold.max()) + 1):
+        rows = problem.fold == fold
+        X, e = [x[rows] for x in columns], residuals[rows].T
+        own = sum(weight * x.T @ x for weight, x in zip(fit.weights, X, strict=True))
+        slope = sum(weight * x.T @ left for weight, x, left in zip(fit.weights, X, e, strict=True))
+        step = _inverse(known - own) @ slope
+        unseen[rows] += np.column_stack([x @ step for x in X])
+    return unseen
+
+
+def error_covariance(
+    seen: NDArray[np.float64], unseen: NDArray[np.float64], rate: float, period: float | None
+) -> NDArray[np.float64]:
+    """(r,) covariance of an actuator's error with itself, by how many rows later.
+
+    `seen` and `unseen` (r,) are its residuals when the fit knew these rows and when it did not.
 
     Up to `MEMORY` it is the error's own, tapered (Parzen's window); whole periods later that of the part of it that
     repeats, which is what the first repetition shows.
     """
-    count = len(error)
-    lags = correlate(error, error, method="fft")[count - 1 :] / np.arange(count, 0, -1)
+    count = len(seen)
+    both = correlate(seen, unseen, method="fft")
+    lags = (both + both[::-1])[count - 1 :] / 2 / np.arange(count, 0, -1)
     reach = min(round(MEMORY * rate), count - 1)
     window = _parzen(np.arange(-reach, reach + 1) / reach)
     near = np.concatenate([lags[reach:0:-1], lags[: reach + 1]]) * window

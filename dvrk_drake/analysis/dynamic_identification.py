@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.dynamic_choice import choose_effects, left_out_errors
 from dvrk_drake.analysis.dynamic_columns import drive_effects, dynamic_columns, optional_effects
 from dvrk_drake.analysis.dynamic_covariance import parameter_covariance
+from dvrk_drake.analysis.dynamic_estimates import DynamicEstimates
 from dvrk_drake.analysis.dynamic_problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.dynamic_statics import base_parameter_estimates
 from dvrk_drake.analysis.motion_grid import MotionGrid, default_settings, motion_grid
@@ -23,11 +24,9 @@ from dvrk_drake.dynamics.dynamic_section import (
     ActuatorEffectEstimate,
     ActuatorStatistics,
     DynamicSection,
-    LinkEstimate,
     RotorEstimate,
 )
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics, Provenance
-from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
 
@@ -44,6 +43,8 @@ class DynamicIdentification:
         grid: the motion.
         period: after which the motion repeats [s], or None.
         measured, predicted: (r, n) efforts of the actuators behind the filter, ends left out [N m, N].
+        dry_friction: coordinate -> Coulomb and presliding friction together and its standard error [N m, N].
+        nominal_mass: of all links as the SDF has them [kg].
     """
 
     model: IdentifiedModel
@@ -51,6 +52,8 @@ class DynamicIdentification:
     period: float | None
     measured: NDArray[np.float64]
     predicted: NDArray[np.float64]
+    dry_friction: dict[str, tuple[float, float]]
+    nominal_mass: float
 
 
 def identify_dynamic(
@@ -85,10 +88,15 @@ def identify_dynamic(
     left_out = left_out_errors(choice, fit.x[: problem.num_rigid], lambda share: progress(0.55 + 0.45 * share))
     left = residuals(problem, chosen, fit)
     covariance = parameter_covariance(problem, fit, left, grid.rate, grid.settings.effort_cut_off, period)
+    estimates = DynamicEstimates(problem, fit, covariance)
     section = _section(problem, chosen, fit, covariance, left_out, grid, tau, period)
+    section.links = estimates.links()
+    section.base_parameters, section.correlations = estimates.base_parameters()
     model = _model(recording, arm, section, covariance)
     progress(1.0)
-    return DynamicIdentification(model, grid, period, problem.columns.tau, problem.columns.tau - left)
+    predicted = problem.columns.tau - left
+    nominal = float(sum(link.parameters[0] for link in problem.regressor.links))
+    return DynamicIdentification(model, grid, period, problem.columns.tau, predicted, estimates.dry_friction(), nominal)
 
 
 def motion_problem(
@@ -130,10 +138,6 @@ def _section(
 ) -> DynamicSection:
     arm, p = grid.arm, problem.num_rigid
     sd = np.sqrt(np.diag(covariance))
-    links = [
-        LinkEstimate(link.link, [float(v) for v in x], float(np.linalg.eigvalsh(pseudo_inertia(x))[0]))
-        for link, x in zip(problem.regressor.links, fit.x[: p - arm.num_joints].reshape(-1, 10), strict=True)
-    ]
     rotors = [
         RotorEstimate(name, float(fit.x[i]), float(sd[i]))
         for i, name in enumerate(arm.joint_names, start=p - arm.num_joints)
@@ -159,7 +163,7 @@ def _section(
     gravity = problem.regressor.arm.gravity + np.append(problem.tilt, 0.0)
     gravity *= np.linalg.norm(problem.regressor.arm.gravity) / np.linalg.norm(gravity)
     expected = [float(g) for g in arm.gravity]
-    return DynamicSection([float(g) for g in gravity], links, rotors, effects, actuators, grid.settings, expected)
+    return DynamicSection([float(g) for g in gravity], [], rotors, effects, actuators, grid.settings, expected)
 
 
 def _model(recording: Recording, arm: Arm, section: DynamicSection, covariance: NDArray[np.float64]) -> IdentifiedModel:

@@ -254,4 +254,4 @@ class ConsistentProgram:
         R = np.linalg.cholesky(H * np.outer(scale, scale)).T
         b = np.linalg.solve(R.T, (sums[:-1, -1] + self.precision * self._mean) * scale)
         problem = self._problem
-        return consistent_parameters(R / scale, b, problem.regressor.links, problem.boxes, self.lower, scale)
+        return consistent_parameters(R / scale, b, problem.regressor.links, problem.boxes, self.lower)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.normal_equations import NormalEquations, solve, squared_errors
 
-#: An effect must lower the cross-validated error, relative and averaged over the actuators, by this much. What gains less
-#: is chosen by chance: on the public motions other phases choose other ones, which predict the left-out phases worse.
+#: An effect must lower the cross-validated error, relative and averaged over the actuators, by this much. What gains
+#: less is chosen by chance: on the public motions other phases choose others, which predict the left-out phases worse.
 LEAST_GAIN = 0.005
 #: So many of the effects that promise most are tried at every step.
 TRIALS = 8

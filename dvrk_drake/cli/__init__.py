@@ -22,6 +22,7 @@ from dvrk_drake.cli import (
     payload,
     recalibrate,
     record,
+    reproduce,
     simulate,
     study,
     transparency,
@@ -60,7 +61,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("dvrk-drake"))
     verbs = parser.add_subparsers(required=True, metavar="VERB")
-    offline = (model, check, identify, recalibrate, payload, export, simulate, study, tune, transparency, demo)
-    for module in (*offline, lcm, record, collect):
+    of_recordings = (check, identify, recalibrate, payload, export)
+    simulated = (simulate, study, tune, transparency, reproduce, demo)
+    for module in (model, *of_recordings, *simulated, lcm, record, collect):
         module.add_verbs(verbs)
     return parser

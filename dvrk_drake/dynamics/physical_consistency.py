@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
+from pydrake.solvers import ClarabelSolver, MathematicalProgram, MathematicalProgramResult, SolverOptions
+from pydrake.symbolic import Expression
 
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, pseudo_inertia
 from dvrk_drake.errors import IdentificationError
@@ -28,6 +29,8 @@ _TOLERANCE = 1e-8
 #: Nearer to a bound than this share of it, a parameter is at the bound.
 _AT_BOUND = 1e-3
 _UNITS = np.eye(10)
+#: Of the way to the cones' boundary that a step may go, tried one after the other; the first is Clarabel's default.
+_STEP_FRACTIONS = (0.99, 0.95, 0.9)
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,6 @@ def consistent_parameters(
     links: Sequence[LinkInertia],
     boxes: Mapping[str, BoundingBox],
     lower: NDArray[np.float64],
-    scale: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """x (p,) that minimises |R x - b|^2 / 2 + the log-det prior such that every link can exist and x >= lower.
 
@@ -84,42 +86,50 @@ def consistent_parameters(
         links: as the SDF has them.
         boxes: link -> where its mass can be.
         lower: (p,) bounds, -inf where there is none.
-        scale: (p,) typical sizes of x, by which the program is scaled.
 
     Raises:
         IdentificationError: the solver did not converge.
     """
     program = MathematicalProgram()
-    y = program.NewContinuousVariables(len(scale), "y")  # x = scale * y
-    A = R * scale
-    program.AddQuadraticCost(A.T @ A, -A.T @ b, y, is_convex=True)
+    # In z = R x the cost is a sphere: what motions tell differs by many decades, which no scaling of x takes away.
+    z = program.NewContinuousVariables(len(b), "z")
+    to_x = np.asarray(np.linalg.inv(R), dtype=np.float64)
+    program.AddQuadraticCost(np.eye(len(b)), -b, z, is_convex=True)
     bounded = np.flatnonzero(np.isfinite(lower))
-    bound = lower[bounded] / scale[bounded]
-    program.AddBoundingBoxConstraint(bound, np.full(len(bounded), np.inf), y[bounded])
+    size = np.linalg.norm(to_x[bounded], axis=1)
+    high = np.full(len(bounded), np.inf)
+    program.AddLinearConstraint(to_x[bounded] / size[:, None], lower[bounded] / size, high, z)
     for k, link in enumerate(links):
-        chosen = slice(10 * k, 10 * k + 10)
-        _add_prior(program, y[chosen], scale[chosen], link)
-        _constrain_link(program, y[chosen], scale[chosen], link, boxes[link.link])
-    total = _total_mass(links)
-    masses = np.arange(0, 10 * len(links), 10)
+        to_link = to_x[10 * k : 10 * k + 10]
+        _add_prior(program, z, to_link, link)
+        _constrain_link(program, z, to_link, link, boxes[link.link])
     share = TOTAL_MASS_TOLERANCE
-    program.AddLinearConstraint(scale[masses][None] / total, [1 - share], [1 + share], y[masses])
-    options = SolverOptions()
-    for name in ("tol_gap_abs", "tol_gap_rel", "tol_feas"):
-        options.SetOption(ClarabelSolver.id(), name, _TOLERANCE)
-    result = ClarabelSolver().Solve(program, None, options)
-    details = result.get_solver_details()
-    # Drake counts what Clarabel calls AlmostSolved, at a reduced accuracy, as a success.
-    if not result.is_success() or details.status != "Solved":
-        raise IdentificationError(
-            f"the program for physically consistent parameters did not converge: Clarabel says {details.status} after "
-            f"{details.iterations} iterations; are efforts and positions this arm's?"
-        )
-    x = np.asarray(result.GetSolution(y), dtype=float) * scale
+    total = np.sum(to_x[: 10 * len(links) : 10], axis=0) / _total_mass(links)
+    program.AddLinearConstraint(total[None], [1 - share], [1 + share], z)
+    result = _solve(program)
+    x = to_x @ np.asarray(result.GetSolution(z), dtype=float)
     # Interior-point solutions keep their inequalities to the tolerance; these are kept exactly.
     x[bounded] = np.maximum(x[bounded], lower[bounded])
     _check(x, links)
     return x
+
+
+def _solve(program: MathematicalProgram) -> MathematicalProgramResult:
+    """Solves to full accuracy, with shorter steps where rounding stops Clarabel's own short of it."""
+    for fraction in _STEP_FRACTIONS:
+        options = SolverOptions()
+        options.SetOption(ClarabelSolver.id(), "max_step_fraction", fraction)
+        for name in ("tol_gap_abs", "tol_gap_rel", "tol_feas"):
+            options.SetOption(ClarabelSolver.id(), name, _TOLERANCE)
+        result = ClarabelSolver().Solve(program, None, options)
+        details = result.get_solver_details()
+        # Drake counts what Clarabel calls AlmostSolved, at a reduced accuracy, as a success.
+        if result.is_success() and details.status == "Solved":
+            return result
+    raise IdentificationError(
+        f"the program for physically consistent parameters did not converge: Clarabel says {details.status} after "
+        f"{details.iterations} iterations; are efforts and positions this arm's?"
+    )
 
 
 def log_det_curvature(x: NDArray[np.float64], links: Sequence[LinkInertia]) -> NDArray[np.float64]:
@@ -156,33 +166,35 @@ def reached_bounds(parameters: NDArray[np.float64], link: LinkInertia, box: Boun
     return bounds
 
 
-def total_mass_reached(x: NDArray[np.float64], links: Sequence[LinkInertia]) -> bool:
-    """Whether the mass of all links of x (p,) lies at the edge of what `TOTAL_MASS_TOLERANCE` allows."""
-    ratio = float(np.sum(x[: 10 * len(links) : 10])) / _total_mass(links)
-    return abs(ratio - 1) > TOTAL_MASS_TOLERANCE - _AT_BOUND
+def total_mass_reached(total: float, nominal: float) -> bool:
+    """Whether the mass of all links [kg] lies at the edge of what the SDF's, `nominal`, allows."""
+    return abs(total / nominal - 1) > TOTAL_MASS_TOLERANCE - _AT_BOUND
 
 
-def _add_prior(program: MathematicalProgram, y: NDArray, scale: NDArray[np.float64], link: LinkInertia) -> None:
+def _add_prior(program: MathematicalProgram, z: NDArray, to_link: NDArray[np.float64], link: LinkInertia) -> None:
     floor = least_eigenvalue_bound(link) * np.eye(4)
     # With S0 = L L', Z = L^-1 S L^-T is 1 at the SDF's, whatever the link's size; log det S differs by a constant.
     L_inverse = np.linalg.inv(np.linalg.cholesky(link.pseudo_inertia() - floor))
-    units = [
-        factor * L_inverse @ pseudo_inertia(unit) @ L_inverse.T for factor, unit in zip(scale, _UNITS, strict=True)
-    ]
-    Z = np.tensordot(y, units, axes=(0, 0)) - L_inverse @ floor @ L_inverse.T
-    program.AddLinearCost(LOG_DET_WEIGHT * np.trace(units, axis1=1, axis2=2), y)
-    cost, terms, _ = program.AddMaximizeLogDeterminantCost(Z)
+    units = np.array([L_inverse @ pseudo_inertia(unit) @ L_inverse.T for unit in _UNITS])
+    Z = program.NewSymmetricContinuousVariables(4, "Z")
+    below = np.tril_indices(4)
+    entries = np.hstack([units[:, *below].T @ to_link, -np.eye(10)])
+    program.AddLinearEqualityConstraint(
+        entries, (L_inverse @ floor @ L_inverse.T)[below], np.concatenate([z, Z[below]])
+    )
+    program.AddLinearCost(np.full(4, LOG_DET_WEIGHT), np.diag(Z))
+    cost, terms, _ = program.AddMaximizeLogDeterminantCost(Z.astype(Expression))
     program.RemoveCost(cost)
     program.AddLinearCost(np.full(4, -LOG_DET_WEIGHT), terms)
 
 
 def _constrain_link(
-    program: MathematicalProgram, y: NDArray, scale: NDArray[np.float64], link: LinkInertia, box: BoundingBox
+    program: MathematicalProgram, z: NDArray, to_link: NDArray[np.float64], link: LinkInertia, box: BoundingBox
 ) -> None:
     mass = link.parameters[0]
-    low, high = (share * mass / scale[0] for share in MASS_RANGE)
-    program.AddBoundingBoxConstraint(low, high, y[0])
-    program.AddLinearConstraint(_room(box) * scale / mass, np.zeros(3), np.full(3, np.inf), y)
+    low, high = MASS_RANGE
+    program.AddLinearConstraint(to_link[:1] / mass, [low], [high], z)
+    program.AddLinearConstraint(_room(box) @ to_link / mass, np.zeros(3), np.full(3, np.inf), z)
 
 
 def _room(box: BoundingBox) -> NDArray[np.float64]:

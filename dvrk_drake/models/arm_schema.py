@@ -40,15 +40,18 @@ class MotionSettings:
     """How the signals of a recorded motion are treated; per joint, in the order of the joints that the file has.
 
     `acceleration_cut_off` [Hz] of the low-pass for accelerations, `effort_delay` [s] by which the recorded effort is
-    later than the positions (negative: earlier). `position_torques` are those that the drives are known to have: name
-    of a coordinate of the drive (`effect_coordinates`) -> "spring", "cable 1" (sine and cosine of one period a turn),
-    "cable 2" (of two). Of a mechanism also `base_may_tilt`, whether the direction of gravity is estimated from a motion.
+    later than the positions (negative: earlier). `known_effects` are what drives have beside friction: name of a
+    coordinate of the drive (`effect_coordinates`) -> "spring", "cable 1" (sine and cosine of one period a turn),
+    "cable 2" (of two), "asymmetric friction". Of a mechanism also `base_may_tilt`, whether the direction of gravity is
+    estimated from a motion, and `presliding_travels`, over which elasto-plastic elements give way, as shares of a
+    coordinate's standard deviation of position.
     """
 
     acceleration_cut_off: list[float] = field(default_factory=list)
     effort_delay: list[float] = field(default_factory=list)
     base_may_tilt: bool = False
-    position_torques: dict[str, list[str]] = field(default_factory=dict)
+    known_effects: dict[str, list[str]] = field(default_factory=dict)
+    presliding_travels: list[float] = field(default_factory=lambda: [0.003, 0.01, 0.08, 0.3, 1.0])
 
 
 @dataclass
@@ -117,8 +120,9 @@ class ArmDescription:
 
     `mechanism` and `instrument` are names of files in their folders, or paths of YAML files from the arm's own folder;
     the `sdf` of such a file is a path from the folder that it is in. `gravity` is the gravity vector [m/s^2] in the
-    arm's base frame. `coupled_limits` replaces [lower, upper] of the mechanism's coupled limits by name, for an arm
-    whose stops were calibrated.
+    arm's base frame. `mirrored_links` names, by SDF file, links of which this arm has the mirror image (x to -x in the
+    link's frame); another SDF, such as one that was exported of this arm, is taken as it is. `coupled_limits` replaces
+    [lower, upper] of the mechanism's coupled limits by name, for an arm whose stops were calibrated.
     """
 
     name: str = ""
@@ -126,4 +130,5 @@ class ArmDescription:
     instrument: str = ""
     position_limits: dict[str, list[float]] = field(default_factory=dict)
     coupled_limits: dict[str, list[float]] = field(default_factory=dict)
+    mirrored_links: dict[str, list[str]] = field(default_factory=dict)
     gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81])

@@ -1,4 +1,4 @@
-"""Where the mass of an arm's links can be: boxes around the shapes that the SDF draws, or those that the arm's files state."""
+"""Where the mass of an arm's links can be: boxes around what the SDF draws, or those that the arm's files state."""
 
 from __future__ import annotations
 
