@@ -65,7 +65,7 @@ def print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
     console.print(table)
     console.print(
         "inertia in the joint box: least, all other joints free, and largest, all others held [kg m^2; kg]; margins\n"
-        f"at these. All frequencies were multiplied by {design.slowed:.2f}, so that all joints are stable together.\n",
+        "at these. Limited by the other joints: slower than alone, so that all are stable together.\n",
         markup=False,
     )
 
