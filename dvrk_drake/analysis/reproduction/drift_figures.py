@@ -207,7 +207,7 @@ def _plots(
 def _plot_time(
     path: Path, what: str, ours: NDArray[np.float64], paper: NDArray[np.float64], trial: Sequence[float]
 ) -> None:
-    figure, axes = plt.subplots(2, 4, figsize=(13, 6.5), layout="constrained", sharex=True)
+    figure, axes = plt.subplots(2, 4, figsize=(13, 6.5), layout="constrained")
     t = SAMPLE_PERIOD * np.arange(len(ours))
     for j, ax in enumerate(axes.flat[:7]):
         ax.axhspan(-BAND[0], BAND[0], color="#dddddd", label="15 mrad")
@@ -231,7 +231,8 @@ def _plot_distribution(path: Path, what: str, ours: Drifts, paper: Drifts, means
     for j, ax in enumerate(axes.flat[:7]):
         for drifts, colour, label in ((paper, MEASURED_COLOUR, "the paper's parameters"), (ours, MODEL_COLOUR, "ours")):
             sizes = np.sort(np.maximum(drifts.largest[:, j], 1e-5))
-            ax.step(sizes, 100 * np.arange(1, len(sizes) + 1) / len(sizes), where="post", color=colour, label=label)
+            shares = 100 * np.arange(len(sizes) + 1) / len(sizes)
+            ax.step(np.append(sizes[0], sizes), shares, where="post", color=colour, label=label)
         ax.axvline(BAND[0], color="#8d8d8d", label="15 mrad")
         if j:
             ax.axvline(means[j - 1], color="black", linestyle=":", label="published, mean of five trials")
