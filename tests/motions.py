@@ -14,9 +14,10 @@ from dvrk_drake.dynamics.dynamic_section import (
     SignalSettings,
 )
 from dvrk_drake.dynamics.inertial_parameters import parameters_from_pseudo_inertia
-from dvrk_drake.dynamics.physical_consistency import LinkScale
+from dvrk_drake.dynamics.physical_consistency import LinkScale, reached_bounds
 from dvrk_drake.dynamics.rotor_inertia import rotor_links
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.bounding_boxes import bounding_boxes
 from dvrk_drake.models.recording import Recording
 
 
@@ -38,17 +39,22 @@ def fourier_motion(arm: Arm, generator: np.random.Generator, period: float, seco
     return t, center + size * shape, size * v, size * (-(w**2 * sines) @ a.T - (w**2 * cosines) @ b.T)
 
 
-def true_dynamics(arm: Arm, generator: np.random.Generator, effects: list[ActuatorEffectEstimate]) -> DynamicModel:
-    """An arm like the SDF's with other links: each is sheared and shifted by a share of its own size."""
-    regressor = DynamicRegressor(arm)
+def true_dynamics(
+    arm: Arm, generator: np.random.Generator, effects: list[ActuatorEffectEstimate], spread: float = 0.05
+) -> DynamicModel:
+    """An arm like the SDF's with other links: each is sheared and shifted by this share of its own size, or as fits."""
+    regressor, boxes = DynamicRegressor(arm), bounding_boxes(arm)
     links = []
     for link in regressor.links:
         size = np.array([*[LinkScale.of(link).length] * 3, 1.0])
-        T = np.eye(4) + 0.05 * generator.normal(size=(4, 4)) * np.outer(size, 1 / size)
-        T[3, :3] = 0.0
-        T[:3, 3] *= link.link not in rotor_links(arm)  # a rotor is balanced
-        J = T @ link.pseudo_inertia() @ T.T
-        links.append(LinkEstimate(link.link, [float(x) for x in parameters_from_pseudo_inertia(J)]))
+        for share in spread * 0.95 ** np.arange(1000):
+            T = np.eye(4) + share * generator.normal(size=(4, 4)) * np.outer(size, 1 / size)
+            T[3, :3] = 0.0
+            T[:3, 3] *= link.link not in rotor_links(arm)  # a rotor is balanced
+            phi = parameters_from_pseudo_inertia(T @ link.pseudo_inertia() @ T.T)
+            if not reached_bounds(phi, link, boxes[link.link]):
+                break
+        links.append(LinkEstimate(link.link, [float(x) for x in phi]))
     rotors = [
         RotorEstimate(name, float(rotor.value * generator.uniform(0.8, 1.2)))
         for name, rotor in zip(arm.joint_names, regressor.rotors, strict=False)
@@ -61,10 +67,31 @@ def true_dynamics(arm: Arm, generator: np.random.Generator, effects: list[Actuat
 def recorded(
     model: DynamicModel, motion, noise: float, generator: np.random.Generator, rate: float = 200.0
 ) -> Recording:
-    """The motion, sampled at 1 kHz, as it would be recorded at `rate`, with noise of a share of each effort's RMS."""
+    """The motion, sampled at 1 kHz, as it would be recorded at `rate`, with noise of a share of each effort's RMS.
+
+    Efforts are late as the arm's file says that they are.
+    """
     t, q, v, vd = motion
     J = model.arm.transmission
-    tau = model.effort(q, v, vd)
+    late = zip(model.arm.motion.effort_delay, model.effort(q, v, vd).T, strict=True)
+    tau = np.column_stack([np.interp(t - delay, t, effort) for delay, effort in late])
     tau = tau + noise * np.sqrt(np.mean(tau**2, axis=0)) * generator.normal(size=tau.shape)
     every = slice(None, None, round(1000 / rate))
     return Recording(q=q[every], qd=v[every], tau=J.pull_back_effort(tau)[every], t=t[every], source="simulated")
+
+
+def friction_everywhere(arm: Arm, motion, share: float = 0.2) -> list[ActuatorEffectEstimate]:
+    """Viscous, Coulomb and presliding friction at every actuator, each a share of the RMS effort of the SDF's arm."""
+    _, q, v, vd = motion
+    without = true_dynamics(arm, np.random.default_rng(0), [])
+    effort = np.sqrt(np.mean(without.effort(q, v, vd) ** 2, axis=0))
+    speed, travel = arm.transmission.velocity(v).std(axis=0), arm.transmission.position(q).std(axis=0)
+    effects = []
+    for i, joint in enumerate(arm.joint_names):
+        at, size = f"actuator.{joint}", float(share * effort[i])
+        effects += [
+            ActuatorEffectEstimate(at, "viscous", 0.0, float(size / speed[i])),
+            ActuatorEffectEstimate(at, "coulomb", float(f"{0.1 * speed[i]:.3g}"), size),
+            ActuatorEffectEstimate(at, "presliding", float(f"{0.08 * travel[i]:.3g}"), size),
+        ]
+    return effects

@@ -1,19 +1,26 @@
 """Full dynamics of simulated arms whose truth is known, from motion to model file to prediction."""
 
+import dataclasses
+from io import StringIO
+
 import numpy as np
 import pytest
-from motions import fourier_motion, recorded, true_dynamics
+from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
+from rich.console import Console
 
 from dvrk_drake.analysis.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic_statics import base_parameter_map
+from dvrk_drake.analysis.dynamic_tables import print_dynamics
 from dvrk_drake.analysis.dynamic_validation import predict_motion, validate_motion
+from dvrk_drake.analysis.tables import TABLE_WIDTH
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.models.recording import Recording, write_recording
 
 NOISE = 0.05
 RATE = 1000.0
@@ -23,19 +30,7 @@ def simulated(name, seed):
     """An arm with friction at every actuator, and its motion: truth, recording, generator."""
     arm, generator = load_arm(name), np.random.default_rng(seed)
     motion = fourier_motion(arm, generator, 10.0, 20.0, RATE)
-    _, q, v, vd = motion
-    without = true_dynamics(arm, np.random.default_rng(seed), [])
-    effort = np.sqrt(np.mean(without.effort(q, v, vd) ** 2, axis=0))
-    speed, travel = arm.transmission.velocity(v).std(axis=0), arm.transmission.position(q).std(axis=0)
-    effects = []
-    for i, joint in enumerate(arm.joint_names):
-        at = f"actuator.{joint}"
-        effects += [
-            ActuatorEffectEstimate(at, "viscous", 0.0, float(0.2 * effort[i] / speed[i])),
-            ActuatorEffectEstimate(at, "coulomb", float(f"{0.1 * speed[i]:.3g}"), float(0.2 * effort[i])),
-            ActuatorEffectEstimate(at, "presliding", float(f"{0.08 * travel[i]:.3g}"), float(0.2 * effort[i])),
-        ]
-    truth = true_dynamics(arm, np.random.default_rng(seed), effects)
+    truth = true_dynamics(arm, np.random.default_rng(seed), friction_everywhere(arm, motion))
     return arm, truth, recorded(truth, motion, NOISE, generator)
 
 
@@ -73,6 +68,39 @@ def test_true_base_parameters_and_rotors_lie_in_their_intervals(case):
     z += [(e.value - t.value) / e.standard_error for e, t in rotors if t.value > 0]
     # 95 % intervals of some twenty numbers: at least 90 % inside, none far off.
     assert np.mean(np.abs(z) < 1.96) >= 0.9 and np.max(np.abs(z)) < 4
+
+
+def test_base_parameters_of_the_motion_lie_in_their_intervals(case):
+    """All that the motion tells of links and rotors, by name."""
+    _, truth, _, result = case
+    base = derive_base_parameters(truth.regressor, coupled_rotors=False)
+    found = result.model.dynamics.base_parameters
+    assert [p.name for p in found] == list(base.base.names)
+    beta = base.combination @ truth.parameters[: base.combination.shape[1]]
+    z = [(p.value - b) / p.standard_error for p, b in zip(found, beta, strict=True) if p.told > 0.5]
+    assert len(z) > 20
+    assert np.mean(np.abs(z) < 1.96) >= 0.9 and np.max(np.abs(z)) < 4
+    # A prior that the motion does not change keeps its variance; one that it does becomes narrower.
+    assert all(0 <= p.told <= 1 for p in found) and min(p.told for p in found) < 0.2
+
+
+def test_all_that_is_printed_fits_a_hundred_columns(case):
+    """The short form counts what it leaves out; the full one names every parameter."""
+    _, _, _, result = case
+    texts = []
+    for full in (False, True):
+        console = Console(file=StringIO(), highlight=False, width=TABLE_WIDTH)
+        print_dynamics(console, result, full)
+        texts.append(console.file.getvalue())
+    short, whole = texts
+    rows = [line for line in short.splitlines() if not line.startswith(("*", "+-:", "not told", "gravity"))]
+    assert max(map(len, rows)) <= 100
+    count = len(result.model.dynamics.base_parameters)
+    assert f"of {count}: " in short and len(short.splitlines()) < 0.7 * len(whole.splitlines())
+    section = result.model.dynamics
+    folded = "".join(whole.split())
+    assert all("".join(p.name.split()) in folded for p in section.base_parameters if len(p.name) < 60)
+    assert all(link.link in short and link.link in whole for link in section.links)
 
 
 def test_true_friction_is_found(case):
@@ -118,6 +146,27 @@ def test_the_model_file_keeps_all_of_it(case, tmp_path):
     (tmp_path / "bad.yaml").write_text(text.replace(str(heavy[4]), "-1.0", 1))
     with pytest.raises(ModelError, match="no body has the inertia of"):
         IdentifiedModel.load(tmp_path / "bad.yaml")
+
+
+def test_verbs_check_a_motion_first_and_refuse_it(case, tmp_path, capsys):
+    """One effort of 500 N m, as a torn line of a file gives: neither identified from, nor compared, nor predicted."""
+    arm, _, recording, result = case
+    tau = recording.tau.copy()
+    tau[500, 1] = 500.0
+    paths = {name: str(tmp_path / name) for name in ("good.csv", "bad.csv", "model.yaml", "out.csv")}
+    write_recording(recording, paths["good.csv"])
+    write_recording(dataclasses.replace(recording, tau=tau), paths["bad.csv"])
+    result.model.save(paths["model.yaml"])
+    for command in (
+        ["identify", paths["bad.csv"], "--arm", arm.source, "--output", str(tmp_path / "new.yaml")],
+        ["validate", paths["model.yaml"], paths["bad.csv"]],
+        ["predict", paths["model.yaml"], paths["bad.csv"], "--output", paths["out.csv"]],
+    ):
+        assert main(command) == 2
+        output = capsys.readouterr()
+        assert "refusal" in output.out and "refused, see above and dvrk-drake check" in output.err
+    assert not (tmp_path / "new.yaml").exists() and not (tmp_path / "out.csv").exists()
+    assert main(["validate", paths["model.yaml"], paths["good.csv"]]) == 0
 
 
 def test_in_actuator_coordinates_it_is_the_same_model(case):

@@ -16,6 +16,11 @@ MTM = load_arm("mtml")
 T = np.arange(0, 20.001, 0.01)
 
 
+def state(q):
+    """What is true: the recordings here are 10 mrad beside it, which must not count."""
+    return np.hstack([q, 0 * q])
+
+
 def released(**motions):
     """Scenario and run of an MTM in mode "gravity": joints named move as said, the others rest."""
     scenario = Scenario(arm="mtml", duration=20.0)
@@ -24,7 +29,7 @@ def released(**motions):
     for joint, motion in motions.items():
         q[:, MTM.joint_names.index(joint)] = motion
     tau = np.tile(0.25 * MTM.effort_limits, (len(T), 1))
-    return scenario, Simulation(Recording(q=q, qd=np.zeros_like(q), tau=tau, t=T), None)
+    return scenario, Simulation(Recording(q=q + 0.01, qd=0 * q, tau=tau, t=T), state(q), None, None)
 
 
 def stepped(motion):
@@ -34,7 +39,7 @@ def stepped(motion):
     q[:, 2] = motion
     desired = np.zeros_like(q)
     desired[:, 2] = 0.4 * np.clip(T / 2, 0, 1)
-    return scenario, Simulation(Recording(q=q, qd=np.zeros_like(q), tau=np.zeros_like(q), t=T), desired)
+    return scenario, Simulation(Recording(q=q + 0.01, qd=0 * q, tau=0 * q, t=T), state(q), None, desired)
 
 
 def test_a_joint_that_drifts_evenly_has_its_rate_and_its_way():
@@ -56,6 +61,17 @@ def test_only_the_joints_that_are_named_count():
     assert Measure("drift_rate")(*run) == pytest.approx(0.1)
     assert Measure("drift_rate", joints=["wrist_yaw"])(*run) == pytest.approx(0.001)
     assert Measure("drift_rate", joints=["elbow_pitch"])(*run) == pytest.approx(0.0, abs=1e-15)
+
+
+def test_what_a_hand_does_before_it_lets_go_does_not_count():
+    scenario, simulation = released(elbow_pitch=0.3 * np.minimum(T, 5.0) + 0.001 * np.maximum(T - 5.0, 0.0))
+    scenario.hand.path = [Target(0.0, [0.0] * 7), Target(5.0, [0.0] * 7)]
+    assert Measure("held")(scenario, simulation) is True
+    assert Measure("held", time=14.9)(scenario, simulation) is True
+    assert Measure("held", band=0.0099)(scenario, simulation) is False
+    assert Measure("ran_away", band=0.016)(scenario, simulation) is False
+    with pytest.raises(StudyError, match=r"allowed: 0.02..15 s"):
+        Measure("held", time=15.1).check(scenario)
 
 
 def test_a_decaying_oscillation_settles_and_overshoots_as_its_formula_says():

@@ -6,66 +6,145 @@ import pytest
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.dynamics.physical_consistency import (
-    COM_REACH,
-    LEAST_COM_REACH,
+    LOG_DET_WEIGHT,
     MASS_RANGE,
+    TOTAL_MASS_TOLERANCE,
     LinkScale,
     consistent_parameters,
     least_eigenvalue_bound,
+    log_det_curvature,
+    room_in_box,
 )
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.bounding_boxes import bounding_boxes
 
 
 @pytest.fixture(scope="module", params=["mtmr", "psm"])
-def links(request):
-    return DynamicRegressor(load_arm(request.param)).links
+def arm(request):
+    return load_arm(request.param)
 
 
-def solve(links, wanted):
-    scale = np.concatenate([LinkScale.of(link).deviations for link in links])
-    R = np.diag(1 / scale)
-    return consistent_parameters(R, wanted / scale, links, np.full(len(scale), -np.inf), scale)
+@pytest.fixture(scope="module")
+def links(arm):
+    return DynamicRegressor(arm).links
 
 
-def test_what_can_exist_is_not_touched(links):
-    wanted = np.concatenate([link.parameters for link in links])
-    scale = np.concatenate([LinkScale.of(link).deviations for link in links])
-    # An interior point keeps away from the edge, where the SDF's rods without a width are, by the solver's tolerance.
-    assert np.max(np.abs(solve(links, wanted) - wanted) / scale) < 1e-4
+@pytest.fixture(scope="module")
+def boxes(arm):
+    return bounding_boxes(arm)
 
 
-def test_what_cannot_exist_becomes_the_nearest_that_can(links):
-    generator = np.random.default_rng(0)
-    scale = np.concatenate([LinkScale.of(link).deviations for link in links])
-    truth = np.concatenate([link.parameters for link in links])
-    wanted = truth + 3 * scale * generator.normal(size=len(truth))
-    x = solve(links, wanted)
+@pytest.fixture(scope="module")
+def nominal(links):
+    return np.concatenate([link.parameters for link in links])
+
+
+@pytest.fixture(scope="module")
+def scale(links):
+    return np.concatenate([LinkScale.of(link).deviations for link in links])
+
+
+def solve(links, boxes, R, b):
+    return consistent_parameters(R, b, links, boxes, np.full(len(b), -np.inf))
+
+
+def log_det_prior(x, links):
+    """LOG_DET_WEIGHT times the sum of trace(S0^-1 S) - log det(S0^-1 S)."""
+    total = 0.0
     for k, link in enumerate(links):
-        own, size = x[10 * k : 10 * k + 10], LinkScale.of(link)
+        floor = least_eigenvalue_bound(link) * np.eye(4)
+        ratio = np.linalg.solve(link.pseudo_inertia() - floor, pseudo_inertia(x[10 * k : 10 * k + 10]) - floor)
+        total += np.trace(ratio) - np.linalg.slogdet(ratio)[1]
+    return LOG_DET_WEIGHT * total
+
+
+def log_det_slope(own, link):
+    """(10,) derivative of a link's log-det prior by its parameters."""
+    floor = least_eigenvalue_bound(link) * np.eye(4)
+    S0_inverse, S_inverse = (np.linalg.inv(J - floor) for J in (link.pseudo_inertia(), pseudo_inertia(own)))
+    return LOG_DET_WEIGHT * np.array([np.trace((S0_inverse - S_inverse) @ pseudo_inertia(e)) for e in np.eye(10)])
+
+
+def test_the_sdfs_links_are_not_touched(links, boxes, nominal, scale):
+    x = solve(links, boxes, np.diag(1 / scale), nominal / scale)
+    assert np.max(np.abs(x - nominal) / scale) < 1e-4
+
+
+def test_what_cannot_exist_becomes_what_can_at_least_cost(links, boxes, nominal, scale):
+    """All conditions hold, and no way to another body that meets them goes down: the program is convex."""
+    generator = np.random.default_rng(0)
+    wanted = nominal + 3 * scale * generator.normal(size=len(nominal))
+    x = solve(links, boxes, np.diag(1 / scale), wanted / scale)
+    for k, link in enumerate(links):
+        own = x[10 * k : 10 * k + 10]
         assert np.linalg.eigvalsh(pseudo_inertia(own))[0] >= least_eigenvalue_bound(link)
-        low, high = (share * size.mass for share in MASS_RANGE)
+        low, high = (share * link.parameters[0] for share in MASS_RANGE)
         assert low * (1 - 1e-6) <= own[0] <= high * (1 + 1e-6)
-        reach = max(COM_REACH * size.gyration, LEAST_COM_REACH)
-        assert np.all(np.abs(own[1:4] / own[0] - size.com) <= reach * (1 + 1e-5))
-    # The projection onto a convex set: no feasible point makes an obtuse angle with what was projected.
-    gap = (wanted - x) / scale
-    assert gap @ ((truth - x) / scale) <= 1e-4 * np.linalg.norm(gap) ** 2
+        assert np.min(room_in_box(own, boxes[link.link])) > -1e-5
+        com, box = own[1:4] / own[0], boxes[link.link]
+        assert np.all(np.abs(com - box.center) <= box.half_width * (1 + 1e-5))
+    assert abs(np.sum(x[::10]) / np.sum(nominal[::10]) - 1) <= TOTAL_MASS_TOLERANCE + 1e-6
+
+    def cost(y):
+        return 0.5 * np.sum(((y - wanted) / scale) ** 2) + log_det_prior(y, links)
+
+    for other in (nominal, *(nominal * (1 + 0.05 * s) for s in (-1, 1))):
+        assert cost(x + 1e-3 * (other - x)) >= cost(x) - 1e-4
 
 
-def test_bounds_are_kept(links):
-    n = 10 * len(links)
-    scale = np.concatenate([*(LinkScale.of(link).deviations for link in links), [1e-5]])
-    wanted = np.concatenate([*(link.parameters for link in links), [-1.0]])
-    lower = np.append(np.full(n, -np.inf), 1e-6)
-    x = consistent_parameters(np.diag(1 / scale), wanted / scale, links, lower, scale)
+def test_links_of_which_the_rows_say_nothing_stay_the_sdfs(links, boxes, nominal, scale):
+    """The Gaussian prior is weak here, so the log-det one holds them, and both have their least cost at the SDF's."""
+    weak = 1e-2 / scale
+    row = np.zeros(len(nominal))
+    row[:10] = 1 / scale[:10]
+    stacked = np.vstack([np.diag(weak), 100 * row])
+    target = np.append(weak * nominal, 100 * (row @ nominal + 0.2))
+    R = np.linalg.qr(stacked, mode="r")
+    x = solve(links, boxes, R, np.linalg.solve(R.T, stacked.T @ target))
+    assert row @ (x - nominal) == pytest.approx(0.2, abs=0.01)
+    assert np.max(np.abs(x - nominal)[10:] / scale[10:]) < 1e-3
+
+
+def test_where_the_rows_say_nothing_the_priors_decide(links, boxes, nominal, scale):
+    """What the rows do not see is balanced by the priors alone: their gradient has no part in the rows' null space."""
+    generator = np.random.default_rng(3)
+    seen = generator.normal(size=(12, len(nominal))) / scale
+    target = seen @ nominal + 2 * generator.normal(size=12)
+    stacked = np.vstack([np.diag(1 / scale), 30 * seen])
+    R = np.linalg.qr(stacked, mode="r")
+    x = solve(links, boxes, R, np.linalg.solve(R.T, stacked.T @ np.append(nominal / scale, 30 * target)))
+    np.testing.assert_allclose(seen @ x, target, atol=0.1)
+    slope = np.concatenate([log_det_slope(x[10 * k : 10 * k + 10], link) for k, link in enumerate(links)])
+    gradient = (x - nominal) / scale + slope * scale
+    H = np.eye(len(x)) + log_det_curvature(x, links) * np.outer(scale, scale)
+
+    def gain(directions):  # by which the priors' cost would fall, were one free to move along these
+        g = directions @ gradient
+        return 0.5 * g @ np.linalg.solve(directions @ H @ directions.T, g)
+
+    null = np.linalg.svd(seen * scale)[2][12:]
+    assert gain(null) < 1e-3 < 1e-2 * gain(np.eye(len(x)))
+
+
+def test_curvature_is_the_second_derivative(links, nominal, scale):
+    step = 1e-6 * scale * np.random.default_rng(1).normal(size=len(nominal))
+    H = log_det_curvature(nominal, links) @ step
+    for k, link in enumerate(links):
+        chosen = slice(10 * k, 10 * k + 10)
+        up, down = (log_det_slope((nominal + sign * step)[chosen], link) for sign in (0.5, -0.5))
+        assert np.max(np.abs(up - down - H[chosen])) < 1e-3 * np.max(np.abs(H[chosen]))
+
+
+def test_bounds_are_kept(links, boxes, nominal, scale):
+    scale, wanted = np.append(scale, 1e-5), np.append(nominal, -1.0)
+    lower = np.append(np.full(len(nominal), -np.inf), 1e-6)
+    x = consistent_parameters(np.diag(1 / scale), wanted / scale, links, boxes, lower)
     assert x[-1] == pytest.approx(1e-6, rel=1e-3)
 
 
-def test_a_program_that_has_no_solution_is_refused(links):
-    n = 10 * len(links)
-    scale = np.concatenate([LinkScale.of(link).deviations for link in links])
-    lower = np.full(n, -np.inf)
+def test_a_program_that_has_no_solution_is_refused(links, boxes, nominal, scale):
+    lower = np.full(len(nominal), -np.inf)
     lower[0] = 100 * links[0].parameters[0]  # more than the range of the mass allows
     with pytest.raises(IdentificationError, match="did not converge: Clarabel says"):
-        consistent_parameters(np.diag(1 / scale), np.ones(n), links, lower, scale)
+        consistent_parameters(np.diag(1 / scale), nominal / scale, links, boxes, lower)

@@ -51,7 +51,7 @@ def formula(monkeypatch):
         q = np.array(scenario.start) + rate * t[:, None]
         if scenario.seed % 11 == 0:
             q[9:] = np.nan
-        return Simulation(Recording(q=q, qd=0 * q, tau=q / 10, t=t), None)
+        return Simulation(Recording(q=q, qd=0 * q, tau=q / 10, t=t), np.hstack([q, 0 * q]), None, None)
 
     monkeypatch.setattr(study_module, "simulate", simulate)
 

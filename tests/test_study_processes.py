@@ -9,9 +9,12 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import formula_study
 import pytest
 
+import dvrk_drake.analysis.study as study_module
 from dvrk_drake.analysis.study import run_study
+from dvrk_drake.analysis.study_executors import dask_executor
 from dvrk_drake.analysis.study_file import load_study
 
 pytestmark = pytest.mark.slow
@@ -23,8 +26,8 @@ random_poses: {count: 5, seed: 1, margin: 0.1}
 variations: [{name: nominal}, {name: wrong, set: [controller.parameter_error=0.2]}]
 measures: [{kind: held, time: 1}, {kind: drift, time: 0.5}, {kind: effort_share}]
 """
-#: What is compiled matters to nobody here but must be ready soon; it is the same without optimisation.
-ENVIRONMENT = {**os.environ, "NUMBA_OPT": "0"}
+#: The command line with a formula in place of the simulation, which workers would compile for seconds.
+FORMULA = Path(__file__).with_name("formula_study.py")
 PATIENCE = 120.0  # s, for a crowded machine
 
 
@@ -35,10 +38,10 @@ def study(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
 def undisturbed(study):
     """The table as one thread of this process makes it."""
     path = study.parent / "undisturbed.csv"
+    path.unlink(missing_ok=True)
     with ThreadPoolExecutor(1) as executor:
         rows = run_study(load_study(study), executor, path)
     assert len(rows) == 10
@@ -52,8 +55,8 @@ def started():
     processes = []
 
     def start(*arguments):
-        command = [sys.executable, "-m", *map(str, arguments)]
-        process = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        command = [sys.executable, *map(str, arguments)]
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         processes.append(process)
         return process
 
@@ -82,9 +85,10 @@ def children_of(process):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds workers in /proc")
-def test_a_killed_study_goes_on_and_a_killed_worker_costs_nothing(study, undisturbed, started, tmp_path):
+def test_a_killed_study_goes_on_and_a_killed_worker_costs_nothing(study, started, tmp_path, monkeypatch):
+    monkeypatch.setattr(study_module, "simulate", formula_study.simulate)
     path = tmp_path / "killed.csv"
-    command = ["dvrk_drake.cli", "study", study, "--output", path, "--workers", 2]
+    command = [FORMULA, "study", study, "--output", path, "--workers", 2]
     first = started(*command)
     wait_for(lambda: rows_in(path) >= 2, first)
     workers = children_of(first)
@@ -103,33 +107,36 @@ def test_a_killed_study_goes_on_and_a_killed_worker_costs_nothing(study, undistu
     output, error = second.communicate(timeout=PATIENCE)
     assert (second.returncode, error) == (0, "")
     assert "nominal: 5 runs" in output
-    assert path.read_bytes() == undisturbed
+    assert path.read_bytes() == undisturbed(study)
 
 
-def test_a_dask_cluster_that_loses_a_worker_gives_the_same(study, undisturbed, started, tmp_path):
+def test_a_dask_cluster_that_loses_a_worker_gives_the_same(study, started, tmp_path):
     pytest.importorskip("distributed", reason="needs the extra dask")
     path, address = tmp_path / "dask.csv", tmp_path / "scheduler.json"
     options = ["--no-dashboard", "--scheduler-file", address]
-    scheduler = started("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 0, *options)
+    scheduler = started("-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 0, *options)
     wait_for(lambda: address.exists() and address.stat().st_size, scheduler)
-    worker = ["distributed.cli.dask_worker", "--nthreads", 1, "--no-nanny", *options]
+    worker = ["-m", "distributed.cli.dask_worker", "--nthreads", 1, "--no-nanny", *options]
     workers = [started(*worker), started(*worker)]
-    uri = json.loads(address.read_text())["address"]
-    run = started("dvrk_drake.cli", "study", study, "--output", path, "--scheduler", uri)
-    wait_for(lambda: rows_in(path) >= 2, run)
-    workers[0].kill()
-    _, error = run.communicate(timeout=PATIENCE)
-    assert (run.returncode, error) == (0, "")
-    assert path.read_bytes() == undisturbed
+
+    def kill_one(done, all_cases):
+        if done == 2:
+            workers[0].kill()
+
+    with dask_executor(json.loads(address.read_text())["address"]) as executor:
+        run_study(load_study(study), executor, path, kill_one)
+    assert workers[0].wait(PATIENCE) == -signal.SIGKILL
+    assert path.read_bytes() == undisturbed(study)
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds workers in /proc")
-def test_ctrl_c_ends_in_one_line_and_leaves_no_worker(study, undisturbed, started, tmp_path):
+def test_ctrl_c_ends_in_one_line_and_leaves_no_worker(study, started, tmp_path):
     path = tmp_path / "interrupted.csv"
-    run = started("dvrk_drake.cli", "study", study, "--output", path, "--set", "duration=100")
-    wait_for(lambda: len(children_of(run)) > 0, run)
+    run = started(FORMULA, "study", study, "--output", path, "--workers", 2)
+    wait_for(lambda: rows_in(path) >= 1, run)
     workers = children_of(run)
     run.send_signal(signal.SIGINT)
     _, error = run.communicate(timeout=PATIENCE)
     assert (run.returncode, error) == (130, "dvrk-drake: interrupted\n")
     assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
+    assert 1 <= rows_in(path) < 10

@@ -13,18 +13,21 @@ from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
     distinct_coordinates,
     effect_coordinates,
+    effect_fault,
     position_along,
     slides,
 )
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 
 #: Widths of the smoothed sign, as shares of the coordinate's standard deviation of speed.
 COULOMB_WIDTHS = (0.03, 0.1, 0.4)
-#: Travel until an elasto-plastic element slips, as shares of the coordinate's standard deviation of position.
-PRESLIDING_TRAVELS = (0.003, 0.01, 0.08, 0.3, 1.0)
-#: Periods in a turn of the cable torques.
-CABLE_PERIODS = (1, 2)
+#: The same width for friction that differs by direction or is more at low speeds.
+DIRECTION_WIDTH = 0.1
+ASYMMETRIC = "asymmetric friction"
+#: What an arm's file can say of a drive -> periods a turn of a sine and a cosine.
+NAMED_EFFECTS = {"spring": 0.0, "cable 1": 1.0, "cable 2": 2.0, ASYMMETRIC: 0.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,34 +55,64 @@ class DynamicColumns:
         return np.hstack([self.rigid[:, i], self.shapes[i] * self.rows[:, i]])
 
 
-def friction_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """What every drive may have: offset at the actuators; viscous, Coulomb and presliding friction everywhere."""
-    effects = []
+def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
+    """What every drive has, and what the arm's file says that its drives have (`motion.known_effects`).
+
+    Every actuator has an offset; every coordinate viscous, Coulomb and presliding friction.
+
+    Raises:
+        ArmError: the file names a coordinate or a kind that there is not.
+    """
+    known = arm.motion.known_effects
+    if unknown := set(known) - set(distinct_coordinates(arm)):
+        raise ArmError(
+            f"{arm.source}: motion.known_effects: unknown coordinate {', '.join(sorted(unknown))}; "
+            f"known: {', '.join(distinct_coordinates(arm))}"
+        )
+    effects, travels = [], arm.motion.presliding_travels
     for name, x, v in _coordinates(arm, grid):
         if name.startswith("actuator."):
             effects.append(ActuatorEffect(name, "offset"))
         effects.append(ActuatorEffect(name, "viscous"))
         if v.std() > 0:
             effects += [ActuatorEffect(name, "coulomb", _rounded(w * v.std())) for w in COULOMB_WIDTHS]
-            effects += [ActuatorEffect(name, "presliding", _rounded(d * x.std())) for d in PRESLIDING_TRAVELS]
+            effects += [ActuatorEffect(name, "presliding", _rounded(d * x.std())) for d in travels]
+            effects += [effect for which in known.get(name, []) for effect in _named(arm, name, which, x, v)]
     return effects
 
 
 def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """What some drives have beside friction: springs, cables, friction that differs by direction."""
+    """What a motion may show beside that: everything that an arm's file can name, and more friction at low speeds."""
     effects = []
     for name, x, v in _coordinates(arm, grid):
         if v.std() == 0:
             continue
-        width = _rounded(0.1 * v.std())
-        travel = _rounded(np.abs(x).max() * 1.01)
-        effects += [ActuatorEffect(name, "coulomb forward", width), ActuatorEffect(name, "spring", travel)]
-        if not slides(arm, name):
-            effects += [
-                ActuatorEffect(name, kind, float(periods))
-                for periods in CABLE_PERIODS
-                for kind in ("cable sine", "cable cosine")
-            ]
+        effects.append(ActuatorEffect(name, "stribeck", _rounded(DIRECTION_WIDTH * v.std())))
+        known = arm.motion.known_effects.get(name, [])
+        for which in NAMED_EFFECTS:
+            # Beside known torques by position, others say the same between the poses of a motion, and run apart beyond.
+            by_position = which != ASYMMETRIC
+            if which in known or (by_position and set(known) - {ASYMMETRIC}):
+                continue
+            if which == "spring" or not by_position or not slides(arm, name):
+                effects += _named(arm, name, which, x, v)
+    return effects
+
+
+def _named(
+    arm: Arm, coordinate: str, which: str, x: NDArray[np.float64], v: NDArray[np.float64]
+) -> list[ActuatorEffect]:
+    """What an arm's file calls `which`."""
+    where = f"{arm.source}: motion.known_effects.{coordinate}"
+    if which not in NAMED_EFFECTS:
+        raise ArmError(f'{where}: unknown "{which}"; known: {", ".join(NAMED_EFFECTS)}')
+    if which == ASYMMETRIC:
+        return [ActuatorEffect(coordinate, "coulomb forward", _rounded(DIRECTION_WIDTH * v.std()))]
+    if which == "spring":
+        return [ActuatorEffect(coordinate, "spring", _rounded(1.01 * np.abs(x).max()))]
+    effects = [ActuatorEffect(coordinate, kind, NAMED_EFFECTS[which]) for kind in ("cable sine", "cable cosine")]
+    if fault := effect_fault(arm, effects[0]):
+        raise ArmError(f"{where}: {fault}")
     return effects
 
 

@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic_columns import dynamic_columns, friction_effects, optional_effects
+from dvrk_drake.analysis.dynamic_choice import choose_effects, left_out_errors
+from dvrk_drake.analysis.dynamic_columns import drive_effects, dynamic_columns, optional_effects
+from dvrk_drake.analysis.dynamic_covariance import parameter_covariance
+from dvrk_drake.analysis.dynamic_estimates import DynamicEstimates
 from dvrk_drake.analysis.dynamic_problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.dynamic_statics import base_parameter_estimates
 from dvrk_drake.analysis.motion_grid import MotionGrid, default_settings, motion_grid
 from dvrk_drake.analysis.phase_folds import period_of, phase_folds
 from dvrk_drake.analysis.repetition import repeatability_floor
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import (
     ActuatorEffectEstimate,
     ActuatorStatistics,
     DynamicSection,
-    LinkEstimate,
     RotorEstimate,
 )
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics, Provenance
-from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
 
@@ -41,6 +43,8 @@ class DynamicIdentification:
         grid: the motion.
         period: after which the motion repeats [s], or None.
         measured, predicted: (r, n) efforts of the actuators behind the filter, ends left out [N m, N].
+        dry_friction: coordinate -> Coulomb and presliding friction together and its standard error [N m, N].
+        nominal_mass: of all links as the SDF has them [kg].
     """
 
     model: IdentifiedModel
@@ -48,6 +52,8 @@ class DynamicIdentification:
     period: float | None
     measured: NDArray[np.float64]
     predicted: NDArray[np.float64]
+    dry_friction: dict[str, tuple[float, float]]
+    nominal_mass: float
 
 
 def identify_dynamic(
@@ -76,61 +82,39 @@ def identify_dynamic(
     period = period_of(grid)
     problem = motion_problem(grid, tau, period)
     progress(0.2)
-    chosen, problem = choose_effects(problem, lambda share: progress(0.2 + 0.4 * share))
-    weights = effort_weights(problem, chosen)
-    fit = problem.consistent(chosen, weights)
-    left_out = np.zeros(arm.num_joints)
-    for fold in range(fit.folds):
-        progress(0.65 + 0.35 * fold / fit.folds)
-        left_out += fit.fold_errors(fold)
-    section = _section(problem, chosen, fit, left_out, grid, tau, period)
-    predicted = problem.columns.tau - residuals(problem, chosen, fit)
-    model = _model(recording, arm, section, problem, fit)
+    choice = choose_effects(problem, lambda share: progress(0.2 + 0.3 * share))
+    problem, chosen = choice.problem, choice.chosen
+    fit = problem.consistent(chosen, choice.weights)
+    left_out = left_out_errors(choice, fit.x[: problem.num_rigid], lambda share: progress(0.55 + 0.45 * share))
+    left = residuals(problem, chosen, fit)
+    covariance = parameter_covariance(problem, fit, left, grid.rate, grid.settings.effort_cut_off, period)
+    estimates = DynamicEstimates(problem, fit, covariance)
+    section = _section(problem, chosen, fit, covariance, left_out, grid, tau, period)
+    section.links = estimates.links()
+    section.base_parameters, section.correlations = estimates.base_parameters()
+    model = _model(recording, arm, section, covariance)
     progress(1.0)
-    return DynamicIdentification(model, grid, period, problem.columns.tau, predicted)
+    predicted = problem.columns.tau - left
+    nominal = float(sum(link.parameters[0] for link in problem.regressor.links))
+    return DynamicIdentification(model, grid, period, problem.columns.tau, predicted, estimates.dry_friction(), nominal)
 
 
-def motion_problem(grid: MotionGrid, tau: NDArray[np.float64], period: float | None) -> DynamicProblem:
-    """The least squares of a motion; tau (m, n): the actuators' measured efforts, a row of the recording each."""
-    effects = [*friction_effects(grid.arm, grid), *optional_effects(grid.arm, grid)]
+def motion_problem(
+    grid: MotionGrid, tau: NDArray[np.float64], period: float | None, effects: Sequence[ActuatorEffect] | None = None
+) -> DynamicProblem:
+    """The least squares of a motion; tau (m, n): the actuators' measured efforts, a row of the recording each.
+
+    `effects`: the only ones, where they are known.
+    """
+    always = effects if effects is not None else drive_effects(grid.arm, grid)
+    candidates = [] if effects is not None else optional_effects(grid.arm, grid)
     regressor = DynamicRegressor(grid.arm)
-    columns = dynamic_columns(grid, tau, regressor, effects)
+    columns = dynamic_columns(grid, tau, regressor, [*always, *candidates])
     fold, edge = phase_folds(grid, period)
     # A low-passed effort has two independent values a period of the cut-off; repetitions say the same again.
     duration = len(columns.tau) / grid.rate
     independent = 2 * grid.settings.effort_cut_off * min(duration, period or duration)
-    return DynamicProblem(columns, regressor, fold, edge, min(independent, len(columns.tau)))
-
-
-def choose_effects(
-    problem: DynamicProblem, progress: Callable[[float], object]
-) -> tuple[NDArray[np.int_], DynamicProblem]:
-    """The effects, and the problem with gravity as the motion shows it."""
-    optional = {"coulomb forward", "spring", "cable sine", "cable cosine", "stribeck"}
-    is_optional = np.array([effect.kind in optional for effect in problem.columns.effects])
-    friction, candidates = np.flatnonzero(~is_optional), np.flatnonzero(is_optional)
-    tilts = len(problem.columns.tilts)
-    if tilts:
-        # The tilt and the effects are found in turn: a lean base looks like a spring, and the other way round.
-        phi, chosen = problem.prior, friction
-        last = problem.num_effects + np.arange(tilts)
-        for turn in range(3):
-            selection = problem.selection(phi)
-            if turn == 0:
-                found = selection.choose(np.append(chosen, last), candidates, lambda s: progress(0.4 * s))
-                chosen = found[found < problem.num_effects]
-            x = selection.fit(np.append(chosen, last))
-            phi = problem.rigid_parameters(x)
-            problem = replace(problem, tilt=problem.tilt + x[-tilts:])
-    selection = problem.selection()
-    return selection.choose(friction, candidates, lambda s: progress(0.5 + 0.5 * s)), problem
-
-
-def effort_weights(problem: DynamicProblem, chosen: NDArray[np.int_]) -> NDArray[np.float64]:
-    """(n,) one over the variance that each actuator's effort keeps with these effects."""
-    selection = problem.selection()
-    selection.fit(chosen)
-    return selection.weights
+    return DynamicProblem(columns, regressor, fold, edge, min(independent, len(columns.tau)), len(always))
 
 
 def residuals(problem: DynamicProblem, chosen: NDArray[np.int_], fit: ConsistentFit) -> NDArray[np.float64]:
@@ -146,17 +130,14 @@ def _section(
     problem: DynamicProblem,
     chosen: NDArray[np.int_],
     fit: ConsistentFit,
+    covariance: NDArray[np.float64],
     left_out: NDArray[np.float64],
     grid: MotionGrid,
     tau: NDArray[np.float64],
     period: float | None,
 ) -> DynamicSection:
     arm, p = grid.arm, problem.num_rigid
-    sd = np.sqrt(np.diag(fit.covariance))
-    links = [
-        LinkEstimate(link.link, [float(v) for v in x], float(np.linalg.eigvalsh(pseudo_inertia(x))[0]))
-        for link, x in zip(problem.regressor.links, fit.x[: p - arm.num_joints].reshape(-1, 10), strict=True)
-    ]
+    sd = np.sqrt(np.diag(covariance))
     rotors = [
         RotorEstimate(name, float(fit.x[i]), float(sd[i]))
         for i, name in enumerate(arm.joint_names, start=p - arm.num_joints)
@@ -182,12 +163,10 @@ def _section(
     gravity = problem.regressor.arm.gravity + np.append(problem.tilt, 0.0)
     gravity *= np.linalg.norm(problem.regressor.arm.gravity) / np.linalg.norm(gravity)
     expected = [float(g) for g in arm.gravity]
-    return DynamicSection([float(g) for g in gravity], links, rotors, effects, actuators, grid.settings, expected)
+    return DynamicSection([float(g) for g in gravity], [], rotors, effects, actuators, grid.settings, expected)
 
 
-def _model(
-    recording: Recording, arm: Arm, section: DynamicSection, problem: DynamicProblem, fit: ConsistentFit
-) -> IdentifiedModel:
+def _model(recording: Recording, arm: Arm, section: DynamicSection, covariance: NDArray[np.float64]) -> IdentifiedModel:
     in_joints = recording.in_joint_coordinates(arm)
     joints = []
     for j, name in enumerate(arm.joint_names):
@@ -210,5 +189,5 @@ def _model(
     # The model's own arm, whose gravity is derived once for all.
     as_mounted = model.load_arm()
     regressor = DynamicRegressor(as_mounted)
-    model.base_parameters = base_parameter_estimates(as_mounted, section, regressor, fit.covariance)
+    model.base_parameters = base_parameter_estimates(as_mounted, section, regressor, covariance)
     return model

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.normal_equations import NormalEquations, solve, squared_errors
 
-#: An effect must lower the cross-validated error, relative and averaged over the actuators, by this much.
-LEAST_GAIN = 0.0005
+#: An effect must lower the cross-validated error, relative and averaged over the actuators, by this much. What gains
+#: less is chosen by chance: on the public motions other phases choose others, which predict the left-out phases worse.
+LEAST_GAIN = 0.005
 #: So many of the effects that promise most are tried at every step.
 TRIALS = 8
 #: An actuator's error is not taken for less than this share of its effort.
@@ -24,38 +25,47 @@ class EffectSelection:
 
     Attributes:
         equations: columns: the rigid body's unknowns, then the effects; the last is what remains of the effort.
-        efforts: (n,) sum of squares of the measured efforts.
+        efforts: (folds, n) sum of squares of the measured efforts.
+        rows: (folds,) their number.
         num_rigid: of the rigid body's.
         precision: (k,) of all unknowns.
         non_negative: (k,).
-        independent: how many rows, of all, are independent measurements of an actuator's effort.
-        rows: number of rows.
+        independent: share of the rows that are independent measurements of an actuator's effort.
     """
 
-    equations: InitVar[NormalEquations]
+    equations: NormalEquations
     efforts: NDArray[np.float64]
+    rows: NDArray[np.int_]
     num_rigid: int
     precision: NDArray[np.float64]
     non_negative: NDArray[np.bool_]
     independent: float
-    rows: int
 
-    def __post_init__(self, equations: NormalEquations) -> None:
+    def __post_init__(self) -> None:
+        equations = self.equations
         self._total = equations.total()
         self._learnt = [equations.without_fold(fold) for fold in range(equations.folds)]
         self._predicted = [equations.of_fold(fold) for fold in range(equations.folds)]
-        self.weights = self._weights(np.full(len(self.efforts), 0.1**2))
+        self._efforts = np.sum(self.efforts, axis=0)
+        self.weights = self._weights(np.full(len(self._efforts), 0.1**2))
+
+    def without(self, first: int, count: int) -> EffectSelection:
+        """The choice that knows nothing of some folds: `count` from `first` on."""
+        kept = self.equations.others(first, count)
+        return replace(
+            self, equations=self.equations.without(first, count), efforts=self.efforts[kept], rows=self.rows[kept]
+        )
 
     def fit(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:
         """(k,) all unknowns, 0 where an effect is not chosen; weighs every actuator by the error that is left."""
         for _ in range(3):
             x = self._solve(self._total, effects)
-            self.weights = self._weights(squared_errors(self._total, x) / self.efforts)
+            self.weights = self._weights(squared_errors(self._total, x) / self._efforts)
         return x
 
     def relative_error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n,) |tau - X x| / |tau|."""
-        return np.asarray(np.sqrt(squared_errors(self._total, x) / self.efforts))
+        return np.asarray(np.sqrt(squared_errors(self._total, x) / self._efforts))
 
     def cross_validated(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:
         """(n,) relative error of folds that are predicted from the others, with the current weights."""
@@ -63,7 +73,7 @@ class EffectSelection:
             squared_errors(predicted, self._solve(learnt, effects))
             for learnt, predicted in zip(self._learnt, self._predicted, strict=True)
         ]
-        return np.asarray(np.sqrt(np.sum(errors, axis=0) / self.efforts))
+        return np.asarray(np.sqrt(np.sum(errors, axis=0) / self._efforts))
 
     def choose(
         self, start: NDArray[np.int_], candidates: NDArray[np.int_], report: Callable[[float], object] = lambda _: None
@@ -124,5 +134,5 @@ class EffectSelection:
 
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         """One over the variance of an independent measurement, from the squared relative errors."""
-        variance = np.maximum(squared, LEAST_ERROR**2) * self.efforts / self.rows
-        return self.independent / self.rows / variance
+        variance = np.maximum(squared, LEAST_ERROR**2) * self._efforts / np.sum(self.rows)
+        return np.asarray(self.independent / variance)

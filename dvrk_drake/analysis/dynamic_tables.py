@@ -2,26 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 
+from dvrk_drake.analysis.dynamic_estimates import DRY_KINDS, LEAST_TOLD
+from dvrk_drake.analysis.dynamic_identification import DynamicIdentification
 from dvrk_drake.analysis.dynamic_validation import DynamicValidation
 from dvrk_drake.analysis.tables import make_table
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS
-from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics, DynamicSection
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.dynamic_section import (
+    ActuatorEffectEstimate,
+    ActuatorStatistics,
+    CorrelatedEstimates,
+    DynamicSection,
+)
+from dvrk_drake.dynamics.physical_consistency import total_mass_reached
+
+#: On a screen: base parameters of more than so many standard errors, so many pairs, so many effects beside friction.
+SHOWN_BEYOND, SHOWN_PAIRS, SHOWN_EFFECTS = 10.0, 5, 10
 
 
-def print_dynamics(console: Console, model: IdentifiedModel) -> None:
-    """Links, rotors, the drive's effects, and how each actuator's effort was fitted."""
-    section = model.dynamic_model.section
-    table = make_table("Links", "", "mass [kg]", "centre of mass [m]", "least eigenvalue of the pseudo-inertia")
-    for link in section.links:
-        m, *h = link.parameters[:4]
-        com = ", ".join(f"{x / m:+.3f}" for x in h)
-        table.add_row(link.link, f"{m:.4f}", com, f"{link.least_eigenvalue:.1e}")
-    console.print(table)
-    _print_drive(console, section)
+def print_dynamics(console: Console, result: DynamicIdentification, full: bool = False) -> None:
+    """Links, base parameters, the drive, and how each actuator's effort was fitted; `full`: every number of them."""
+    section = result.model.dynamic_model.section
+    _print_links(console, section, result.nominal_mass)
+    _print_base_parameters(console, section, full)
+    if full:
+        _print_effects(console, section)
+    _print_drive(console, section, result.dry_friction)
     tilt = np.degrees(_angle(np.array(section.gravity), np.array(section.gravity_expected)))
     if tilt > 0.1:
         console.print(
@@ -38,8 +49,9 @@ def print_dynamics(console: Console, model: IdentifiedModel) -> None:
     table.add_row("mean", "", "", "", *(_mean_percent(section.actuators, w) for w in _MEANS))
     console.print(table)
     console.print(
-        "* phases of the motion predicted from the other phases (stretches, if it does not repeat); which effects "
-        "there are was chosen with all of them: expect more error on another motion",
+        "* sixths of the motion's phases (stretches, if it does not repeat) predicted by models that know nothing of "
+        "them: neither parameters nor the choice of effects nor how the base leans. What the arm's file says of its "
+        "drives flatters, for it was chosen on such motions; on another day friction is another",
         style="dim",
         soft_wrap=True,
     )
@@ -69,19 +81,110 @@ def print_dynamic_validation(console: Console, validation: DynamicValidation) ->
     )
 
 
+_COLUMNS = ("", "value", "+-", "unit")
+_EFFECT_COLUMNS = ("", "kind", "scale", "value", "+-", "unit if it turns")
+_NAME_WIDTH, _REMARK_WIDTH = 64, 30
 _MEANS = ("rms_fit", "rms_cross_validation", "rms_repeatability")
 
 
-def _print_drive(console: Console, section: DynamicSection) -> None:
-    table = make_table("Effects in the drive", "", "kind", "scale", "value", "standard error", "unit if it turns")
+def _print_links(console: Console, section: DynamicSection, nominal_mass: float) -> None:
+    table = make_table("Links", "", "mass [kg]", "+-", "centre of mass [m]", "+-", "")
+    table.columns[-1].no_wrap, table.columns[-1].max_width = False, _REMARK_WIDTH
+    for link in section.links:
+        m, *h = link.parameters[:4]
+        com = np.array(h) / m
+        errors = np.array(link.standard_errors[:4])
+        # First order, mass and first moments taken for independent: the better known of both decides.
+        spread = float(np.max(np.hypot(errors[1:], com * errors[0]))) / m
+        remark = "; ".join(link.bounds) + " *" if link.bounds else ("mass: the SDF's" if link.mass_told < 0.5 else "")
+        place = ", ".join(f"{x:+.3f}" for x in com)
+        table.add_row(link.link, f"{m:.4g}", f"{errors[0]:.1g}", place, f"{spread:.1g}", remark)
+    total = sum(link.parameters[0] for link in section.links)
+    reached = total_mass_reached(total, nominal_mass)
+    table.add_row("all", f"{total:.4g}", "", "", "", f"{nominal_mass:.4g} in the SDF" + " *" * reached)
+    console.print(table)
+    if reached or any(link.bounds for link in section.links):
+        console.print("* at its bound: this number is the bound's, not the motion's", style="yellow")
+    console.print(
+        "+-: standard errors, of one by one: a motion tells sums of links far better, the base parameters\n",
+        style="dim",
+        soft_wrap=True,
+    )
+
+
+def _print_base_parameters(console: Console, section: DynamicSection, full: bool) -> None:
+    parameters = section.base_parameters
+    known = [p for p in parameters if p.told >= LEAST_TOLD and abs(p.value) > SHOWN_BEYOND * p.standard_error]
+    title = "Base parameters" if full else f"Base parameters known to {1 / SHOWN_BEYOND:.0%}"
+    table = make_table(title, *_COLUMNS, *([""] if full else []))
+    table.columns[0].max_width = _NAME_WIDTH
+    for p in parameters if full else known:
+        remark = "" if p.told >= LEAST_TOLD else "not told"
+        if not remark and abs(p.value) < 2 * p.standard_error:
+            remark = "zero?"
+        numbers = (f"{p.value:+.3g}", f"{p.standard_error:.1g}", p.unit, *([remark] if full else []))
+        table.add_row(escape(p.name), *numbers)
+    console.print(table)
+    rest = [p for p in parameters if p not in known]
+    untold = sum(p.told < LEAST_TOLD for p in rest)
+    vague = sum(p.told >= LEAST_TOLD and abs(p.value) < 2 * p.standard_error for p in rest)
+    console.print(
+        f"of {len(parameters)}: {len(rest) - untold - vague} more known to a half, {vague} not told from zero, "
+        f"{untold} that this motion tells less of than the SDF",
+        style="dim",
+        soft_wrap=True,
+    )
+    _print_correlations(console, section.correlations, len(section.correlations) if full else SHOWN_PAIRS)
+
+
+def _print_correlations(console: Console, pairs: Sequence[CorrelatedEstimates], most: int) -> None:
+    for pair in pairs[:most]:
+        what = "difference" if pair.correlation > 0 else "sum"
+        console.print(
+            f"not told apart: {pair.first} | {pair.second}: {pair.correlation:+.3f}, only their scaled {what} is known",
+            style="yellow",
+            markup=False,
+            soft_wrap=True,
+        )
+    if len(pairs) > most:
+        console.print(f"and {len(pairs) - most} more pairs", style="yellow")
+    console.print()
+
+
+def _print_drive(console: Console, section: DynamicSection, dry: dict[str, tuple[float, float]]) -> None:
+    others = [e for e in section.effects if e.kind not in (*DRY_KINDS, "viscous", "offset")]
+    table = make_table("Drive [N m, N m s/rad; N, N s/m]", "", "dry friction", "+-", "viscous", "+-", "offset", "+-")
+    for name in dict.fromkeys([*dry, *(e.coordinate for e in section.effects)]):
+        cells = [f"{dry[name][0]:.3g}", f"{dry[name][1]:.1g}"] if name in dry else ["", ""]
+        for kind in ("viscous", "offset"):
+            found = next((e for e in section.effects if e.coordinate == name and e.kind == kind), None)
+            cells += ["", ""] if found is None else [f"{found.value:.3g}", f"{found.standard_error:.1g}"]
+        table.add_row(name, *cells)
+    console.print(table)
+    if others:
+        strongest = sorted(others, key=lambda e: -abs(e.value) / (e.standard_error or 1.0))[:SHOWN_EFFECTS]
+        table = make_table("Springs, cables, friction by direction", *_EFFECT_COLUMNS)
+        for e in strongest:
+            table.add_row(*_effect_cells(e))
+        console.print(table)
+        if len(others) > len(strongest):
+            console.print(f"and {len(others) - len(strongest)} more, less certain", style="dim")
+    console.print()
+
+
+def _print_effects(console: Console, section: DynamicSection) -> None:
+    table = make_table("Effects in the drive", *_EFFECT_COLUMNS)
     for rotor in section.rotors:
         row = (f"{rotor.value:.3g}", f"{rotor.standard_error:.1g}", "kg m^2")
         table.add_row(f"actuator.{rotor.actuator}", "rotor", "", *row)
     for e in sorted(section.effects, key=lambda e: (e.coordinate, e.kind, e.scale)):
-        scale = f"{e.scale:g}" if e.scale else ""
-        numbers = (f"{e.value:+.3g}", f"{e.standard_error:.1g}")
-        table.add_row(e.coordinate, e.kind, scale, *numbers, EFFECT_KINDS[e.kind].unit)
+        table.add_row(*_effect_cells(e))
     console.print(table)
+
+
+def _effect_cells(e: ActuatorEffectEstimate) -> tuple[str, ...]:
+    scale = f"{e.scale:g}" if e.scale else ""
+    return e.coordinate, e.kind, scale, f"{e.value:+.3g}", f"{e.standard_error:.1g}", EFFECT_KINDS[e.kind].unit
 
 
 def _percent(part: float, whole: float) -> str:

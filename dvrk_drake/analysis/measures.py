@@ -74,11 +74,11 @@ class Measure:
                 f"joints of {self.column}: unknown {', '.join(unknown)}; {scenario.mounted_arm.name} has "
                 f"{', '.join(scenario.mounted_arm.joint_names)}"
             )
-        rest = scenario.duration - float(scenario.knots()[0][-1])
+        rest = scenario.duration - _arrival(scenario)
         if kind.time is not None and not 2 * scenario.sample_period <= self._time <= rest + 1e-9:
             raise StudyError(
                 f"time of {self.column} is {self._time:g} s; allowed: {2 * scenario.sample_period:g}..{rest:g} s, from "
-                "two samples to what is left of the scenario after its last target or its start"
+                "two samples to what is left of the scenario after start, last target and hand"
             )
         if self.kind == "overshoot" and not scenario.targets:
             raise StudyError("overshoot needs a scenario with targets")
@@ -88,15 +88,17 @@ class Measure:
         arm = scenario.mounted_arm
         columns = [arm.joint_names.index(name) for name in self.joints or arm.joint_names]
         times, poses = scenario.knots()
-        q = simulation.recording.q
-        reference = np.broadcast_to(poses[0], q.shape) if simulation.desired is None else simulation.desired
+        arrival, desired = _arrival(scenario), simulation.desired
+        free = simulation.time >= (arrival - 1e-9 if desired is None else 0.0)
+        q = simulation.state_true[free, : arm.num_joints]
+        reference = np.broadcast_to(q[0], q.shape) if desired is None else desired
         run = _Run(
-            t=simulation.time,
+            t=simulation.time[free],
             q=q[:, columns],
             error=(q - reference)[:, columns],
-            effort_share=(np.abs(simulation.recording.measured_effort()) / arm.effort_limits)[:, columns],
+            effort_share=(np.abs(simulation.recording.measured_effort()[free]) / arm.effort_limits)[:, columns],
             departure=float(times[-2]) if len(times) > 1 else 0.0,
-            arrival=float(times[-1]),
+            arrival=arrival,
             way=(poses[-1] - poses[-2])[columns] if len(poses) > 1 else np.zeros(len(columns)),
             goal=reference[-1, columns],
         )
@@ -114,7 +116,8 @@ class Measure:
 class _Run(NamedTuple):
     """Of the k joints that count: t (m,); q, error from the wanted pose, effort_share (m, k); way, goal (k,).
 
-    `arrival` [s] is when the last target is to be reached, after `way` from the pose before, left at `departure`.
+    `arrival` [s] is when the last target is to be reached, after `way` from the pose before, left at `departure`, and
+    no hand holds the arm any more.
     """
 
     t: NDArray[np.float64]
@@ -129,6 +132,11 @@ class _Run(NamedTuple):
     def last(self, time: float) -> NDArray[np.bool_]:
         """(m,) the samples of the last `time` [s]."""
         return self.t >= self.t[-1] - time - 1e-9
+
+
+def _arrival(scenario: Scenario) -> float:
+    """When the last target is reached and no hand holds the arm any more [s]."""
+    return max(float(scenario.knots()[0][-1]), *(point.time for point in scenario.hand.path), 0.0)
 
 
 def _settling_time(run: _Run, band: float, time: float) -> float:
@@ -182,16 +190,18 @@ class Kind(NamedTuple):
     worst: float | bool
 
 
-#: The kinds of measures, of recorded samples, over the joints that count. The wanted pose is where the controller leads
-#: the arm; in mode "gravity", where it was released.
+#: The kinds of measures: of true positions at the recorded times, and of measured efforts, over the joints that count.
+#: The wanted pose is where the controller leads the arm; in mode "gravity" it is the pose at the release (the start, or
+#: when the hand lets go), and nothing before counts.
 #:
-#: settling_time: from the last target's time until all joints stay within `band` of it; infinite if they do not.
+#: settling_time: from the last target's time until all joints stay within `band` of the end's wanted pose; infinite if
+#: they do not.
 #: overshoot: beyond the last target, in the direction of the way there.
 #: steady_error: distance from the wanted pose, mean over the last `time`.
 #: drift: largest distance, in the last `time`, from the pose at its beginning.
 #: drift_rate: slope of the straight line through the last `time`.
 #: effort_share: largest effort over the joint's limit.
-#: held: within `band` of the wanted pose for `time` from the last target's time, or from the start.
+#: held: within `band` of the wanted pose for `time` from the last target's time, or from the release.
 #: ran_away: further than `band` from the wanted pose at any time.
 KINDS = {
     "settling_time": Kind(_settling_time, "s", 1e-3, None, math.inf),

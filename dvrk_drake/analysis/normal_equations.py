@@ -56,6 +56,17 @@ class NormalEquations:
         """Number of folds."""
         return self.products.shape[1]
 
+    def others(self, first: int, count: int) -> NDArray[np.int_]:
+        """(folds - count,) which folds come after `count` from `first` on, in their circle."""
+        return np.arange(first + count, first + self.folds) % self.folds
+
+    def without(self, first: int, count: int) -> NormalEquations:
+        """Of the other folds, without the edges that touch those."""
+        products = self.products[:, self.others(first, count)]
+        products[:, 0, 0] = 0.0
+        products[:, -1, 2] = 0.0
+        return NormalEquations(products)
+
     def total(self) -> NDArray[np.float64]:
         """(n, k + 1, k + 1) over the whole motion."""
         return self.products.sum(axis=(1, 2))
@@ -63,6 +74,10 @@ class NormalEquations:
     def of_fold(self, fold: int) -> NDArray[np.float64]:
         """(n, k + 1, k + 1) over one fold."""
         return self.products[:, fold].sum(axis=1)
+
+    def of_folds(self, first: int, count: int) -> NDArray[np.float64]:
+        """(n, k + 1, k + 1) over `count` folds from `first` on."""
+        return self.products[:, np.arange(first, first + count) % self.folds].sum(axis=(1, 2))
 
     def without_fold(self, fold: int) -> NDArray[np.float64]:
         """(n, k + 1, k + 1) over all rows but those of one fold and those of its neighbours that touch it."""

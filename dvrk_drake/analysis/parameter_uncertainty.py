@@ -44,6 +44,12 @@ class ParameterUncertainty:
     standard_errors: NDArray[np.float64]
     correlation: NDArray[np.float64]
 
+    @classmethod
+    def of_covariance(cls, names: Sequence[str], covariance: NDArray[np.float64]) -> ParameterUncertainty:
+        """From the covariance (b, b) of the estimates."""
+        spread = np.sqrt(np.diag(covariance))
+        return cls(tuple(names), spread, covariance / np.outer(spread, spread))
+
     def strong_correlations(self, limit: float = STRONG_CORRELATION) -> list[StrongCorrelation]:
         """Pairs whose correlation exceeds `limit` in size, the strongest first."""
         size = np.abs(np.triu(self.correlation, 1))

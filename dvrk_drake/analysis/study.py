@@ -82,8 +82,7 @@ def run_case(scenario: Scenario, measures: Sequence[Measure]) -> Row:
         simulation = simulate(scenario)
     except (RuntimeError, ArithmeticError, ValueError) as error:  # what Drake and numpy raise
         return Row({}, " ".join(f"{type(error).__name__}: {error}".split()))
-    recording = simulation.recording
-    lost = ~np.all(np.isfinite(np.hstack([recording.q, recording.measured_effort()])), axis=1)
+    lost = ~np.all(np.isfinite(np.hstack([simulation.state_true, simulation.recording.measured_effort()])), axis=1)
     if np.any(lost):
         return Row({}, f"diverged: not finite from {simulation.time[np.argmax(lost)]:g} s on")
     return Row({measure.column: measure(scenario, simulation) for measure in measures})

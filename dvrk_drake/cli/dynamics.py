@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dvrk_drake.cli.support import ProgressBar
+from dvrk_drake.cli.support import ProgressBar, write_tables
 from dvrk_drake.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def refuse_unusable(console: Console, recording: Recording, arm: Arm, warn: bool = False) -> None:
-    """Prints what `check` refuses in a recording, and its warnings if wanted.
+    """Prints what `check` refuses in a recording, and of a motion its warnings if wanted.
 
     Raises:
         RecordingError: it refuses anything.
@@ -28,26 +28,28 @@ def refuse_unusable(console: Console, recording: Recording, arm: Arm, warn: bool
 
     report = check_recording(recording, arm)
     for finding in report.findings:
-        if finding.severity == "refusal" or (warn and finding.severity == "warning"):
+        if finding.severity == "refusal" or (warn and finding.severity == "warning" and report.kind == "motion"):
             console.print(str(finding), style="yellow", markup=False, soft_wrap=True)
     if report.refusals:
         raise RecordingError(f"{recording.source or 'recording'}: refused, see above and dvrk-drake check")
 
 
 def identify_motion(options: argparse.Namespace, recording: Recording, arm: Arm, plots: Path | None) -> None:
-    """Identifies the dynamics, prints them, writes the model and the plots."""
+    """Identifies the dynamics, prints them in short, writes the model, all tables and the plots."""
     from dvrk_drake.analysis.dynamic_identification import identify_dynamic
     from dvrk_drake.analysis.dynamic_tables import print_dynamics
     from dvrk_drake.analysis.dynamic_validation import validate_motion
     from dvrk_drake.analysis.tables import make_console
 
     console = make_console()
-    refuse_unusable(console, recording, arm, warn=True)
     with ProgressBar("identifying") as (progress, task):
         result = identify_dynamic(recording, arm, lambda share: progress.update(task, completed=100 * share))
-    print_dynamics(console, result.model)
+    print_dynamics(console, result)
     result.model.save(options.output)
     console.print(f"model: {options.output}")
+    if options.tables is not None:
+        write_tables(options.tables, lambda file: print_dynamics(file, result, full=True))
+        console.print(f"all parameters: {options.tables}")
     if plots is not None:
         from dvrk_drake.analysis.dynamic_plots import plot_motion
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from dvrk_drake.cli.dynamics import identify_motion, validate_in_motion
+from dvrk_drake.cli.dynamics import identify_motion, refuse_unusable, validate_in_motion
 from dvrk_drake.cli.support import (
     ProgressBar,
     add_gravity,
@@ -14,6 +14,7 @@ from dvrk_drake.cli.support import (
     made_folder,
     mounted,
     print_notes,
+    write_tables,
 )
 
 
@@ -28,6 +29,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--output", required=True, metavar="MODEL.yaml", help="the model file to write")
     verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="for poses; default: robust")
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
+    verb.add_argument("--tables", metavar="FILE.txt", help="write all parameters with their standard errors as text")
     verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
     add_gravity(verb)
     verb.set_defaults(run=_identify)
@@ -76,8 +78,11 @@ def _identify(options: argparse.Namespace) -> None:
     recording = read_recording(options.recording, arm, options.coordinates)
     print_notes(options.recording, recording.notes)
     check_output(options.output, options.recording)
+    if options.tables is not None:
+        check_output(options.tables, options.recording, options.output)
     plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
+    refuse_unusable(console, recording, arm, warn=True)
     recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
     if moves:
         identify_motion(options, recording, arm, plots)
@@ -90,6 +95,9 @@ def _identify(options: argparse.Namespace) -> None:
         )
     print_doubts(console, result.doubts)
     print_model(console, result.model)
+    if options.tables is not None:
+        write_tables(options.tables, lambda file: print_model(file, result.model))
+        console.print(f"all parameters: {options.tables}")
     if len(result.recording) < len(recording):
         console.print(
             f"{len(recording)} rows are {len(result.recording)} distinct poses; samples of a pose are averaged"
@@ -118,6 +126,7 @@ def _validate(options: argparse.Namespace) -> None:
         check_output(options.json, options.recording, options.model)
     plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
+    refuse_unusable(console, recording, arm, warn=True)
     recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
     if moves and model.dynamics is not None:
         validate_in_motion(options, model, recording, plots)
@@ -146,15 +155,18 @@ def _validate(options: argparse.Namespace) -> None:
 def _predict(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.dynamic_validation import predict_motion
     from dvrk_drake.analysis.poses import find_poses
+    from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.analysis.validation import predict
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.recording import read_recording, write_csv
 
     check_output(options.output, options.recording, options.model)
     model = IdentifiedModel.load(options.model)
-    recording = read_recording(options.recording, model.load_arm(), options.coordinates)
-    print_notes(options.recording, recording.notes)
     arm = model.load_arm()
+    recording = read_recording(options.recording, arm, options.coordinates)
+    print_notes(options.recording, recording.notes)
+    if recording.tau is not None:  # of poses a prediction needs none
+        refuse_unusable(make_console(), recording, arm, warn=True)
     if model.dynamics is not None and find_poses(recording, arm).moves:
         tau = predict_motion(model, recording)
         if recording.coordinates == "joint":

@@ -111,6 +111,15 @@ def print_notes(path: str, notes: Sequence[str]) -> None:
         print(f"dvrk-drake: note: {path}: {note}", file=sys.stderr)
 
 
+def write_tables(path: str, print_to: Callable[[Console], object]) -> None:
+    """Writes what `print_to` prints into a text file."""
+    from dvrk_drake.analysis.tables import TABLE_WIDTH
+    from dvrk_drake.models.atomic_file import atomic_write
+
+    with atomic_write(path) as stream:
+        print_to(Console(file=stream, highlight=False, width=TABLE_WIDTH))
+
+
 def add_recording(verb: argparse.ArgumentParser) -> None:
     """Adds RECORDING and the option --coordinates."""
     verb.add_argument(

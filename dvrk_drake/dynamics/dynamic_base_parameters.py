@@ -52,10 +52,15 @@ class DynamicBaseParameters:
         return self.to_links[:, self.base.columns]
 
 
-def derive_base_parameters(model: DynamicRegressor) -> DynamicBaseParameters:
+def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True) -> DynamicBaseParameters:
     """Reduces the regressor at random states, chosen so that gravity, velocity and acceleration weigh about the same.
 
     They are those of the arm as it is mounted: tilting it can bring parameters of the first links into the torque.
+
+    Args:
+        model: of the arm.
+        coupled_rotors: False leaves out what couples two rotors, which no motor has (see `rotor_inertias`); p is less
+            by these, the last columns of the regressor.
 
     Raises:
         ArmError: the arm's SDF has no frames dh_1, dh_2, ...
@@ -63,17 +68,19 @@ def derive_base_parameters(model: DynamicRegressor) -> DynamicBaseParameters:
     plant = make_arm_plant(model.arm)
     bodies = labelled_bodies(plant, "dh")
     frames = _link_frames(model, plant, bodies)
-    to_links = np.eye(len(model.values))
+    rotors = [rotor for rotor in model.rotors if coupled_rotors or rotor.actuators[0] == rotor.actuators[1]]
+    p = len(model.values) - len(model.rotors) + len(rotors)
+    to_links = np.eye(p)
     parameters = []
     for i, (label, X_LF) in enumerate(frames):
         to_links[10 * i : 10 * i + 10, 10 * i : 10 * i + 10] = change_of_frame(X_LF)
         parameters += [StandardParameter(label, axis) for axis in _AXES]
-    for rotor in model.rotors:
+    for rotor in rotors:
         a, b = (model.arm.joint_names.index(name) for name in rotor.actuators)
         label = f"{a + 1}" if a == b else f"{a + 1},{b + 1}"
         parameters.append(StandardParameter(label, "a", slides=bool(a == b and model.arm.prismatic[a])))
     base = reduce_to_base(
-        _regressor_at_random_states(model) @ to_links,
+        _regressor_at_random_states(model)[:, :p] @ to_links,
         parameters,
         _readable_preference(parameters, _hinge_axes(plant, model, frames)),
         _named_coefficients(named_lengths(plant, bodies)),

@@ -10,12 +10,41 @@ from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 class LinkEstimate:
     """The ten inertial parameters of a link about its origin in its frame of the SDF, see `LinkInertia`.
 
-    `least_eigenvalue` is that of its pseudo-inertia: positive for every body that can exist.
+    `least_eigenvalue` is that of its pseudo-inertia: positive for every body that can exist. `standard_errors` are of
+    the parameters, of one by one: base parameters are known far better. `mass_told` is the share of the prior's
+    variance of the mass that the motion took away, 0..1: near 0 the mass is the SDF's. `bounds` says which bounds of
+    `consistent_parameters` it lies at.
     """
 
     link: str = ""
     parameters: list[float] = field(default_factory=list)
     least_eigenvalue: float = 0.0
+    standard_errors: list[float] = field(default_factory=list)
+    mass_told: float = 0.0
+    bounds: list[str] = field(default_factory=list)
+
+
+@dataclass
+class MotionParameterEstimate:
+    """A base parameter of the full dynamics, see `derive_base_parameters`.
+
+    `told` is the share of the prior's variance that the motion took away, 0..1.
+    """
+
+    name: str = ""
+    unit: str = ""
+    value: float = 0.0
+    standard_error: float = 0.0
+    told: float = 0.0
+
+
+@dataclass
+class CorrelatedEstimates:
+    """Two base parameters, or a base parameter and an effect, that the motion hardly tells apart."""
+
+    first: str = ""
+    second: str = ""
+    correlation: float = 0.0
 
 
 @dataclass
@@ -52,7 +81,8 @@ class ActuatorEffectEstimate:
 class ActuatorStatistics:
     """How the effort of one actuator was fitted, behind the low-pass: RMS in N m (N of one that slides).
 
-    `rms_cross_validation`: of phases of the motion (or stretches, if it does not repeat) predicted from the others.
+    `rms_cross_validation`: of phases of the motion (or stretches, if it does not repeat) predicted by what the others
+    alone give, the choice of effects and the direction of gravity included.
     `rms_repeatability`: by which the arm does not repeat its efforts from period to period; 0 where it is unknown.
     """
 
@@ -78,7 +108,8 @@ class DynamicSection:
     """tau_actuator = J'^-1 Y(q, v, vd) phi + effects: an arm's identified dynamics.
 
     `gravity` [m/s^2] is gravity in the base frame as the motion shows it, the model's; `gravity_expected` is what it
-    was taken for before, from which it differs where the base was not quite level.
+    was taken for before, from which it differs where the base was not quite level. `base_parameters` are what a motion
+    can tell of links and rotors, `correlations` which of them this one did not tell apart.
     """
 
     gravity: list[float] = field(default_factory=list)
@@ -88,3 +119,5 @@ class DynamicSection:
     actuators: list[ActuatorStatistics] = field(default_factory=list)
     signals: SignalSettings = field(default_factory=SignalSettings)
     gravity_expected: list[float] = field(default_factory=list)
+    base_parameters: list[MotionParameterEstimate] = field(default_factory=list)
+    correlations: list[CorrelatedEstimates] = field(default_factory=list)

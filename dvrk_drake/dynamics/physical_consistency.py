@@ -1,24 +1,36 @@
-"""Inertial parameters that a body can have, nearest to what a recording says: a convex program."""
+"""Inertial parameters that a body can have, nearest to what a recording and the SDF say: a convex program."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
+from pydrake.solvers import ClarabelSolver, MathematicalProgram, MathematicalProgramResult, SolverOptions
+from pydrake.symbolic import Expression
 
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, pseudo_inertia
 from dvrk_drake.errors import IdentificationError
+from dvrk_drake.models.bounding_boxes import BoundingBox
 
 #: Least eigenvalue of a pseudo-inertia [kg, kg m, kg m^2], unless the SDF's own link has less than four times that.
 LEAST_EIGENVALUE = 1e-9
 #: A link's mass stays within these multiples of the SDF's.
 MASS_RANGE = 0.1, 5.0
-#: Its centre of mass stays in a box around the SDF's: this many radii of gyration, at least this far [m].
-COM_REACH, LEAST_COM_REACH = 3.0, 0.03
-#: Relative accuracy that the solver must reach.
-_TOLERANCE = 1e-9
+#: The sum of all links' masses stays within this share of the SDF's.
+TOTAL_MASS_TOLERANCE = 0.2
+#: Weight of the log-det prior, in units of one squared standard deviation; the largest that no actuator's
+#: cross-validated error rises by more than a thousandth with, on the public motions.
+LOG_DET_WEIGHT = 0.03
+#: Relative accuracy that the solver must reach: on the public motions and simulated arms the cost is then within 0.0003
+#: of the least, in units of one squared standard deviation.
+_TOLERANCE = 1e-8
+#: Nearer to a bound than this share of it, a parameter is at the bound.
+_AT_BOUND = 1e-3
+_UNITS = np.eye(10)
+#: Of the way to the cones' boundary that a step may go, tried one after the other; the first is Clarabel's default.
+_STEP_FRACTIONS = (0.99, 0.95, 0.9)
 
 
 @dataclass(frozen=True)
@@ -28,14 +40,10 @@ class LinkScale:
     Attributes:
         mass: [kg].
         length: distance of the centre of mass from the origin plus the radius of gyration [m].
-        com: (3,) [m].
-        gyration: radius of gyration about the centre of mass [m].
     """
 
     mass: float
     length: float
-    com: NDArray[np.float64]
-    gyration: float
 
     @classmethod
     def of(cls, link: LinkInertia) -> LinkScale:
@@ -43,7 +51,7 @@ class LinkScale:
         m, h, moments = link.parameters[0], link.parameters[1:4], link.parameters[4:7]
         com = h / m
         gyration = float(np.sqrt(max(np.sum(moments) / (2 * m) - com @ com, 1e-12)))
-        return cls(float(m), float(np.linalg.norm(com)) + gyration, com, gyration)
+        return cls(float(m), float(np.linalg.norm(com)) + gyration)
 
     @property
     def deviations(self) -> NDArray[np.float64]:
@@ -54,52 +62,85 @@ class LinkScale:
 def consistent_parameters(
     R: NDArray[np.float64],
     b: NDArray[np.float64],
-    links: tuple[LinkInertia, ...],
+    links: Sequence[LinkInertia],
+    boxes: Mapping[str, BoundingBox],
     lower: NDArray[np.float64],
-    scale: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """x (p,) that minimises |R x - b|^2 such that every link can exist and x >= lower.
+    """x (p,) that minimises |R x - b|^2 / 2 + the log-det prior such that every link can exist and x >= lower.
 
-    x starts with the ten parameters of each link. Conditions on a link: pseudo-inertia - eps I positive semidefinite,
-    mass and centre of mass in a box about the SDF's (`MASS_RANGE`, `COM_REACH`). Wensing, Kim and Slotine, "Linear
-    matrix inequalities for physically consistent inertial parameter identification" (2018).
+    x starts with the ten parameters of each link. The prior of a link is LOG_DET_WEIGHT times
+
+        trace(S0^-1 S) - log det S,    S = J - eps I,
+
+    J its pseudo-inertia, S0 that of the SDF's: least at the SDF's, and infinite at the edge of what can exist, so
+    that J - eps I is positive definite. Where R says nothing, x is the SDF's. Its mass and the mass of all are near
+    the SDF's (`MASS_RANGE`, `TOTAL_MASS_TOLERANCE`), and it has a place in its bounding box (`BoundingBox`): the mean
+    square distance from the box's middle is at most the half width squared along each axis, which is linear in J and
+    puts the centre of mass into the box. Pseudo-inertia, and trace(J Q) >= 0 of a bounding ellipsoid, here a flat one
+    an axis: Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter
+    identification" (2018); log-det: Lee, Wensing and Park, "Geometric robot dynamic identification" (2020).
 
     Args:
-        R, b: (p, p) and (p,), compressed rows (e.g. the QR decomposition's), the prior's rows included.
+        R, b: (p, p) and (p,), compressed rows (e.g. the QR decomposition's) in units of their standard deviation, the
+            Gaussian prior's rows included.
         links: as the SDF has them.
+        boxes: link -> where its mass can be.
         lower: (p,) bounds, -inf where there is none.
-        scale: (p,) typical sizes of x, by which the program is scaled.
 
     Raises:
         IdentificationError: the solver did not converge.
     """
     program = MathematicalProgram()
-    y = program.NewContinuousVariables(len(scale), "y")  # x = scale * y
-    A = R * scale
-    size = float(np.linalg.norm(b)) or 1.0
-    program.Add2NormSquaredCost(A / size, b / size, y)
+    # In z = R x the cost is a sphere: what motions tell differs by many decades, which no scaling of x takes away.
+    z = program.NewContinuousVariables(len(b), "z")
+    to_x = np.asarray(np.linalg.inv(R), dtype=np.float64)
+    program.AddQuadraticCost(np.eye(len(b)), -b, z, is_convex=True)
     bounded = np.flatnonzero(np.isfinite(lower))
-    bound = lower[bounded] / scale[bounded]
-    program.AddBoundingBoxConstraint(bound, np.full(len(bounded), np.inf), y[bounded])
+    size = np.linalg.norm(to_x[bounded], axis=1)
+    high = np.full(len(bounded), np.inf)
+    program.AddLinearConstraint(to_x[bounded] / size[:, None], lower[bounded] / size, high, z)
     for k, link in enumerate(links):
-        chosen = slice(10 * k, 10 * k + 10)
-        _constrain_link(program, y[chosen], scale[chosen], link)
-    options = SolverOptions()
-    for name in ("tol_gap_abs", "tol_gap_rel", "tol_feas"):
-        options.SetOption(ClarabelSolver.id(), name, _TOLERANCE)
-    result = ClarabelSolver().Solve(program, None, options)
-    details = result.get_solver_details()
-    # Drake counts what Clarabel calls AlmostSolved, at a reduced accuracy, as a success.
-    if not result.is_success() or details.status != "Solved":
-        raise IdentificationError(
-            f"the program for physically consistent parameters did not converge: Clarabel says {details.status} after "
-            f"{details.iterations} iterations; are efforts and positions this arm's?"
-        )
-    x = np.asarray(result.GetSolution(y), dtype=float) * scale
+        to_link = to_x[10 * k : 10 * k + 10]
+        _add_prior(program, z, to_link, link)
+        _constrain_link(program, z, to_link, link, boxes[link.link])
+    share = TOTAL_MASS_TOLERANCE
+    total = np.sum(to_x[: 10 * len(links) : 10], axis=0) / _total_mass(links)
+    program.AddLinearConstraint(total[None], [1 - share], [1 + share], z)
+    result = _solve(program)
+    x = to_x @ np.asarray(result.GetSolution(z), dtype=float)
     # Interior-point solutions keep their inequalities to the tolerance; these are kept exactly.
     x[bounded] = np.maximum(x[bounded], lower[bounded])
     _check(x, links)
     return x
+
+
+def _solve(program: MathematicalProgram) -> MathematicalProgramResult:
+    """Solves to full accuracy, with shorter steps where rounding stops Clarabel's own short of it."""
+    for fraction in _STEP_FRACTIONS:
+        options = SolverOptions()
+        options.SetOption(ClarabelSolver.id(), "max_step_fraction", fraction)
+        for name in ("tol_gap_abs", "tol_gap_rel", "tol_feas"):
+            options.SetOption(ClarabelSolver.id(), name, _TOLERANCE)
+        result = ClarabelSolver().Solve(program, None, options)
+        details = result.get_solver_details()
+        # Drake counts what Clarabel calls AlmostSolved, at a reduced accuracy, as a success.
+        if result.is_success() and details.status == "Solved":
+            return result
+    raise IdentificationError(
+        f"the program for physically consistent parameters did not converge: Clarabel says {details.status} after "
+        f"{details.iterations} iterations; are efforts and positions this arm's?"
+    )
+
+
+def log_det_curvature(x: NDArray[np.float64], links: Sequence[LinkInertia]) -> NDArray[np.float64]:
+    """(p, p) second derivative of the log-det prior at x (p,)."""
+    H = np.zeros((len(x),) * 2)
+    for k, link in enumerate(links):
+        chosen = slice(10 * k, 10 * k + 10)
+        inverse = np.linalg.inv(pseudo_inertia(x[chosen]) - least_eigenvalue_bound(link) * np.eye(4))
+        steps = np.array([inverse @ pseudo_inertia(unit) for unit in _UNITS])
+        H[chosen, chosen] = LOG_DET_WEIGHT * np.einsum("iab,kba->ik", steps, steps)
+    return H
 
 
 def least_eigenvalue_bound(link: LinkInertia) -> float:
@@ -107,26 +148,68 @@ def least_eigenvalue_bound(link: LinkInertia) -> float:
     return min(LEAST_EIGENVALUE, 0.25 * float(np.linalg.eigvalsh(link.pseudo_inertia())[0]))
 
 
-def _constrain_link(program: MathematicalProgram, y: NDArray, scale: NDArray[np.float64], link: LinkInertia) -> None:
-    size = LinkScale.of(link)
-    # A congruence keeps the sign of every eigenvalue and brings a finger's and a forearm's numbers to the same size.
-    D = np.diag([1 / size.length] * 3 + [1.0]) / np.sqrt(size.mass)
-    units = [scale[i] * D @ pseudo_inertia(unit) @ D for i, unit in enumerate(np.eye(10))]
-    # Twice the bound: what the solver leaves of its tolerance must not go below it.
-    floor = -2 * least_eigenvalue_bound(link) * D @ D
-    program.AddLinearMatrixInequalityConstraint([floor, *units], y)
-    low, high = (share * size.mass / scale[0] for share in MASS_RANGE)
-    program.AddBoundingBoxConstraint(low, high, y[0])
-    reach = max(COM_REACH * size.gyration, LEAST_COM_REACH)
-    for axis in range(3):
-        # m (c - reach) <= m c <= m (c + reach), linear in m and m c; divided by mass and length of the link.
-        row = np.array([scale[0], scale[1 + axis]]) / (size.mass * size.length)
-        for sign in (1.0, -1.0):
-            edge = size.com[axis] + sign * reach
-            program.AddLinearConstraint(sign * np.array([[row[0] * edge, -row[1]]]), 0.0, np.inf, y[[0, 1 + axis]])
+def room_in_box(parameters: NDArray[np.float64], box: BoundingBox) -> NDArray[np.float64]:
+    """(3,) 1 - mean square distance from the middle of the box / half width^2, along each axis; negative: outside."""
+    return _room(box) @ parameters / parameters[0]
 
 
-def _check(x: NDArray[np.float64], links: tuple[LinkInertia, ...]) -> None:
+def reached_bounds(parameters: NDArray[np.float64], link: LinkInertia, box: BoundingBox) -> list[str]:
+    """Which bounds (10,) parameters of a link lie at, for people; empty: none."""
+    bounds = [
+        f"mass at {limit:g} x the SDF's"
+        for limit in MASS_RANGE
+        if abs(parameters[0] / link.parameters[0] - limit) < _AT_BOUND * limit
+    ]
+    sides = "".join(axis for axis, room in zip("xyz", room_in_box(parameters, box), strict=True) if room < _AT_BOUND)
+    if sides:
+        bounds.append(f"mass fills its box along {sides}")
+    return bounds
+
+
+def total_mass_reached(total: float, nominal: float) -> bool:
+    """Whether the mass of all links [kg] lies at the edge of what the SDF's, `nominal`, allows."""
+    return abs(total / nominal - 1) > TOTAL_MASS_TOLERANCE - _AT_BOUND
+
+
+def _add_prior(program: MathematicalProgram, z: NDArray, to_link: NDArray[np.float64], link: LinkInertia) -> None:
+    floor = least_eigenvalue_bound(link) * np.eye(4)
+    # With S0 = L L', Z = L^-1 S L^-T is 1 at the SDF's, whatever the link's size; log det S differs by a constant.
+    L_inverse = np.linalg.inv(np.linalg.cholesky(link.pseudo_inertia() - floor))
+    units = np.array([L_inverse @ pseudo_inertia(unit) @ L_inverse.T for unit in _UNITS])
+    Z = program.NewSymmetricContinuousVariables(4, "Z")
+    below = np.tril_indices(4)
+    entries = np.hstack([units[:, *below].T @ to_link, -np.eye(10)])
+    program.AddLinearEqualityConstraint(
+        entries, (L_inverse @ floor @ L_inverse.T)[below], np.concatenate([z, Z[below]])
+    )
+    program.AddLinearCost(np.full(4, LOG_DET_WEIGHT), np.diag(Z))
+    cost, terms, _ = program.AddMaximizeLogDeterminantCost(Z.astype(Expression))
+    program.RemoveCost(cost)
+    program.AddLinearCost(np.full(4, -LOG_DET_WEIGHT), terms)
+
+
+def _constrain_link(
+    program: MathematicalProgram, z: NDArray, to_link: NDArray[np.float64], link: LinkInertia, box: BoundingBox
+) -> None:
+    mass = link.parameters[0]
+    low, high = MASS_RANGE
+    program.AddLinearConstraint(to_link[:1] / mass, [low], [high], z)
+    program.AddLinearConstraint(_room(box) @ to_link / mass, np.zeros(3), np.full(3, np.inf), z)
+
+
+def _room(box: BoundingBox) -> NDArray[np.float64]:
+    """(3, 10) of the parameters: integral of (1 - (x - c)^2 / w^2) dm for each axis, c and w of the box."""
+    units = np.array([pseudo_inertia(unit) for unit in _UNITS])
+    m, h, squares = units[:, 3, 3], units[:, :3, 3].T, units[:, [0, 1, 2], [0, 1, 2]].T
+    c, w = box.center[:, None], box.half_width[:, None]
+    return m - (squares - 2 * c * h + c**2 * m) / w**2
+
+
+def _total_mass(links: Sequence[LinkInertia]) -> float:
+    return float(sum(link.parameters[0] for link in links))
+
+
+def _check(x: NDArray[np.float64], links: Sequence[LinkInertia]) -> None:
     for k, link in enumerate(links):
         least = float(np.linalg.eigvalsh(pseudo_inertia(x[10 * k : 10 * k + 10]))[0])
         if least < least_eigenvalue_bound(link):

@@ -16,6 +16,7 @@ from pydrake.common.yaml import yaml_load_typed
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_schema import (
     ArmDescription,
+    BoundingShapes,
     CoupledLimit,
     Gains,
     Instrument,
@@ -44,6 +45,7 @@ class Arm:
         joint_names: the n independent joints.
         tree_joint_names: the joints of the SDF tree, linkage included.
         sdf: package URLs or paths of the model files: the arm's, then its instrument's if it has one.
+        mirrored_links: URL of `sdf` -> its links that this arm has as mirror images.
         position_lower, position_upper: (n,) limits of this arm.
         effort_limits: (n,) limits of the joint torques, from the SDF.
         prismatic: (n,) True for a joint that slides [m, N], False for one that turns [rad, N m].
@@ -56,6 +58,7 @@ class Arm:
         friction_coordinates: name -> (n,) coefficients of the joints: where parts rub beside joints and actuators.
         motion: how the signals of a recorded motion are treated, one value a joint.
         effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].
+        bounding_shapes: where the mass of the links of each file of `sdf` can be, see `bounding_boxes`.
         effects: what the real arm has beside all that; only a simulation that asks for them has them.
     """
 
@@ -64,6 +67,7 @@ class Arm:
     joint_names: tuple[str, ...]
     tree_joint_names: tuple[str, ...]
     sdf: tuple[str, ...]
+    mirrored_links: dict[str, tuple[str, ...]]
     position_lower: NDArray[np.float64]
     position_upper: NDArray[np.float64]
     effort_limits: NDArray[np.float64]
@@ -77,6 +81,7 @@ class Arm:
     friction_coordinates: dict[str, NDArray[np.float64]]
     motion: MotionSettings
     effort_cut_off: float
+    bounding_shapes: tuple[BoundingShapes, ...]
     effects: ArmEffects
 
     @property
@@ -200,7 +205,8 @@ def _build_arm(
 ) -> Arm:
     joints = [*mechanism.joints, *instrument.joints]
     sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)
-    facts = read_sdf_facts(compose_sdf(sdf))
+    mirrored = {url: tuple(links) for url, links in description.mirrored_links.items()}
+    facts = read_sdf_facts(compose_sdf(sdf, mirrored))
     position_limits = {**instrument.position_limits, **description.position_limits}
     if set(joints) != set(position_limits):
         raise ArmError(f"{path}: position_limits must name exactly {', '.join(mechanism.joints)}")
@@ -227,6 +233,7 @@ def _build_arm(
         joint_names=tuple(joints),
         tree_joint_names=facts.joint_names,
         sdf=sdf,
+        mirrored_links=mirrored,
         position_lower=limits[:, 0],
         position_upper=limits[:, 1],
         effort_limits=np.array([facts.effort_limits[j] for j in joints]),
@@ -243,6 +250,7 @@ def _build_arm(
         },
         motion=motion,
         effort_cut_off=_checked_cut_off(path, mechanism),
+        bounding_shapes=tuple(part.bounding_shapes for part in (mechanism, instrument) if part.sdf),
         effects=_checked_effects(path, mechanism.effects.joined(instrument.effects), joints),
     )
 
@@ -257,7 +265,15 @@ def _motion_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -
             if values and len(values) != len(part.joints):
                 raise ArmError(f"{path}: motion.{which} has {len(values)} numbers for {len(part.joints)} joints")
             both[which] += values or [default] * len(part.joints)
-    return MotionSettings(both["acceleration_cut_off"], both["effort_delay"], mechanism.motion.base_may_tilt)
+    known = {**mechanism.motion.known_effects, **instrument.motion.known_effects}
+    if not all(0 < travel < np.inf for travel in mechanism.motion.presliding_travels):
+        raise ArmError(f"{path}: motion.presliding_travels must be positive numbers")
+    return dataclasses.replace(
+        mechanism.motion,
+        acceleration_cut_off=both["acceleration_cut_off"],
+        effort_delay=both["effort_delay"],
+        known_effects=known,
+    )
 
 
 def _check_limits(path: Path, joint: str, limits: list[float], prismatic: bool) -> None:

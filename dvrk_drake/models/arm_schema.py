@@ -40,13 +40,38 @@ class MotionSettings:
     """How the signals of a recorded motion are treated; per joint, in the order of the joints that the file has.
 
     `acceleration_cut_off` [Hz] of the low-pass for accelerations, `effort_delay` [s] by which the recorded effort is
-    later than the positions (negative: earlier). Of a mechanism also `base_may_tilt`, whether the direction of gravity
-    is estimated from a motion.
+    later than the positions (negative: earlier). `known_effects` are what drives have beside friction: name of a
+    coordinate of the drive (`effect_coordinates`) -> "spring", "cable 1" (sine and cosine of one period a turn),
+    "cable 2" (of two), "asymmetric friction". Of a mechanism also `base_may_tilt`, whether the direction of gravity is
+    estimated from a motion, and `presliding_travels`, over which elasto-plastic elements give way, as shares of a
+    coordinate's standard deviation of position.
     """
 
     acceleration_cut_off: list[float] = field(default_factory=list)
     effort_delay: list[float] = field(default_factory=list)
     base_may_tilt: bool = False
+    known_effects: dict[str, list[str]] = field(default_factory=dict)
+    presliding_travels: list[float] = field(default_factory=lambda: [0.003, 0.01, 0.08, 0.3, 1.0])
+
+
+@dataclass
+class BoxCorners:
+    """A box along the axes of a link's frame: its lower and upper corner [m]."""
+
+    lower: list[float] = field(default_factory=list)
+    upper: list[float] = field(default_factory=list)
+
+
+@dataclass
+class BoundingShapes:
+    """Where the mass of the links of one SDF file can be: in the box around a link's collision shapes, widened.
+
+    `margin` [m] on all sides is for what is not drawn: covers, screws, cables. `boxes` are those of links whose shapes
+    are not where their mass is, or that have none; no margin is added to them.
+    """
+
+    margin: float = 0.04
+    boxes: dict[str, BoxCorners] = field(default_factory=dict)
 
 
 @dataclass
@@ -65,6 +90,7 @@ class Mechanism:
     loop_closures: list[LoopClosure] = field(default_factory=list)
     motion: MotionSettings = field(default_factory=MotionSettings)
     effort_cut_off: float = 10.0
+    bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
     effects: ArmEffects = field(default_factory=ArmEffects)
 
 
@@ -84,6 +110,7 @@ class Instrument:
     gains: Gains = field(default_factory=Gains)
     friction_coordinates: dict[str, dict[str, float]] = field(default_factory=dict)
     motion: MotionSettings = field(default_factory=MotionSettings)
+    bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
     effects: ArmEffects = field(default_factory=ArmEffects)
 
 
@@ -93,8 +120,9 @@ class ArmDescription:
 
     `mechanism` and `instrument` are names of files in their folders, or paths of YAML files from the arm's own folder;
     the `sdf` of such a file is a path from the folder that it is in. `gravity` is the gravity vector [m/s^2] in the
-    arm's base frame. `coupled_limits` replaces [lower, upper] of the mechanism's coupled limits by name, for an arm
-    whose stops were calibrated.
+    arm's base frame. `mirrored_links` names, by SDF file, links of which this arm has the mirror image (x to -x in the
+    link's frame); another SDF, such as one that was exported of this arm, is taken as it is. `coupled_limits` replaces
+    [lower, upper] of the mechanism's coupled limits by name, for an arm whose stops were calibrated.
     """
 
     name: str = ""
@@ -102,4 +130,5 @@ class ArmDescription:
     instrument: str = ""
     position_limits: dict[str, list[float]] = field(default_factory=dict)
     coupled_limits: dict[str, list[float]] = field(default_factory=dict)
+    mirrored_links: dict[str, list[str]] = field(default_factory=dict)
     gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81])

@@ -1,0 +1,31 @@
+"""The command line with a formula in place of the simulation, in all processes: workers that are spawned import this.
+
+python tests/formula_study.py study STUDY.yaml --output RESULTS.csv --workers 2
+"""
+
+import sys
+import time
+
+import numpy as np
+
+import dvrk_drake.analysis.study as study_module
+from dvrk_drake.analysis.simulation import Simulation
+from dvrk_drake.models.recording import Recording
+
+
+def simulate(scenario):
+    """A quarter of a second for a drift that seed, start and parameter error decide."""
+    time.sleep(0.25)
+    t = np.arange(0.0, scenario.duration + 1e-9, scenario.sample_period)
+    rate = (1 + scenario.controller.parameter_error) * (scenario.seed % 1000) / 5e4
+    q = np.array(scenario.start) + rate * t[:, None]
+    return Simulation(Recording(q=q, qd=0 * q, tau=q / 10, t=t), np.hstack([q, 0 * q]), None, None)
+
+
+if __name__ in ("__main__", "__mp_main__"):  # the command, and its workers
+    study_module.simulate = simulate
+
+if __name__ == "__main__":
+    from dvrk_drake.cli import main
+
+    sys.exit(main(sys.argv[1:]))

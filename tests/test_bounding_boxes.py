@@ -1,0 +1,72 @@
+"""Where the mass of links can be: boxes around shapes, and what fits them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
+from dvrk_drake.dynamics.physical_consistency import reached_bounds, room_in_box
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_schema import BoundingShapes, BoxCorners
+from dvrk_drake.models.bounding_boxes import BoundingBox, bounding_boxes
+
+
+@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+def test_the_sdfs_own_links_fit_their_boxes(name):
+    arm = load_arm(name)
+    boxes = bounding_boxes(arm)
+    assert list(boxes) == [link.link for link in link_inertias(arm)]
+    for link in link_inertias(arm):
+        assert np.all(room_in_box(link.parameters, boxes[link.link]) > 0.05), link.link
+
+
+def test_a_box_is_around_the_collision_shapes_and_the_margin_is_that_of_its_file():
+    boxes = bounding_boxes(load_arm("psm"))
+    # One box each in the SDF: 0.028 x 0.536 x 0.02 m about (0, 0.258, 0) in psm.sdf.
+    np.testing.assert_allclose(boxes["bottom_bar_link"].lower, [-0.054, -0.05, -0.05], atol=1e-9)
+    np.testing.assert_allclose(boxes["bottom_bar_link"].upper, [0.054, 0.566, 0.05], atol=1e-9)
+    # A shaft of radius 4.2 mm in the instrument's, whose margin is 1 cm.
+    assert boxes["roll_link"].half_width[0] == pytest.approx(0.0142, abs=2e-4)
+
+
+def point_mass(mass, p):
+    moments = np.sum(np.square(p)) - np.square(p)
+    products = [-p[0] * p[1], -p[0] * p[2], -p[1] * p[2]]
+    return mass * np.concatenate([[1.0], p, moments, products])
+
+
+def test_the_room_of_a_point_is_by_its_distance_from_the_middle():
+    """1 - (d / w)^2 along each axis; a body is the sum of its points, so what is inside has room."""
+    box = BoundingBox(np.array([-0.1, 0.0, 0.2]), np.array([0.3, 0.2, 0.3]))
+    p = np.array([0.2, 0.1, 0.32])
+    expected = 1 - ((p - box.center) / box.half_width) ** 2
+    np.testing.assert_allclose(room_in_box(point_mass(0.7, p), box), expected, atol=1e-12)
+    inside = np.random.default_rng(0).uniform(box.lower, box.upper, (20, 3))
+    body = sum(point_mass(0.05, point) for point in inside)
+    assert np.all(room_in_box(body, box) >= 0)
+
+
+def test_bounds_that_are_reached_are_named():
+    box = BoundingBox(np.full(3, -0.1), np.full(3, 0.1))
+    nominal = LinkInertia("link", point_mass(1.0, np.zeros(3)))
+    assert reached_bounds(nominal.parameters, nominal, box) == []
+    assert reached_bounds(5 * nominal.parameters, nominal, box) == ["mass at 5 x the SDF's"]
+    far = point_mass(0.1, np.array([0.0, 0.1, 0.0]))
+    assert reached_bounds(far, nominal, box) == ["mass at 0.1 x the SDF's", "mass fills its box along y"]
+
+
+def test_links_whose_place_nobody_states_are_refused():
+    arm = load_arm("mtmr")
+    with pytest.raises(ArmError, match=r"motor_4_link has no <collision> in its SDF.*give it a box"):
+        bounding_boxes(dataclasses.replace(arm, bounding_shapes=(BoundingShapes(),)))
+    box = BoxCorners([0, 0, 0], [1, -1, 1])
+    with pytest.raises(ArmError, match="lower and upper of crank_link must be three numbers each"):
+        shapes = dataclasses.replace(arm.bounding_shapes[0], boxes={"crank_link": box})
+        bounding_boxes(dataclasses.replace(arm, bounding_shapes=(shapes,)))
+    with pytest.raises(ArmError, match="boxes names elbow, no link of"):
+        shapes = dataclasses.replace(arm.bounding_shapes[0], boxes={"elbow": box})
+        bounding_boxes(dataclasses.replace(arm, bounding_shapes=(shapes,)))

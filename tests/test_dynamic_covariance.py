@@ -1,0 +1,84 @@
+"""Standard errors in motion against what many simulated experiments show."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dvrk_drake.analysis.dynamic_covariance import error_covariance, independent_measurements, parameter_covariance
+from dvrk_drake.analysis.low_pass import low_pass
+
+RATE, CUT_OFF, PERIOD, SECONDS = 100.0, 5.0, 8.0, 32.0
+T = np.arange(round(SECONDS * RATE)) / RATE
+
+
+def noise(generator, count=1):
+    return low_pass(generator.normal(size=(len(T), count)), RATE, CUT_OFF)
+
+
+def test_low_passed_white_noise_has_two_independent_values_a_period_of_the_cut_off():
+    counts = [
+        independent_measurements(error_covariance(column, column, RATE, PERIOD))
+        for column in noise(np.random.default_rng(0), 20).T
+    ]
+    assert np.mean(counts) == pytest.approx(2 * CUT_OFF * SECONDS, rel=0.15)
+
+
+def test_an_error_that_repeats_counts_once():
+    """Four periods of the same error tell as much as one."""
+    generator = np.random.default_rng(1)
+    counts = []
+    for _ in range(20):
+        one = noise(generator)[: round(PERIOD * RATE), 0]
+        again = np.tile(one, 4)
+        counts.append(independent_measurements(error_covariance(again, again, RATE, PERIOD)))
+    assert np.mean(counts) == pytest.approx(2 * CUT_OFF * PERIOD, rel=0.25)
+
+
+@pytest.mark.parametrize("repeating", [0.0, 1.0])
+def test_standard_errors_are_the_spread_of_repeated_fits(repeating):
+    """Two actuators, a motion of four periods, white noise and (or not) an error that comes again in every period."""
+    generator = np.random.default_rng(2)
+    w = 2 * np.pi * np.arange(1, 4) / PERIOD
+    slow, fast = (np.hstack([np.sin(f * w * T[:, None]), np.cos(f * w * T[:, None])]) for f in (1, 5))
+    X, weights, prior = [slow, 0.3 * fast + 0.1 * slow], np.array([1.0, 0.3]), 1e-6 * np.eye(6)
+    fold = (T % PERIOD / PERIOD * 12).astype(int)
+    problem = SimpleNamespace(chosen_columns=lambda i, _: X[i], fold=fold)
+    information = sum(weight * x.T @ x for weight, x in zip(weights, X, strict=True))
+    fit = SimpleNamespace(
+        information=information, prior_precision=prior, weights=weights, chosen=np.arange(0), lower=np.full(6, -np.inf)
+    )
+    estimates, predicted = [], []
+    for _ in range(100):
+        again = noise(generator, 2)[: round(PERIOD * RATE)]
+        error = noise(generator, 2) + repeating * np.tile(again, (4, 1))
+        sums = sum(w * x.T @ e for w, x, e in zip(weights, X, error.T, strict=True))
+        fit.x = np.linalg.solve(information + prior, sums)
+        left = error - np.column_stack([x @ fit.x for x in X])
+        estimates.append(fit.x)
+        predicted.append(np.diag(parameter_covariance(problem, fit, left, RATE, CUT_OFF, PERIOD)))
+    spread, mean = np.std(estimates, axis=0), np.sqrt(np.mean(predicted, axis=0))
+    # The spread of 100 fits is known to 7 % (1 sigma).
+    np.testing.assert_allclose(mean, spread, rtol=0.2)
+    assert np.mean(mean / spread) == pytest.approx(1.0, abs=0.1)
+
+
+def test_what_the_motion_does_not_tell_keeps_the_priors_variance():
+    X = np.zeros((len(T), 2))
+    X[:, 0] = np.sin(T)
+    tau = noise(np.random.default_rng(3))
+    prior, weights = np.diag([1.0, 4.0]), np.array([2.0])
+    fit = SimpleNamespace(
+        information=2.0 * X.T @ X,
+        prior_precision=prior,
+        weights=weights,
+        chosen=np.arange(0),
+        x=np.zeros(2),
+        lower=np.full(2, -np.inf),
+    )
+    problem = SimpleNamespace(chosen_columns=lambda i, _: X, fold=(T // 4).astype(int))
+    covariance = parameter_covariance(problem, fit, tau, RATE, CUT_OFF, None)
+    assert covariance[1, 1] == pytest.approx(1 / 4.0)
+    assert covariance[0, 0] < 0.01
