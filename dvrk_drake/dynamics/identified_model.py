@@ -164,17 +164,10 @@ class IdentifiedModel:
 
     @property
     def holding_effects(self) -> list[ActuatorEffectEstimate]:
-        """The effects that act at rest as they do in motion: those of position alone.
-
-        An offset that a motion shows does not hold an arm: friction that differs by direction looks like one (the
-        -0.22 N m at the shoulder of the public MTM are not there at rest). Where the coordinate has a cable's cosine,
-        the offset is part of that curve, and stays.
-        """
+        """The effects that act at rest as they do in motion (`DynamicModel.holding_effects`)."""
         if self.dynamics is None:
             return self.effects
-        effects = self.dynamics.effects
-        curves = {e.coordinate for e in effects if e.kind == "cable cosine"}
-        return [e for e in effects if e.kind in POSITION_KINDS and (e.kind != "offset" or e.coordinate in curves)]
+        return [self.dynamics.effects[i] for i in self.dynamic_model.holding_effects]
 
     @property
     def theta(self) -> NDArray[np.float64]:
