@@ -143,4 +143,4 @@ def test_a_controller_sees_the_arm_before_the_step_of_its_command(effects):
         now = station.get_positions(context)
         limited = [np.clip(model.holding_torque(q), -arm.effort_limits, arm.effort_limits) for q in (before, now)]
         np.testing.assert_allclose(port.Eval(own), limited[0], atol=1e-12)
-    assert np.abs(limited[1] - limited[0]).max() > 1e-4
+    assert np.abs(limited[1] - limited[0]).max() > 1e-6
