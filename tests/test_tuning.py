@@ -1,14 +1,16 @@
 """Gains: what is found on a joint whose equations are known, and what the files and the verb refuse."""
 
 import dataclasses
+import io
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.optimize import brentq
 
 from dvrk_drake.analysis.scenario import load_scenario
 from dvrk_drake.analysis.tuning.bench import Bench, Response
-from dvrk_drake.analysis.tuning.comparison import DURATION, REST, measure_step
+from dvrk_drake.analysis.tuning.comparison import CONDITIONS, DURATION, REST, measure_step
 from dvrk_drake.analysis.tuning.joint_on_bench import JointOnBench
 from dvrk_drake.analysis.tuning.model_based import (
     GAIN_MARGIN,
@@ -21,10 +23,12 @@ from dvrk_drake.analysis.tuning.model_based import (
     sampling_of,
 )
 from dvrk_drake.analysis.tuning.oscillation import judge_oscillation
+from dvrk_drake.analysis.tuning.plots import plot_steps
 from dvrk_drake.analysis.tuning.procedure import RELEASE, find_ultimate_gain, tune_joint
 from dvrk_drake.analysis.tuning.published import published_gains
 from dvrk_drake.analysis.tuning.sampled_loop import SampledLoop, Sampling, place
 from dvrk_drake.analysis.tuning.settings import band, step_size
+from dvrk_drake.analysis.tuning.tables import print_tuning
 from dvrk_drake.analysis.tuning.tuning import tune_arm
 from dvrk_drake.cli import main
 from dvrk_drake.errors import ControllerError
@@ -309,14 +313,15 @@ def test_the_insertion_of_a_psm_swings_up_where_the_equations_say():
 
 
 @pytest.mark.slow
-def test_the_designed_gains_settle_every_joint_of_a_psm():
-    tuning = tune_arm("psm", ["model"], conditions=tuning_conditions(), poses=1)
+def test_the_designed_gains_settle_every_joint_of_a_psm(tmp_path):
+    tuning = tune_arm("psm", ["model"], conditions=CONDITIONS[:1], poses=1)
     settling = tuning.comparison.table("model", "settling")
     assert np.all(np.isfinite(settling))
     assert tuning.found == {"model": design_arm(load_arm("psm")).gains}
-
-
-def tuning_conditions():
-    from dvrk_drake.analysis.tuning.comparison import CONDITIONS
-
-    return CONDITIONS[:1]
+    assert tuning.comparison.best(["model"]) == "model"
+    console = Console(record=True, width=120, file=io.StringIO())
+    print_tuning(console, tuning)
+    said = console.export_text()
+    assert all(name in said for name in (*tuning.arm.joint_names, "the arm's own", "[s]", "[kg m^2; kg]"))
+    plot_steps(tmp_path / "steps.png", tuning.comparison)
+    assert (tmp_path / "steps.png").stat().st_size > 10_000

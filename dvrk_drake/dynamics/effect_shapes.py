@@ -29,8 +29,13 @@ def effect_shapes(
     rows = effect_coordinates(arm)
     weight = np.zeros_like(a)
     if any(EFFECT_KINDS[effect.kind].loaded for effect in effects):
-        rest = np.zeros_like(q)
-        weight = arm.transmission.inverse().pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
+        weight = nominal_weight(regressor, q)
     for effect in effects:
         h = rows[effect.coordinate]
         yield effect.column(a @ h, a_dot @ h, np.abs(weight @ h) / (h @ h))
+
+
+def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.float64]:
+    """(m, n) efforts of the actuators [N m, N] that bear the arm's weight at poses q (m, n), as the SDF states it."""
+    rest = np.zeros_like(q, dtype=np.float64)
+    return regressor.arm.transmission.inverse().pull_back_effort(regressor.torque(q, rest, rest, regressor.values))

@@ -65,7 +65,8 @@ def print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
     console.print(table)
     console.print(
         "inertia in the joint box: least, all other joints free, and largest, all others held [kg m^2; kg]; margins\n"
-        f"at these. All frequencies were multiplied by {design.slowed:.2f}, so that all joints are stable together.\n"
+        "at these. Limited by the other joints: slower than alone, so that all are stable together.\n",
+        markup=False,
     )
 
 
@@ -75,14 +76,15 @@ def print_comparison(console: Console, comparison: Comparison) -> None:
     console.print(
         f"All joints of {arm.name} step at once, from {poses} poses. Settling time [s]: afterwards the joint stays\n"
         f"inside its band, 2 % of the step or a count of its encoder; the slowest pose; n/{poses}: from n poses it\n"
-        f"has not settled in {DURATION - REST:g} s. Overshoot, error left, unrest (peak to peak of effort at rest,\n"
-        "over its limit): the worst pose, arm as modelled.\n"
+        f"has not settled in {DURATION - REST:g} s. Overshoot, what is left, unrest (peak to peak of effort at rest,\n"
+        "over its limit): the worst pose, arm as modelled. G, M: true gravity torque, true inertia over the model's.\n",
+        markup=False,
     )
     for j, joint in enumerate(arm.joint_names):
         unit, size = ("mm", step_size(arm)[j]) if arm.prismatic[j] else ("mrad", step_size(arm)[j])
         title = f"{joint}, step {1e3 * size:g} {unit}, band {1e3 * band(arm)[j]:.2g} {unit}"
         names = [condition.name for condition in comparison.conditions]
-        table = make_table(title, "", *names, "overshoot", "error left", "unrest")
+        table = make_table(title, "", *names, "overshoot", "left", "unrest")
         for which in comparison.gains:
             settling = comparison.table(which, "settling")[:, :, j]
             worst = [comparison.table(which, name)[0, :, j].max() for name in ("overshoot", "steady_error", "unrest")]
@@ -101,7 +103,7 @@ def print_comparison(console: Console, comparison: Comparison) -> None:
 def _print_poses(console: Console, comparison: Comparison) -> None:
     n = comparison.arm.num_joints
     table = make_table(
-        f"Joints of {n} that settle, mean settling time [s] of those: arm as modelled",
+        f"Joints of {n} that settle, and their mean settling time [s]",
         "pose [rad, m]",
         *comparison.gains,
     )
