@@ -50,7 +50,7 @@ GOAL = START + 0.1
 
 
 def serial_plant(arm: Arm) -> MultibodyPlant:
-    root = compose_sdf(arm.sdf)
+    root = compose_sdf(arm.sdf, arm.mirrored_links)
     model = root.find("model")
     names = arm.joint_names
     ElementTree.register_namespace("drake", DRAKE.strip("{}"))

@@ -21,6 +21,7 @@ from dvrk_drake.analysis.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.payload import Payload, estimate_payload
 from dvrk_drake.analysis.point_mass import point_mass_parameters
 from dvrk_drake.analysis.recalibration import recalibrate
+from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
@@ -48,8 +49,27 @@ def main() -> int:
         for name, link, mass, place in WEIGHTS:
             (payload,) = estimate_payload(read(reference), read(name), model.dynamic_model, [link])
             _print_payload(arm, read(name), reference, name, payload, mass, np.array(place))
+    # The arm without payload on the other day, and the torque of a payload that is known exactly.
+    for reference, other in (("psm_one_no_weight", "psm_one"), ("psm_one", "psm_one_no_weight")):
+        model = models[reference].dynamic_model
+        for _, link, mass, place in WEIGHTS:
+            loaded = _with_payload(read(other), model, link, mass, np.array(place))
+            (payload,) = estimate_payload(read(reference), loaded, model, [link])
+            name = f"{other} with {1000 * mass:.0f} g added to its efforts"
+            _print_payload(arm, loaded, reference, name, payload, mass, np.array(place))
     _print_seconds(models["psm_one"], read("psm_one_no_weight"))
     return 0
+
+
+def _with_payload(recording: Recording, model: DynamicModel, link: str, mass: float, place: np.ndarray) -> Recording:
+    """The recording with the efforts that a point mass on a link would have added."""
+    arm = model.arm
+    recording = recording.in_actuator_coordinates(arm)
+    grid = motion_grid(recording, arm, model.section.signals)
+    k = [link.link for link in model.regressor.links].index(link)
+    Y = model.regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
+    added = Y @ point_mass_parameters(mass, place) @ arm.transmission.inverse().matrix
+    return dataclasses.replace(recording, tau=recording.measured_effort() + grid.efforts_at_rows(added))
 
 
 def _print_payload(

@@ -62,7 +62,7 @@ def motion(seconds: float) -> PiecewisePolynomial:
 
 def open_arm(folder: Path) -> Arm:
     """The PSM without linkage, as a file of its own in `folder`."""
-    root = compose_sdf(ARM.sdf)
+    root = compose_sdf(ARM.sdf, ARM.mirrored_links)
     model = root.find("model")
     joints = {joint.get("name"): joint for joint in model.findall("joint")}
     joints["pitch"].find("child").text = "end_link"

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from real_arm import ARMS, Run, middle, weightless
 
+from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.effects_schema import ArmEffects, Cable, FrictionEffect
+from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect, FrictionEffect
+from dvrk_drake.systems.arm_station import ArmStation
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -69,27 +71,39 @@ def test_the_coupled_stop_gives_no_energy(direction):
     assert energy[1][-1] < 0.8 * energy[1][0] < energy[0][100]
 
 
+def test_a_cables_effort_is_minus_what_identification_calls_the_effect():
+    arm, q = load_arm("mtml"), np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
+    sine = DriveEffect("joint.wrist_pitch", "cable sine", 1.0, 0.2)
+    offset = DriveEffect("actuator.elbow_pitch", "offset", 0.0, 0.1)
+    run = Run(arm, ArmEffects(cables=[sine], springs=[offset]), q)
+    force = run.station.GetSubsystemByName("drive_force")
+    effort = force.get_output_port().Eval(force.GetMyContextFromRoot(run.context))[run.station._joints.index]
+    np.testing.assert_allclose(effort, [0, -0.1, -0.1, 0, -0.2 * np.sin(0.5), 0, 0], atol=1e-16)
+
+
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_cables_and_springs_give_back_what_they_take(name):
     """Round a closed path of the joints their work is nothing."""
     arm = weightless(name)
     run = Run(arm, arm.effects.only(["cables", "springs"]))
-    torque = run.station.GetSubsystemByName("cables_and_springs")
-    context = torque.CreateDefaultContext()
+    system = run.station.GetSubsystemByName("drive_force")
+    context, index = system.CreateDefaultContext(), run.station._joints.index
     phase = np.linspace(0, 2 * np.pi, 4001)
     ranges = 0.4 * (arm.position_upper - arm.position_lower)
     q = middle(arm) + ranges * np.sin(np.outer(phase, np.arange(1, arm.num_joints + 1)) + 0.3)
     forces = []
+    state = np.zeros(run.station.plant.num_multibody_states())
     for pose in q:
-        torque.get_input_port().FixValue(context, np.concatenate([pose, np.zeros(arm.num_joints)]))
-        forces.append(torque.get_output_port().Eval(context).copy())
+        state[index] = pose
+        system.GetInputPort("plant_state").FixValue(context, state)
+        forces.append(system.get_output_port().Eval(context)[index])
     f = np.array(forces)
     work = np.sum(0.5 * (f[1:] + f[:-1]) * np.diff(q, axis=0), axis=1)
     assert abs(work.sum()) < 1e-4 * np.abs(work).sum()
     assert np.abs(f).max() > 1e-3
 
 
-CABLES = {"outer_yaw": Cable(80.0, 0.05), "elbow_pitch": Cable(60.0, 0.02), "wrist_roll": Cable(0.5, 1e-4)}
+CABLES = {"outer_yaw": Cable(80.0, 0.05), "shoulder_pitch": Cable(60.0, 0.02), "wrist_roll": Cable(0.5, 1e-4)}
 
 
 def stretched(friction=()):
@@ -101,7 +115,7 @@ def test_a_cable_stretches_by_its_load():
     """A motor that holds against an effort on the joints turns by what the cable gives; the encoder sits on it."""
     brakes = [FrictionEffect(f"actuator.{joint}", "viscous", 0.0, 0.5) for joint in load_arm("mtml").joint_names]
     arm, run = stretched(brakes)
-    load = dict.fromkeys(arm.joint_names, 0.0) | {"outer_yaw": 0.8, "elbow_pitch": -0.6, "wrist_roll": 0.01}
+    load = dict.fromkeys(arm.joint_names, 0.0) | {"outer_yaw": 0.8, "shoulder_pitch": -0.6, "wrist_roll": 0.01}
     effort = arm.transmission.pull_back_effort(list(load.values()))
     run.fix("effort_commanded", -effort)
     run.fix("effort_disturbance", effort)
@@ -112,6 +126,12 @@ def test_a_cable_stretches_by_its_load():
         # The tie is a rod whose length is as good as linear in the angle: 1 % at 10 mrad.
         assert stretch[i] == pytest.approx(expected, rel=0.02, abs=2e-4)
     assert np.abs(run.v).max() < 1e-3
+
+
+@pytest.mark.parametrize(("name", "actuator"), [("mtml", "elbow_pitch"), ("psm", "insertion"), ("psm", "jaw")])
+def test_a_cable_whose_rotor_is_not_known_is_refused(name, actuator):
+    with pytest.raises(StationError, match=f"stretch.{actuator}: allowed are actuators that turn one joint alone"):
+        ArmStation(load_arm(name), effects=ArmEffects(stretch={actuator: Cable(100.0)}))
 
 
 def test_cables_that_stretch_give_back_no_more_than_they_hold():

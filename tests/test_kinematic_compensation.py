@@ -89,7 +89,9 @@ def test_the_chain_is_the_arm(tmp_path):
 def test_what_the_file_cannot_hold_is_refused():
     model = other_psm()
     model.effects = [ActuatorEffectEstimate("joint.pitch", "offset", 0.0, 0.1)]
-    with pytest.raises(ModelError, match=r"off by up to pitch 0\.1 .*no joint effects"):
+    with pytest.raises(
+        ModelError, match=r"off by up to pitch 0\.1 .*: joint.pitch offset 0\.1\. .*--gc-tolerance 0\.1"
+    ):
         kinematic_compensation(model)
     heavy = other_psm()
     (net,) = (p for p in heavy.base_parameters if "- m_counterweight" in p.name and p.name.startswith("(m3"))

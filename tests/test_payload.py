@@ -9,7 +9,9 @@ from pydrake.multibody.tree import MultibodyForces
 
 from dvrk_drake.analysis.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.payload import as_good, estimate_payload
+from dvrk_drake.analysis.payload_tables import print_payload
 from dvrk_drake.analysis.point_mass import point_mass_parameters
+from dvrk_drake.analysis.tables import make_console
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, pseudo_inertia
@@ -95,6 +97,30 @@ def test_an_arm_without_payload_has_none():
     for seed in range(3):
         model, reference, loaded = two_days("psm", "end_link", 0.0, [0.0, 0.0, 0.0], seed)
         assert not any(p.found for p in estimate_payload(reference, loaded, model, ["end_link", "bottom_bar_link"]))
+
+
+def test_a_recording_against_itself_is_refused():
+    model, reference, _ = two_days("psm", "end_link", 0.0, [0.0, 0.0, 0.0], 0)
+    with pytest.raises(
+        RecordingError, match=r"simulated: shows no difference from the reference: .* the same recording"
+    ):
+        estimate_payload(reference, reference, model, ["end_link"])
+
+
+def test_what_is_not_found_is_said_with_how_much_it_may_be(capsys):
+    link = "end_link"
+    model, reference, other = two_days("psm", link, 0.0, [0.0, 0.0, 0.0], 0)
+    (none,) = estimate_payload(reference, other, model, [link])
+    print_payload(make_console(), none)
+    printed = capsys.readouterr().out
+    assert "No payload found on end_link" in printed and f"below {1e3 * none.largest_at_com:.3g} g (95%)" in printed
+    assert "mass [kg]" not in printed
+    # What weighs more is not below that.
+    com = next(own for own in model.regressor.links if own.link == link).parameters
+    mass = 1.5 * none.largest_at_com
+    model, reference, loaded = two_days("psm", link, mass, com[1:4] / com[0], 0)
+    (some,) = estimate_payload(reference, loaded, model, [link])
+    assert mass < some.largest_at_com < 4 * mass
 
 
 def test_a_reference_that_begins_later_is_aligned():

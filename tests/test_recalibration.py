@@ -64,13 +64,13 @@ def test_friction_and_offsets_of_the_second_day_are_found(name):
     np.testing.assert_allclose(found, expected, atol=0.1)
 
 
-def test_rigid_bodies_stay_and_offsets_move_the_arm_but_do_not_hold_it():
+def test_rigid_bodies_stay_and_offsets_count_in_motion_alone():
     model, truth, generator = days("psm")
     result = recalibrate(model, motion(truth, generator))
     new, arm = result.model, model.load_arm()
     assert new.dynamics.links == model.dynamics.links and new.dynamics.rotors == model.dynamics.rotors
     assert new.base_parameters == model.base_parameters
-    # All actuators of a PSM bear weight: what a motion shows as their offsets need not be there at rest.
+    # An offset that a motion shows is no torque that holds an arm (`IdentifiedModel.holding_effects`).
     q = arm.sample_poses(3, np.random.default_rng(0))
     offsets = np.array([a.offset for a in result.actuators])
     np.testing.assert_array_equal(new.holding_torque(q), model.holding_torque(q))
@@ -120,11 +120,36 @@ def test_another_arm_is_refused(ours, theirs):
 def test_efforts_of_something_else_are_refused():
     model, truth, generator = days("psm")
     recording = motion(truth, generator)
-    shuffled = dataclasses.replace(recording, tau=recording.tau[::-1], source="backwards.csv")
-    with pytest.raises(
-        RecordingError, match=r"backwards.csv: efforts differ .* is it of this arm, in these coordinates"
-    ):
-        recalibrate(model, shuffled)
+    noise = generator.normal(size=recording.tau.shape) * np.std(recording.tau, axis=0)
+    other = dataclasses.replace(recording, tau=noise, source="noise.csv")
+    with pytest.raises(RecordingError, match=r"noise.csv: efforts differ .* is it of this arm, in these coordinates"):
+        recalibrate(model, other)
+
+
+@pytest.mark.parametrize(("name", "seconds"), [("psm", 6.0), ("mtmr", 8.0)])
+def test_an_effort_of_the_wrong_sign_is_refused_however_short_the_recording(name, seconds):
+    model, truth, generator = days(name)
+    recording = motion(truth, generator, seconds).in_actuator_coordinates(truth.arm)
+    for j, joint in enumerate(truth.arm.joint_names):
+        tau = recording.tau.copy()
+        tau[:, j] *= -1
+        with pytest.raises(RecordingError, match=rf"efforts go against the model's \(correlation\): {joint} \(-"):
+            recalibrate(model, dataclasses.replace(recording, tau=tau))
+    assert recalibrate(model, recording).seconds > 0
+
+
+def test_the_error_after_is_of_parts_that_were_not_fitted():
+    """Friction that goes wild in one part of the motion can be fitted there, but not predicted from the other parts."""
+    model, truth, generator = days("psm")
+    recording = motion(truth, generator).in_actuator_coordinates(truth.arm)
+    tau = recording.tau.copy()
+    first = recording.t < 2.5
+    tau[first, 3] += 2 * np.std(tau[:, 3]) * np.sign(recording.qd[first, 3])
+    result = recalibrate(model, dataclasses.replace(recording, tau=tau))
+    other = motion(truth, generator, seconds=16.0, seed=6)
+    before, after = errors(model, other), errors(result.model, other)
+    assert np.all(after[[0, 1, 2, 4, 5, 6]] < before[[0, 1, 2, 4, 5, 6]] + NOISE / 10)
+    assert result.actuators[3].after > 0.3
 
 
 def test_from_the_command_line(tmp_path, capsys):

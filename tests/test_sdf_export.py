@@ -138,7 +138,7 @@ def test_urdf_has_the_equations_of_motion_of_the_sdf(name, tmp_path):
             (arm.position_lower[i], arm.position_upper[i]), abs=1e-15
         )
         assert urdf_plant.GetJointActuatorByName(joint_name).effort_limit() == arm.effort_limits[i]
-    root = compose_sdf(arm.sdf)
+    root = compose_sdf(arm.sdf, arm.mirrored_links)
     names = [part.get("name") for tag in ("link", "frame") for part in root.iterfind(f"model/{tag}")]
     assert "dh_1" in names
     for frame in names:

@@ -149,7 +149,7 @@ NEIGHBOURS = (
 def test_links_keep_apart_over_the_joint_box():
     """With the collision shapes and without the filter that an arm has; Drake leaves out links that a joint joins."""
     arm = load_arm("psm")
-    root = compose_sdf(arm.sdf)
+    root = compose_sdf(arm.sdf, arm.mirrored_links)
     (model,) = root.findall("model")
     for group in model.findall(f"{DRAKE}collision_filter_group"):
         model.remove(group)

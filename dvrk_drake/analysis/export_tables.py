@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -44,13 +45,18 @@ def print_changed_links(console: Console, changes: Sequence[LinkChange], bodies:
         console.print(escape(f"Left out: {remark}"), soft_wrap=True)
 
 
-def print_compensation(console: Console, path: str, arm: Arm, file: GravityCompensationFile) -> None:
-    """What a person should read before the controller does."""
-    table = _table("", "clip [N m]", "friction [N m]", "ratio", "dead band [rad/s]", "saturation [rad/s]")
+def print_compensation(
+    console: Console, path: str, arm: Arm, file: GravityCompensationFile, off: NDArray[np.float64]
+) -> None:
+    """What a person should read before the controller does; `off` (7,) differences from the model [N m]."""
+    table = _table(
+        "", "off by* [N m]", "clip [N m]", "friction [N m]", "ratio", "dead band [rad/s]", "saturation [rad/s]"
+    )
     friction = (file.positive - file.negative)[10::5] / 2
     for j, name in enumerate(MTM_JOINTS):
         table.add_row(
             name,
+            f"{off[j]:.1e}",
             f"{file.torque_lower[j]:+.4f} .. {file.torque_upper[j]:+.4f}",
             f"{np.append(friction, 0.0)[j]:.4f}",
             f"{file.friction_ratio[j]:g}",
@@ -58,6 +64,7 @@ def print_compensation(console: Console, path: str, arm: Arm, file: GravityCompe
             f"{file.saturation[j]:g}",
         )
     console.print(table)
+    console.print("* at most, the file's torque at rest from the model's, at 4000 random poses of the joint box")
     largest = np.maximum(np.abs(file.torque_lower), np.abs(file.torque_upper))
     if short := [name for name, at_limit in zip(MTM_JOINTS, largest >= arm.effort_limits, strict=True) if at_limit]:
         console.print(f"Clipped at the motor's limit somewhere in the joint box: {', '.join(short)}")

@@ -10,6 +10,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize_scalar
 
 from dvrk_drake.analysis.drive_efforts import DriveEfforts, drive_efforts
+from dvrk_drake.analysis.effort_sign import refuse_opposite_efforts
 from dvrk_drake.analysis.motion_grid import GRID_RATE, MotionGrid, motion_grid
 from dvrk_drake.analysis.phase_folds import period_of
 from dvrk_drake.analysis.repetition import SAME_MOTION
@@ -27,8 +28,12 @@ CUT_OFF = 5.0
 #: actuator by actuator, between two days of a PSM without payload (psm_one, psm_one_no_weight of
 #: docs/public_recordings.md).
 DRIFT = 0.06
-#: Of the position.
-POWERS = 3
+#: Pieces of an actuator's travel, in each of which such a torque is linear: a stop or a cable's fold is local.
+PIECES = 8
+#: Share of the travel over which such a torque at one place goes with that at another.
+CORRELATED = 0.25
+#: Columns of `changes` of which nothing is known beforehand: offset, dry and viscous friction.
+_SIMPLE = 3
 #: Step of the search before it is refined [s].
 _STEP = 0.01
 
@@ -45,7 +50,7 @@ class MotionDifference:
         tau: (k, n) efforts of the actuators [N m, N], other less reference, behind the filter, less what the model
             expects since the two motions differ a little.
         changes: (k, n, c) by which the drives may have changed since, actuator by actuator: an offset, dry and viscous
-            friction, and torques that depend on the position (cables, springs), as three powers of it.
+            friction, and torques that depend on the position (cables, springs, a stop), piecewise linear in it.
         deviation: (n, c) RMS effort [N m, N] by which each may well have changed; inf where nothing is known.
     """
 
@@ -66,7 +71,7 @@ def motion_difference(reference: Recording, other: Recording, model: DynamicMode
         model: of the arm without what was added to it; only small differences of the motions go through it.
 
     Raises:
-        RecordingError: one is no motion of this arm, or they are not of the same motion.
+        RecordingError: one is no motion of this arm, an effort has the wrong sign, or they are not of the same motion.
     """
     signals = model.section.signals
     settings = replace(signals, effort_cut_off=min(CUT_OFF, signals.effort_cut_off))
@@ -74,28 +79,53 @@ def motion_difference(reference: Recording, other: Recording, model: DynamicMode
     period = period_of(grid)
     shift = _shift(before, grid, period, other)
     expected = drive_efforts(model, grid)
-    left, left_before = (
-        own.behind_filter(recording.in_actuator_coordinates(model.arm).measured_effort()) - efforts.total()
-        for own, recording, efforts in ((grid, other, expected), (before, reference, drive_efforts(model, before)))
+    (tau, left), (_, left_before) = (
+        _efforts(reference_or_other, own, efforts, model)
+        for reference_or_other, own, efforts in (
+            (other, grid, expected),
+            (reference, before, drive_efforts(model, before)),
+        )
     )
     t, t_before = grid.row_times[grid.inner] + shift, before.row_times[before.inner]
     rows = (t >= t_before[0]) & (t <= t_before[-1])
     changes = _changes(model, grid, expected)[rows]
-    size = np.sqrt(np.mean((expected.total() + left) ** 2, axis=0))
+    size = np.sqrt(np.mean(tau**2, axis=0))
     deviation = np.full(changes.shape[1:], np.inf)
-    deviation[:, -POWERS:] = DRIFT * size[:, None]
-    tau = left[rows] - _at(t_before, left_before, t[rows])
-    return MotionDifference(grid, rows, period, shift, tau, changes, deviation)
+    parts = np.sqrt(np.mean(changes[..., _SIMPLE:] ** 2, axis=0))
+    deviation[:, _SIMPLE:] = DRIFT * size[:, None] * parts / np.linalg.norm(parts, axis=1, keepdims=True)
+    change = left[rows] - _at(t_before, left_before, t[rows])
+    return MotionDifference(grid, rows, period, shift, change, changes, deviation)
+
+
+def _efforts(
+    recording: Recording, grid: MotionGrid, expected: DriveEfforts, model: DynamicModel
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(r, n) measured efforts of the actuators behind the filter, and what the model leaves of them."""
+    tau = grid.behind_filter(recording.in_actuator_coordinates(model.arm).measured_effort())
+    refuse_opposite_efforts(recording, model.arm.joint_names, tau, expected.total())
+    return tau, tau - expected.total()
 
 
 def _changes(model: DynamicModel, grid: MotionGrid, expected: DriveEfforts) -> NDArray[np.float64]:
-    """(r, n, 3 + POWERS) at the inner rows."""
+    """(r, n, 3 + PIECES + 1) at the inner rows."""
     transmission = model.arm.transmission
     speed = grid.behind_filter(grid.efforts_at_rows(transmission.velocity(grid.v)))
     a = transmission.position(grid.q)
-    place = (a - np.mean(a, axis=0)) / np.maximum(np.std(a, axis=0), np.finfo(float).tiny)
-    powers = [grid.behind_filter(grid.efforts_at_rows(place**power)) for power in range(1, POWERS + 1)]
-    return np.stack([np.ones_like(speed), expected.friction_part("dry"), speed, *powers], axis=2)
+    shapes = np.stack([_shapes(x) for x in a.T], axis=1)
+    flat = grid.behind_filter(np.stack([grid.at_rows(shapes[:, i], i) for i in range(a.shape[1])], axis=1))
+    simple = np.stack([np.ones_like(speed), expected.friction_part("dry"), speed], axis=2)
+    return np.concatenate([simple, flat], axis=2)
+
+
+def _shapes(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(m, PIECES + 1) of positions (m,): with independent weights their sum is piecewise linear between knots, and
+    neighbouring knots are alike (a Gaussian process over the travel, with a squared-exponential kernel)."""
+    place = (x - np.min(x)) / max(float(np.ptp(x)), np.finfo(float).tiny)
+    knots = np.linspace(0.0, 1.0, PIECES + 1)
+    hats = np.maximum(1 - PIECES * np.abs(place[:, None] - knots), 0.0)
+    kernel = np.exp(-0.5 * ((knots[:, None] - knots) / CORRELATED) ** 2)
+    values, vectors = np.linalg.eigh(kernel)
+    return np.asarray(hats @ (vectors * np.sqrt(np.maximum(values, 0.0))))
 
 
 def _at(t: NDArray[np.float64], x: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from dvrk_drake.analysis.payload import CONFIDENCE, Payload, as_good
+from dvrk_drake.analysis.point_mass import LARGEST_MASS
 from dvrk_drake.analysis.tables import make_table
 
 
@@ -17,20 +18,17 @@ def print_links(console: Console, estimates: Sequence[Payload]) -> None:
     good = as_good(estimates)
     for payload in estimates:
         note = "" if payload not in good else "best" if payload is estimates[0] else "cannot be told from it"
-        table.add_row(
-            payload.link,
-            f"{100 * payload.left_out:.1f} %",
-            f"{payload.body.mass:.4f}",
-            f"{payload.mass_error:.4f}",
-            note,
-        )
+        mass, error = "none found", ""
+        if payload.found:
+            mass, error = f"{payload.body.mass:.4f}", f"{payload.mass_error:.4f}"
+        table.add_row(payload.link, f"{100 * payload.left_out:.1f} %", mass, error, note if payload.found else "")
     console.print(table)
     console.print(
-        "* phases of the motion predicted from the others: RMS error as a share of that without payload, geometric "
-        "mean over the actuators\n",
+        "* phases of the motion predicted from the others: RMS error, whitened, as a share of that without payload, "
+        "geometric mean over the actuators\n",
         style="dim",
     )
-    if len(good) > 1:
+    if estimates[0].found and len(good) > 1:
         console.print(
             "These recordings cannot tell which of the best links it is: name the one that carries it with --link.\n",
             style="yellow",
@@ -39,7 +37,10 @@ def print_links(console: Console, estimates: Sequence[Payload]) -> None:
 
 
 def print_payload(console: Console, payload: Payload) -> None:
-    """Mass and place with their intervals, then what is explained."""
+    """Mass and place with their intervals, then what is explained; or that there is none to be found."""
+    if not payload.found:
+        console.print(_none_found(payload), soft_wrap=True)
+        return
     table = make_table(
         f"Payload on {payload.link}",
         "",
@@ -53,7 +54,7 @@ def print_payload(console: Console, payload: Payload) -> None:
         rows.append((f"{axis} [m]", x, error, f"{base:+.4f}"))
     for k, (name, value, error, base) in enumerate(rows):
         if k and not payload.body.determined[k - 1]:
-            table.add_row(escape(name), "not determined by this motion", "", "", "")
+            table.add_row(escape(name), "fixed: not determined by this motion", "", "", "")
             continue
         reach = payload.quantile * error
         table.add_row(
@@ -67,10 +68,11 @@ def print_payload(console: Console, payload: Payload) -> None:
         table.add_row(actuator.name, *numbers, explained)
     console.print(table)
     console.print("* by the payload and by what changed in the drives: offsets, friction\n", style="dim")
-    if not payload.found:
-        console.print(
-            f"The interval of the mass on {payload.link} includes 0: these recordings do not tell it from "
-            "no payload there, or tell only mass times distance.",
-            style="yellow",
-            soft_wrap=True,
-        )
+
+
+def _none_found(payload: Payload) -> str:
+    """One line with what would have been found."""
+    said = f"No payload found on {payload.link}: the interval of its mass includes 0. "
+    if payload.largest_at_com > LARGEST_MASS:
+        return said + "A mass at the link's centre of mass would not show in this motion."
+    return said + f"At the link's centre of mass it is below {1e3 * payload.largest_at_com:.3g} g ({CONFIDENCE:.0%})."

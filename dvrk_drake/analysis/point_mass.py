@@ -48,10 +48,10 @@ class PointMassProblem:
     """tau_i ~ Y_i phi(m, p) + N_i x_i of every actuator i, x_i its own nuisances: normal, about 0.
 
     Attributes:
-        equations: columns: ten of the link, then the nuisances, an offset first.
-        independent: share of the rows that are independent measurements.
+        equations: columns: ten of the link, then the nuisances.
+        independent: share of the `rows` that are independent measurements.
         com: (3,) the link's centre of mass [m], where a coordinate stays that the motion does not determine.
-        deviation: (n, k) RMS effort of each nuisance before the recording, inf where nothing is known.
+        precision: (n, k) one over the variance of each nuisance before the recording, 0 where nothing is known.
     """
 
     def __init__(
@@ -59,39 +59,59 @@ class PointMassProblem:
         equations: NormalEquations,
         independent: float,
         com: NDArray[np.float64],
-        deviation: NDArray[np.float64],
+        precision: NDArray[np.float64],
+        rows: int,
     ) -> None:
         self.equations, self.com = equations, com
         self._total = equations.total()
-        rows = float(self._total[0, _RIGID, _RIGID])
-        self._count = rows * independent
-        size = np.einsum("ikk->ik", self._total[:, _RIGID:-1, _RIGID:-1]) / rows
-        self._precision = size / deviation**2
+        self._count, self._precision = rows * independent, precision
 
-    def fit(self) -> tuple[PointMass, NDArray[np.float64], NDArray[np.float64]]:
+    def fit(self, start: PointMass | None = None) -> tuple[PointMass, NDArray[np.float64], NDArray[np.float64]]:
         """The point mass, the actuators' weights (n,), and (4,) the standard errors if all rows' noise were alike.
 
         Every actuator weighs by the variance that is left. Coordinates that the motion does not determine are set to
         the link's centre of mass, one by one.
+
+        Args:
+            start: near it; by default it is searched, as the cost has several minima in the place.
         """
         weights = self._count / np.maximum(self._total[:, -1, -1], _TINY)
-        determined = np.ones(3, dtype=bool)
+        determined = np.ones(3, dtype=bool) if start is None else start.determined
         while True:
-            body = self._search(self._reduced(self._total, weights), weights, determined)
+            body = start or self._search(self._reduced(self._total, weights), weights, determined)
             for _ in range(10):
                 reduced = self._reduced(self._total, weights)
                 body = self._refine(reduced, weights, body)
                 weights = self._count / np.maximum(_left_by(reduced, body), _TINY)
             errors = self._standard_errors(self._reduced(self._total, weights), weights, body)
-            worst = int(np.argmax(np.where(determined, errors[1:], 0.0)))
-            if not errors[1 + worst] > LEAST_KNOWN:
+            # What ends at the edge of the search is as unknown as what has no edge.
+            unknown = np.where(np.abs(body.place - self.com) > REACH - 1e-6, np.inf, errors[1:])
+            worst = int(np.argmax(np.where(determined, unknown, 0.0)))
+            if not determined[worst] or not unknown[worst] > LEAST_KNOWN:
                 return body, weights, errors
-            determined = determined & (np.arange(3) != worst)
+            start, determined = None, determined & (np.arange(3) != worst)
 
     def without_fold(self, fold: int, weights: NDArray[np.float64], start: PointMass) -> PointMass:
         """The point mass as the other folds see it."""
         others = self._total - self.equations.of_fold(fold)
         return self._refine(self._reduced(others, weights), weights, start)
+
+    def mass_at_com(self, weights: NDArray[np.float64], fold: int | None = None) -> tuple[float, float]:
+        """The mass at the link's centre of mass, and its standard error if all rows' noise were alike [kg].
+
+        Args:
+            weights: of the actuators.
+            fold: which is left out; None: none.
+        """
+        products = self._total if fold is None else self._total - self.equations.of_fold(fold)
+        H, b = _weighted(self._reduced(products, weights), weights)
+        unit = point_mass_parameters(1.0, self.com)
+        information = max(float(unit @ H @ unit), _TINY)
+        return float(unit @ b) / information, information**-0.5
+
+    def nuisances(self, body: PointMass, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, k) that go with a point mass."""
+        return np.array([self._own_nuisances(i, self._total[i], body.parameters, weights) for i in range(len(weights))])
 
     def fold_errors(self, fold: int, weights: NDArray[np.float64], start: PointMass | None) -> NDArray[np.float64]:
         """(n,) sum of squares left of a fold that is predicted, nuisances included, from the others.
@@ -122,11 +142,16 @@ class PointMassProblem:
         """(n,) sum of squares left of some rows by phi (10,) and nuisances that are fitted to others."""
         left = np.empty(len(learnt))
         for i, (H, own) in enumerate(zip(learnt, predicted, strict=True)):
-            right = H[_RIGID:-1, -1] - H[_RIGID:-1, :_RIGID] @ phi
-            x = _pseudo_solve(H[_RIGID:-1, _RIGID:-1] + np.diag(self._precision[i] / weights[i]), right)
-            residual = np.concatenate([-phi, -x, [1.0]])
+            residual = np.concatenate([-phi, -self._own_nuisances(i, H, phi, weights), [1.0]])
             left[i] = max(residual @ own @ residual, 0.0)
         return left
+
+    def _own_nuisances(
+        self, i: int, H: NDArray[np.float64], phi: NDArray[np.float64], weights: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(k,) of actuator i that go with phi (10,), from products H of some rows."""
+        right = H[_RIGID:-1, -1] - H[_RIGID:-1, :_RIGID] @ phi
+        return _pseudo_solve(H[_RIGID:-1, _RIGID:-1] + np.diag(self._precision[i] / weights[i]), right)
 
     def _reduced(self, products: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 11, 11) of the link's columns and the effort when each actuator's nuisances are fitted away."""
@@ -141,7 +166,7 @@ class PointMassProblem:
     def _search(
         self, reduced: NDArray[np.float64], weights: NDArray[np.float64], determined: NDArray[np.bool_]
     ) -> PointMass:
-        """From several starts: the cost has several minima in the place."""
+        """From several starts."""
         offsets = [np.zeros(3)] + [s * d * axis for d in _STARTS for axis in np.eye(3)[determined] for s in (1, -1)]
         H, b = _weighted(reduced, weights)
         bodies = []
@@ -167,9 +192,12 @@ class PointMassProblem:
             values = whole(x)
             return A @ point_mass_parameters(values[0], values[1:]) - b
 
-        result = least_squares(
-            residual, np.clip(full[free], lower + 1e-9, upper - 1e-9), bounds=(lower, upper), x_scale=0.1
-        )
+        def jacobian(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            values = whole(x)
+            return (A @ _derivatives(values[0], values[1:]))[:, free]
+
+        start_x = np.clip(full[free], lower + 1e-9, upper - 1e-9)
+        result = least_squares(residual, start_x, jac=jacobian, bounds=(lower, upper), x_scale=0.1)
         values = whole(result.x)
         return PointMass(float(values[0]), values[1:], start.determined)
 
@@ -178,9 +206,7 @@ class PointMassProblem:
     ) -> NDArray[np.float64]:
         """(4,) of mass and place; infinite where the motion tells nothing, 0 where a coordinate is not estimated."""
         A, _ = _rows(reduced, weights)
-        jacobian = A @ np.column_stack(
-            [point_mass_parameters(1.0, body.place), *(_by_place(body.mass, body.place, k) for k in range(3))]
-        )
+        jacobian = A @ _derivatives(body.mass, body.place)
         errors = np.zeros(4)
         free = np.flatnonzero(np.concatenate([[True], body.determined]))
         for k in free:
@@ -197,10 +223,13 @@ def _left_by(reduced: NDArray[np.float64], body: PointMass) -> NDArray[np.float6
     return np.maximum(np.einsum("a,nab,b->n", residual, reduced, residual), 0.0)
 
 
-def _by_place(mass: float, place: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """(10,) derivative of the parameters by a coordinate: exact by central difference, since they are quadratic."""
-    step = np.eye(3)[axis]
-    return (point_mass_parameters(mass, place + step) - point_mass_parameters(mass, place - step)) / 2
+def _derivatives(mass: float, place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(10, 4) of the parameters by mass and place: exact by central differences, since they are quadratic in it."""
+    by_place = [
+        (point_mass_parameters(mass, place + step) - point_mass_parameters(mass, place - step)) / 2
+        for step in np.eye(3)
+    ]
+    return np.column_stack([point_mass_parameters(1.0, place), *by_place])
 
 
 def _pseudo_solve(H: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from dvrk_drake.analysis.drive_efforts import FRICTION_PARTS, FrictionPart, drive_efforts
+from dvrk_drake.analysis.effort_sign import refuse_opposite_efforts
 from dvrk_drake.analysis.motion_grid import MotionGrid, motion_grid
+from dvrk_drake.analysis.phase_folds import period_of, phase_folds
 from dvrk_drake.dynamics.actuator_effects import effect_coordinates
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
@@ -17,8 +19,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.recording import REST_SPEED, Recording
 
-#: Share of the recording, its end, that decides what is kept.
-HOLD_OUT = 1 / 3
+#: Parts of the motion, cut by its phase where it repeats, each predicted from the others to decide what is kept.
+FOLDS = 4
 #: A friction scale may well differ from 1 by this, an offset by this share of the RMS effort.
 SCALE_DEVIATION, OFFSET_DEVIATION = 0.5, 0.3
 #: Relative error that the efforts are weighed with.
@@ -31,12 +33,12 @@ LARGEST_ERROR = 0.7
 
 @dataclass(frozen=True)
 class RecalibratedActuator:
-    """One actuator, errors as |tau_f - tau_hat| / |tau_f| on the held-out end of the recording.
+    """One actuator, errors as |tau_f - tau_hat| / |tau_f|.
 
     Attributes:
         name: of the joint whose actuator it is.
         before: error of the model as it was.
-        after: error with friction and offset fitted to the recording's start.
+        after: error of parts of the motion that are predicted with friction and offset from the other parts.
         kept: whether the new model has them.
         reason: why not, or "".
         dry, viscous: scales of the actuator's own friction, from the whole recording; None where it has none.
@@ -73,12 +75,13 @@ class Recalibration:
 def recalibrate(model: IdentifiedModel, recording: Recording) -> Recalibration:
     """Fits one scale of dry and one of viscous friction at every coordinate of the drive, and an offset an actuator.
 
-    Rigid bodies, springs and cables stay. The first two thirds of the recording are fitted, the rest decides: where an
+    Rigid bodies, springs and cables stay. Each of `FOLDS` parts of the motion is predicted from the others: where an
     actuator's error does not fall, its offset and friction, and those that it shares, stay as they were, and the others
     are fitted again; what is kept is then fitted to all of the recording.
 
     Raises:
-        RecordingError: it is no motion of this arm, it is of another arm, or no actuator moves both ways.
+        RecordingError: it is no motion of this arm, it is of another arm, efforts have the wrong sign, or no actuator
+            moves both ways.
         ModelError: the model has no dynamics.
     """
     fit = _Fit(model.dynamic_model, recording)
@@ -88,23 +91,20 @@ def recalibrate(model: IdentifiedModel, recording: Recording) -> Recalibration:
             f"{recording.source or 'recording'}: no actuator moves both ways for {LEAST_SHARE:.0%} of the time at "
             f"{REST_SPEED[0]:g} rad/s, {REST_SPEED[1]:g} m/s RMS or more; friction shows only in such a motion"
         )
-    start = fit.rows < (1 - HOLD_OUT) * fit.rows[-1]
-    before = fit.error(fit.nothing, ~start)
-    free = excited.copy()
-    while True:
-        after = fit.error(fit.solve(free, start), ~start)
-        worse = free & ~(after < before)
-        if not np.any(worse):
-            break
+    refuse_opposite_efforts(recording, fit.names, fit.tau, fit.expected)
+    before = fit.error(fit.nothing)
+    first = fit.left_out_error(excited)
+    free, after = excited.copy(), first
+    while np.any(worse := free & ~(after < before)):
         free &= ~worse
-    first = fit.error(fit.solve(excited, start), ~start)
+        after = fit.left_out_error(free)
     if not np.mean(np.minimum(before, after)) < LARGEST_ERROR:
         raise RecordingError(
             f"{recording.source or 'recording'}: efforts differ from the model's by {np.mean(before):.0%} on average "
             f"over the actuators, and by {np.mean(after):.0%} with its friction fitted; {LARGEST_ERROR:.0%} is "
             "allowed: is it of this arm, in these coordinates?"
         )
-    x = fit.solve(free, np.ones(len(fit.rows), dtype=bool))
+    x = fit.solve(free, np.ones(len(fit.tau), dtype=bool))
     actuators = []
     for i, name in enumerate(fit.names):
         reason = "" if free[i] else "gains nothing" if excited[i] else "does not move both ways"
@@ -126,7 +126,7 @@ def recalibrate(model: IdentifiedModel, recording: Recording) -> Recalibration:
         if not coordinate.startswith("actuator.")
     }
     section = _section(model.dynamic_model.section, fit, x)
-    return Recalibration(_with_section(model, section, recording), actuators, shared, float(len(fit.rows) / fit.rate))
+    return Recalibration(_with_section(model, section, recording), actuators, shared, float(len(fit.tau) / fit.rate))
 
 
 class _Fit:
@@ -143,16 +143,33 @@ class _Fit:
         self.friction = np.stack([expected.friction[key] for key in self.keys], axis=2)
         rows = effect_coordinates(model.arm)
         self._loads = np.array([rows[coordinate] != 0 for coordinate, _ in self.keys])
-        self.rows = np.arange(len(self.tau))
+        self.expected = expected.total()
+        self._fold, self._edge = phase_folds(grid, period_of(grid), FOLDS)
         self.excited = _moves_both_ways(model, grid)
         self.nothing = np.concatenate([np.ones(len(self.keys)), np.zeros(len(self.names))])
 
-    def error(self, x: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """(n,) relative error at some of the rows."""
+    def error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n,) relative error."""
+        return self._relative(np.sum(self._left(x) ** 2, axis=0))
+
+    def left_out_error(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """(n,) relative error of parts of the motion that are predicted from the others, less what is beside them."""
+        squares = np.zeros(len(self.names))
+        for fold in range(FOLDS):
+            own = self._fold == fold
+            beside = (self._edge[:, 0] & (self._fold == (fold + 1) % FOLDS)) | (
+                self._edge[:, 1] & (self._fold == (fold - 1) % FOLDS)
+            )
+            squares += np.sum(self._left(self.solve(free, ~own & ~beside))[own] ** 2, axis=0)
+        return self._relative(squares)
+
+    def _left(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         k = len(self.keys)
-        left = (self.tau - self.other - self.friction @ x[:k] - x[k:])[rows]
-        size = np.sum(self.tau[rows] ** 2, axis=0)
-        return np.asarray(np.sqrt(np.sum(left**2, axis=0) / np.maximum(size, np.finfo(float).tiny)))
+        return np.asarray(self.tau - self.other - self.friction @ x[:k] - x[k:])
+
+    def _relative(self, squares: NDArray[np.float64]) -> NDArray[np.float64]:
+        size = np.sum(self.tau**2, axis=0)
+        return np.asarray(np.sqrt(squares / np.maximum(size, np.finfo(float).tiny)))
 
     def solve(self, free: NDArray[np.bool_], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
         """x (k + n,); friction and offsets of actuators that are not free stay, and friction that they share."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from rich.console import Console
 
-from dvrk_drake.analysis.recalibration import HOLD_OUT, Recalibration
+from dvrk_drake.analysis.recalibration import FOLDS, Recalibration
 from dvrk_drake.analysis.tables import make_table
 
 
 def print_recalibration(console: Console, result: Recalibration) -> None:
     """Errors before and after, what is kept, and the new scales."""
-    title = f"Error on the last {HOLD_OUT:.0%} of {result.seconds:.1f} s*, and friction after the fit to all of it"
+    title = f"Error over {result.seconds:.1f} s*, and friction after the fit to all of it"
     table = make_table(title, "", "before", "refit", "", "dry friction x", "viscous x", "offset +")
     for a in result.actuators:
         new = [_scale(a.dry), _scale(a.viscous), f"{a.offset:+.4f}"] if a.kept else ["as it was", "", ""]
@@ -20,7 +20,8 @@ def print_recalibration(console: Console, result: Recalibration) -> None:
     table.add_row("mean", f"{100 * before:.1f} %", f"{100 * after:.1f} %", "", "", "", "")
     console.print(table)
     console.print(
-        "* actuators: |tau_f - tau_hat| / |tau_f| behind the model's low-pass; refit to what comes before it\n",
+        "* actuators: |tau_f - tau_hat| / |tau_f| behind the model's low-pass; refit: each of "
+        f"{FOLDS} parts of the motion predicted from the others\n",
         style="dim",
     )
     shared = [f"{name} x {scale:.2f}" for name, scale in result.shared.items()]

@@ -20,7 +20,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, ScenarioError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
-from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
+from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
+from dvrk_drake.models.gains_file import load_gains
 from dvrk_drake.models.plant import Closure
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.hand import Grip
@@ -33,14 +34,17 @@ LONGEST, LEAST_SAMPLE_PERIOD = 3600.0, 1e-3
 class ControllerScenario:
     """`mode` is "hold" or "gravity"; `model` the file of an identified model, or empty for what the SDF states.
 
-    `gains` replaces the arm's own (kp, kd, ki: one number a joint). `friction_ratio` is the share of the friction that
-    the arm's files state which is compensated, 0..0.9; in mode "gravity" only. `parameter_error` makes the model wrong:
+    `gains` replaces the arm's own (kp, kd, ki: one number a joint; in a file also the name of a file of gains).
+    `friction_ratio` is the share of the friction that the arm's files state which is compensated, 0..0.9; in mode
+    "gravity" only. `parameter_error` makes the model wrong:
     each of its base parameters is multiplied by a factor of its own from 1 - `parameter_error`..1 + `parameter_error`,
-    drawn by the scenario's seed.
+    drawn by the scenario's seed. `knows` names those of "cables" and "springs" of the arm's own effects that the model
+    has beside the SDF; not for a model from a file.
     """
 
     mode: str = "hold"
     model: str = ""
+    knows: list[str] = field(default_factory=list)
     gains: Gains | None = None
     friction_ratio: float = 0.0
     parameter_error: float = 0.0
@@ -94,6 +98,7 @@ class Scenario:
         targets: where the arm shall be when; before, between and after them it is at rest at each. Mode "hold" only.
         hand: a person who moves the arm.
         effects: more of them in the drive of the simulated arm, of position alone; the controller does not know them.
+        stretch: actuator -> cable of the simulated arm that stretches, beside those of `real_arm`.
         real_arm: parts of the arm's own `effects` that the simulation has, by name; ["all"] for all of them.
         effort_noise: standard deviation of recorded efforts, as a share of the effort limits.
         seed: of all noise, and of the controller's parameter error.
@@ -110,6 +115,7 @@ class Scenario:
     targets: list[Target] = field(default_factory=list)
     hand: HandScenario = field(default_factory=HandScenario)
     effects: list[DriveEffect] = field(default_factory=list)
+    stretch: dict[str, Cable] = field(default_factory=dict)
     real_arm: list[str] = field(default_factory=list)
     effort_noise: float = 0.0
     seed: int = 0
@@ -124,7 +130,8 @@ class Scenario:
     def model(self) -> IdentifiedModel:
         """What the controller believes."""
         file, error = self.controller.model, self.controller.parameter_error
-        model = IdentifiedModel.load(file) if file else IdentifiedModel.from_arm(self.mounted_arm)
+        known = [effect for part in self.controller.knows for effect in getattr(self.mounted_arm.effects, part)]
+        model = IdentifiedModel.load(file) if file else IdentifiedModel.from_arm(self.mounted_arm, known)
         if error == 0.0:
             return model
         # A stream of its own: the seed alone is the noise's.
@@ -133,14 +140,15 @@ class Scenario:
 
     @property
     def all_effects(self) -> ArmEffects | None:
-        """What the simulated arm has beside its links: what `real_arm` names, and `effects`; None if there is nothing.
+        """What the simulated arm has beside its links: `real_arm`, `effects` and `stretch`; None if there is nothing.
 
         Raises:
             ArmError: a name that is no part.
         """
-        if not self.real_arm and not self.effects:
+        if not (self.real_arm or self.effects or self.stretch):
             return None
-        return self.mounted_arm.effects.only(self.real_arm).joined(ArmEffects(cables=self.effects))
+        own = self.mounted_arm.effects.only(self.real_arm)
+        return own.joined(ArmEffects(cables=self.effects, stretch=self.stretch))
 
     def knots(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Times (m,) and poses (m, n) that the arm shall rest at: the start, then the targets."""
@@ -169,13 +177,18 @@ class Scenario:
         _check_number("seed", self.seed, 0, 2**63)
         try:
             arm.effects.only(self.real_arm)
+            ArmEffects(stretch=self.stretch).check(arm.joint_names)
         except ArmError as error:
-            raise ScenarioError(f"real_arm: {error}") from error
+            raise ScenarioError(f"simulated arm: {error}") from error
         if self.start is not None:
             check_pose("start", self.start, arm)
         self._check_targets("targets", self.targets, 0.0)
         self._check_targets("hand.path", self.hand.path, -1.0)
         self._check_hand()
+        for part in self.controller.knows:
+            _check_choice("controller.knows", part, ("cables", "springs"))
+        if self.controller.knows and self.controller.model:
+            raise ScenarioError("controller.knows is of a model from the arm's files; controller.model names another")
         _check_number("controller.friction_ratio", self.controller.friction_ratio, 0.0, 0.9)
         if self.controller.friction_ratio and self.controller.mode != "gravity":
             raise ScenarioError(f'controller.friction_ratio needs mode "gravity"; it is "{self.controller.mode}"')
@@ -236,6 +249,7 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
         content = {"arm": arm_or_file}
     for setting in settings:
         _change(content, setting)
+    _load_gains_of(content)
     for key, value in content.items():
         try:
             yaml_load_typed(schema=Scenario, data=yaml_dump({key: value}))
@@ -248,6 +262,13 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
     except ScenarioError as error:
         raise ScenarioError(f"{arm_or_file}: {error}") from error
     return scenario
+
+
+def _load_gains_of(content: dict[str, Any]) -> None:
+    """Puts what is in a file of gains in the place of its name."""
+    controller = content.get("controller")
+    if isinstance(controller, dict) and isinstance(controller.get("gains"), str):
+        controller["gains"] = dataclasses.asdict(load_gains(controller["gains"]))
 
 
 def _change(content: dict[str, Any], setting: str) -> None:
@@ -279,6 +300,7 @@ def _known_keys() -> str:
         "controller.gains": Gains,
         "targets": Target,
         "effects": DriveEffect,
+        "stretch.<actuator>": Cable,
         "hand": HandScenario,
     }
     return f"allowed: {names(Scenario)}; " + "; ".join(f"in {key}: {names(schema)}" for key, schema in groups.items())

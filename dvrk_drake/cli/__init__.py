@@ -22,9 +22,11 @@ from dvrk_drake.cli import (
     payload,
     recalibrate,
     record,
+    reproduce,
     simulate,
     study,
     transparency,
+    tune,
 )
 from dvrk_drake.cli.support import import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
@@ -59,20 +61,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("dvrk-drake"))
     verbs = parser.add_subparsers(required=True, metavar="VERB")
-    for module in (
-        model,
-        check,
-        identify,
-        recalibrate,
-        payload,
-        export,
-        simulate,
-        study,
-        transparency,
-        demo,
-        lcm,
-        record,
-        collect,
-    ):
+    of_recordings = (check, identify, recalibrate, payload, export)
+    simulated = (simulate, study, tune, transparency, reproduce, demo)
+    for module in (model, *of_recordings, *simulated, lcm, record, collect):
         module.add_verbs(verbs)
     return parser

@@ -102,7 +102,13 @@ def _print_difference(model: IdentifiedModel) -> None:
 def _write_gc(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.export_tables import print_compensation
     from dvrk_drake.analysis.tables import make_console
-    from dvrk_drake.dynamics.gravity_compensation import CompensationOptions, compensation_from_model, dry_friction
+    from dvrk_drake.dynamics.gravity_compensation import (
+        CompensationOptions,
+        compensation_from_model,
+        dry_friction,
+        largest_differences,
+    )
+    from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
 
     if options.friction and options.coulomb is not None:
         raise DvrkDrakeError("--friction and --coulomb both say how large friction is; give one")
@@ -116,7 +122,8 @@ def _write_gc(model: IdentifiedModel, path: str, options: argparse.Namespace) ->
     file = compensation_from_model(model, CompensationOptions(**{k: v for k, v in given.items() if v is not None}))
     arm = model.load_arm()
     file.save(path, arm.name, f"dvrk-drake export of {options.model}")
-    print_compensation(make_console(), path, arm, file)
+    written = GravityCompensationFile.load(path)
+    print_compensation(make_console(), path, arm, written, largest_differences(written, model))
 
 
 def _write_kinematic(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from dvrk_drake.cli.support import add_gravity, mounted, quiet_drake
 
 if TYPE_CHECKING:
+    from dvrk_drake.models.arm_schema import Gains
     from dvrk_drake.processes.arm_controller import ArmController
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
     from dvrk_drake.systems.gravity_pid_controller import Mode
@@ -62,6 +63,7 @@ def _add_run(verbs: argparse._SubParsersAction) -> None:
     verb = verbs.add_parser("run", help="compensate or hold an arm over LCM")
     add_control(verb)
     verb.add_argument("--mode", choices=("gravity", "hold"), default="gravity", help="default: gravity")
+    verb.add_argument("--gains", metavar="GAINS.yaml", help="from tune, for mode hold; default: the arm's own")
     verb.add_argument(
         "--reset", action="store_true", help="say which fault the arm has, if any, and clear it before it is controlled"
     )
@@ -84,8 +86,8 @@ def _run(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.live_status import LiveStatus
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
-    compensator = _friction_compensator(options)
-    controller, url, period = ready_controller(options, options.mode, compensator, reset=options.reset)
+    compensator, gains = _friction_compensator(options), _gains(options)
+    controller, url, period = ready_controller(options, options.mode, compensator, gains, reset=options.reset)
     arm = controller.arm
     stopped = stop_on_signals()
     print(
@@ -109,6 +111,22 @@ def _run(options: argparse.Namespace) -> None:
     finally:
         line.clear()
     print(f"{arm.name} holds by itself", flush=True)
+
+
+def _gains(options: argparse.Namespace) -> Gains | None:
+    """What --gains names.
+
+    Raises:
+        ControllerError: it is no file of gains, or the arm is not to be held.
+    """
+    if options.gains is None:
+        return None
+    from dvrk_drake.errors import ControllerError
+    from dvrk_drake.models.gains_file import load_gains
+
+    if options.mode != "hold":
+        raise ControllerError("--gains is for --mode hold: in mode gravity the arm is not regulated")
+    return load_gains(options.gains)
 
 
 def _friction_compensator(options: argparse.Namespace) -> FrictionCompensator | None:
@@ -150,11 +168,17 @@ def add_control(verb: argparse.ArgumentParser) -> None:
 
 
 def ready_controller(
-    options: argparse.Namespace, mode: Mode, friction: FrictionCompensator | None = None, *, reset: bool = False
+    options: argparse.Namespace,
+    mode: Mode,
+    friction: FrictionCompensator | None = None,
+    gains: Gains | None = None,
+    *,
+    reset: bool = False,
 ) -> tuple[ArmController, str, float]:
     """A controller of an arm that may be controlled, the URL of the network, and the period of its statuses [s].
 
-    With `friction` it compensates that as well; with `reset` a latched fault is said and cleared first.
+    With `friction` it compensates that as well; `gains` are what it holds with; with `reset` a latched fault is said
+    and cleared first.
 
     Raises:
         ModelError: the model is of another arm.
@@ -180,7 +204,7 @@ def ready_controller(
         status, period = first_status(link)
     if status.gravity_compensation:
         _warn(f"{arm.name} adds gravity compensation of its own: switch it off, or it is compensated twice")
-    controller = ArmController(arm, model, mode, period, friction)
+    controller = ArmController(arm, model, mode, period, friction, gains)
     if options.realtime:
         for warning in make_realtime():
             _warn(warning)

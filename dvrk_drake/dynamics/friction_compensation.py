@@ -63,12 +63,12 @@ class Friction:
 
     @classmethod
     def of_arm(cls, arm: Arm) -> Friction:
-        """What the arm's files state.
+        """What the arm's files state, without what falls with speed: compensated, it would push an arm that slides.
 
         Raises:
             ControllerError: they state none.
         """
-        effects = arm.effects.friction
+        effects = [effect for effect in arm.effects.friction if not effect.fall_speed]
         if not effects:
             raise ControllerError(f"friction: the files of {arm.name} state none")
         return cls.of(

@@ -123,8 +123,9 @@ def compensation_from_model(
     """The controller's file that says what the model says.
 
     The ten columns span the gravity of an upright MTM whose last link is balanced about its axis, so they follow from
-    the base parameters exactly. A joint's offset is its constant, the shoulder's cable the first two columns; an
-    effect elsewhere has no exact place and gets the best polynomial over the joint's range. Torque limits are the range
+    the base parameters exactly; what a leaning base adds gets the best polynomials in the joints' own positions. A
+    joint's offset is its constant, the shoulder's cable the first two columns; an effect elsewhere has no exact place
+    and gets the best polynomial over the joint's range. Torque limits are the range
     that is needed over the joint box and a tenth more, at most the arm's effort limits; joint 7 gets none.
 
     Raises:
@@ -134,12 +135,13 @@ def compensation_from_model(
     arm = model.load_arm()
     if arm.joint_names != MTM_JOINTS:
         raise ModelError(f"{arm.name}: the controller's gravity-compensation file is one of an MTM; joints differ")
-    parameters = _gravity_parameters(model) + _effect_parameters(model, arm)
+    poses = arm.sample_poses(20000, np.random.default_rng(0))
+    gravity, effects = _gravity_parameters(model, poses[:4000]), _effect_parameters(model, arm)
+    _refuse_errors(model, gravity, effects, poses[:4000], options.tolerance)
+    parameters = gravity + effects
     coulomb = _seven("coulomb", options.coulomb)
     friction = np.zeros(NUM_PARAMETERS)
     friction[[polynomial_columns(j).start for j in range(NUM_JOINTS - 1)]] = coulomb[:-1]
-    poses = arm.sample_poses(20000, np.random.default_rng(0))
-    _refuse_errors(model, parameters, poses[:4000], options.tolerance)
     needed = controller_regressor(poses) @ parameters
     lower, upper = _torque_limits(arm, needed.min(axis=0) - coulomb, needed.max(axis=0) + coulomb)
     file = GravityCompensationFile(
@@ -175,14 +177,33 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
     return tuple(float(f) for f in friction)
 
 
-def _gravity_parameters(model: IdentifiedModel) -> NDArray[np.float64]:
-    """(40,) the ten columns of gravity, fitted over whole turns of all joints: there they are well apart."""
-    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (400, NUM_JOINTS))
+def largest_differences(file: GravityCompensationFile, model: IdentifiedModel) -> NDArray[np.float64]:
+    """(7,) by how much [N m] the torque that the file commands at rest differs from the model's over the joint box."""
+    poses = model.load_arm().sample_poses(4000, np.random.default_rng(1))
+    return np.asarray(np.abs(controller_torque(file, poses) - model.holding_torque(poses)).max(axis=0))
+
+
+def _gravity_torque(model: IdentifiedModel, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(m, 7) what the base parameters alone say, trust included."""
     beta = np.array([p.value for p in model.base_parameters])
-    tau = model.trust * (model.static_model.regressor(q)[:, :, : len(beta)] @ beta)
+    return np.asarray(model.trust * (model.static_model.regressor(q)[:, :, : len(beta)] @ beta))
+
+
+def _gravity_parameters(model: IdentifiedModel, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(40,) the ten columns of gravity, fitted over whole turns of all joints: there they are well apart.
+
+    Then the polynomials nearest, over the joint box, to what these leave: little but for a base that leans.
+    """
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (400, NUM_JOINTS))
     R = controller_regressor(q)[:, :, :NUM_GRAVITY]
-    solution = np.linalg.lstsq(R.reshape(-1, NUM_GRAVITY), tau.ravel(), rcond=None)[0]
-    return np.concatenate([solution, np.zeros(NUM_PARAMETERS - NUM_GRAVITY)])
+    solution = np.linalg.lstsq(R.reshape(-1, NUM_GRAVITY), _gravity_torque(model, q).ravel(), rcond=None)[0]
+    parameters = np.concatenate([solution, np.zeros(NUM_PARAMETERS - NUM_GRAVITY)])
+    R = controller_regressor(poses)
+    left = _gravity_torque(model, poses) - R @ parameters
+    for joint in range(NUM_JOINTS - 1):
+        columns = polynomial_columns(joint)
+        parameters[columns] = np.linalg.lstsq(R[:, joint, columns], left[:, joint], rcond=None)[0]
+    return parameters
 
 
 def _effect_parameters(model: IdentifiedModel, arm: Arm) -> NDArray[np.float64]:
@@ -216,18 +237,34 @@ def _best_polynomial(effect: ActuatorEffect, arm: Arm, joint: int) -> NDArray[np
 
 
 def _refuse_errors(
-    model: IdentifiedModel, parameters: NDArray[np.float64], poses: NDArray[np.float64], tolerance: float
+    model: IdentifiedModel,
+    gravity: NDArray[np.float64],
+    effects: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    tolerance: float,
 ) -> None:
-    error = np.abs(controller_regressor(poses) @ parameters - model.holding_torque(poses)).max(axis=0)
-    if error.max() > tolerance:
-        off = ", ".join(
-            f"{name} {e:.2g}" for name, e in zip(MTM_JOINTS, error, strict=True) if e > min(tolerance, 1e-6)
-        )
-        raise ModelError(
-            f"the controller's file cannot hold this model: it would be off by up to {off} N m. It knows gravity along "
-            "-z, a last link balanced about its roll axis, nothing at joint 7, a polynomial of order 4 elsewhere, and "
-            f"trust only where it is 1; to accept the error, set the tolerance to {round_up(error.max()):g} N m"
-        )
+    """Raises ModelError with what parameters (40,) of gravity and of effects would leave over the joint box."""
+    R, tau = controller_regressor(poses), _gravity_torque(model, poses)
+    gravity_off = np.abs(R @ gravity - tau).max(axis=0)
+    effects_off = np.abs(R @ effects - (model.holding_torque(poses) - tau)).max(axis=0)
+    error = np.abs(R @ (gravity + effects) - model.holding_torque(poses)).max(axis=0)
+    if not error.max() > tolerance:
+        return
+    least = min(tolerance, 1e-6)
+    off = ", ".join(f"{name} {e:.2g}" for name, e in zip(MTM_JOINTS, error, strict=True) if e > least)
+    down = model.load_arm().gravity
+    lean = float(np.rad2deg(np.arccos(np.clip(-down[2] / np.linalg.norm(down), -1.0, 1.0))))
+    reasons = {
+        f"gravity {gravity_off.max():.2g} (the file knows an upright base, which here leans by {lean:.1f} deg, a last "
+        "link balanced about its roll axis, and trust only where it is 1)": gravity_off.max(),
+        f"effects {effects_off.max():.2g} (it knows polynomials of order 4 in a joint's own position, nothing at "
+        "joint 7)": effects_off.max(),
+    }
+    raise ModelError(
+        "the controller's file cannot hold this model: over the joint box it would be off by up to "
+        f"{off} N m. Of that: {', '.join(reason for reason, size in reasons.items() if size > least)}. "
+        f"To accept it: --gc-tolerance {round_up(error.max()):g}"
+    )
 
 
 def round_up(x: float) -> float:

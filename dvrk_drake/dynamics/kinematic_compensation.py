@@ -124,13 +124,21 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
     if error.max() > tolerance:
         off = ", ".join(f"{name} {e:.2g}" for name, e in zip(ARM_JOINTS, error, strict=True) if e > tolerance)
         raise ModelError(
-            f"the controller's file cannot hold this model: it would be off by up to {off} (N m; N on insertion). It "
-            "knows gravity only: no joint effects, and trust only where it is 1; to accept the error, set the "
-            f"tolerance to {round_up(error.max()):g}"
+            f"the controller's file cannot hold this model: over the joint box it would be off by up to {off} "
+            "(N m; N on insertion). It knows gravity only, and trust only where it is 1; left out: "
+            f"{_left_out(model, straight)}. To accept it: --gc-tolerance {round_up(error.max()):g}"
         )
     center = np.divide(known[:, 1:], mass[:, None], out=np.zeros((7, 3)), where=mass[:, None] > 0)
     wrist = np.abs(model.holding_torque(q)[:, :3] - tau_model).max(axis=0)
     return KinematicCompensation(alpha, A, theta, D, mass, center, error, wrist)
+
+
+def _left_out(model: IdentifiedModel, q: NDArray[np.float64]) -> str:
+    """The model's effects on yaw, pitch and insertion at rest, with the largest torque of each at poses q (m, n)."""
+    gravity = len(model.base_parameters)
+    tau = np.abs(model.static_model.regressor(q)[:, :3, gravity:] * model.theta[gravity:]).max(axis=(0, 1))
+    said = [f"{e.effect} {t:.2g}" for e, t in zip(model.holding_effects, tau, strict=True) if t > 0]
+    return ", ".join(said) or "no effects"
 
 
 def _chain(plant: MultibodyPlant) -> tuple[NDArray[np.float64], ...]:

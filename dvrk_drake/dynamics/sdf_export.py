@@ -66,7 +66,7 @@ def with_inertias(
     Raises:
         ModelError: a link that the arm does not have, an inertia that no body has, or a negative rotor inertia.
     """
-    root = compose_sdf(arm.sdf)
+    root = compose_sdf(arm.sdf, arm.mirrored_links)
     elements = {link.get("name"): link for link in root.iterfind("model/link")}
     for change in changed_links(arm, links):
         element = elements[change.link]
@@ -110,7 +110,7 @@ def sdf_difference(arm: Arm, links: Sequence[LinkInertia], rotor_inertias: Mappi
     """Unified diff from the arm's composed SDF to that of `with_inertias`; empty if nothing changes."""
     before, after = (
         to_text(root).splitlines(keepends=True)
-        for root in (compose_sdf(arm.sdf), with_inertias(arm, links, rotor_inertias))
+        for root in (compose_sdf(arm.sdf, arm.mirrored_links), with_inertias(arm, links, rotor_inertias))
     )
     return "".join(difflib.unified_diff(before, after, " + ".join(arm.sdf), "exported", n=4))
 

@@ -45,6 +45,7 @@ class Arm:
         joint_names: the n independent joints.
         tree_joint_names: the joints of the SDF tree, linkage included.
         sdf: package URLs or paths of the model files: the arm's, then its instrument's if it has one.
+        mirrored_links: URL of `sdf` -> its links that this arm has as mirror images.
         position_lower, position_upper: (n,) limits of this arm.
         effort_limits: (n,) limits of the joint torques, from the SDF.
         prismatic: (n,) True for a joint that slides [m, N], False for one that turns [rad, N m].
@@ -66,6 +67,7 @@ class Arm:
     joint_names: tuple[str, ...]
     tree_joint_names: tuple[str, ...]
     sdf: tuple[str, ...]
+    mirrored_links: dict[str, tuple[str, ...]]
     position_lower: NDArray[np.float64]
     position_upper: NDArray[np.float64]
     effort_limits: NDArray[np.float64]
@@ -203,7 +205,8 @@ def _build_arm(
 ) -> Arm:
     joints = [*mechanism.joints, *instrument.joints]
     sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)
-    facts = read_sdf_facts(compose_sdf(sdf))
+    mirrored = {url: tuple(links) for url, links in description.mirrored_links.items()}
+    facts = read_sdf_facts(compose_sdf(sdf, mirrored))
     position_limits = {**instrument.position_limits, **description.position_limits}
     if set(joints) != set(position_limits):
         raise ArmError(f"{path}: position_limits must name exactly {', '.join(mechanism.joints)}")
@@ -230,6 +233,7 @@ def _build_arm(
         joint_names=tuple(joints),
         tree_joint_names=facts.joint_names,
         sdf=sdf,
+        mirrored_links=mirrored,
         position_lower=limits[:, 0],
         position_upper=limits[:, 1],
         effort_limits=np.array([facts.effort_limits[j] for j in joints]),

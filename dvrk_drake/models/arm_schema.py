@@ -120,8 +120,9 @@ class ArmDescription:
 
     `mechanism` and `instrument` are names of files in their folders, or paths of YAML files from the arm's own folder;
     the `sdf` of such a file is a path from the folder that it is in. `gravity` is the gravity vector [m/s^2] in the
-    arm's base frame. `coupled_limits` replaces [lower, upper] of the mechanism's coupled limits by name, for an arm
-    whose stops were calibrated.
+    arm's base frame. `mirrored_links` names, by SDF file, links of which this arm has the mirror image (x to -x in the
+    link's frame); another SDF, such as one that was exported of this arm, is taken as it is. `coupled_limits` replaces
+    [lower, upper] of the mechanism's coupled limits by name, for an arm whose stops were calibrated.
     """
 
     name: str = ""
@@ -129,4 +130,5 @@ class ArmDescription:
     instrument: str = ""
     position_limits: dict[str, list[float]] = field(default_factory=dict)
     coupled_limits: dict[str, list[float]] = field(default_factory=dict)
+    mirrored_links: dict[str, list[str]] = field(default_factory=dict)
     gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81])

@@ -45,7 +45,7 @@ class FrictionEffect(DriveEffect):
 
 @dataclass
 class Cable:
-    """Between an actuator's motor and the arm, at the actuator: [N m/rad], and [N m s/rad] of its damping."""
+    """Between the motor and the joint of an actuator that turns this joint alone: [N m/rad], damping [N m s/rad]."""
 
     stiffness: float = 0.0
     damping: float = 0.0

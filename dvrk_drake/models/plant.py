@@ -44,7 +44,7 @@ def add_arm(
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
     parser = Parser(plant)
     parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))
-    model = compose_sdf(arm.sdf)
+    model = compose_sdf(arm.sdf, arm.mirrored_links)
     if closure == "ball":
         _remove_loop_mimics(model, arm)
     if not collision_shapes:

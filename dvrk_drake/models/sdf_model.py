@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from dvrk_drake.errors import ArmError
+from dvrk_drake.models.mirrored_links import mirror_links
 
 MODELS_FOLDER = Path(__file__).parent
 PACKAGE_URL = "package://dvrk_drake/"
@@ -32,7 +33,7 @@ class SdfFacts:
     prismatic: frozenset[str]
 
 
-def compose_sdf(urls: Sequence[str]) -> ElementTree.Element:
+def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | None = None) -> ElementTree.Element:
     """The model of the first file with the links, joints and frames of the others added: an arm and its instrument.
 
     Meshes that a file names relative to itself get their absolute path.
@@ -42,11 +43,15 @@ def compose_sdf(urls: Sequence[str]) -> ElementTree.Element:
 
     Args:
         urls: package URLs or paths.
+        mirrored: URL -> links of that file that are taken as their mirror image (`mirror_links`).
 
     Raises:
-        ArmError: a file is not an SDF with one model, or gives a link that is already there more than shapes.
+        ArmError: a file is not an SDF with one model, gives a link that is already there more than shapes, or lacks one
+            that is to be mirrored.
     """
     root, *others = (_read(Path(str(url).replace(PACKAGE_URL, f"{MODELS_FOLDER}/", 1))) for url in urls)
+    for url, part in zip(urls, (root, *others), strict=True):
+        mirror_links(part, (mirrored or {}).get(url, ()), url)
     (model,) = root.findall("model")
     links = {link.get("name", ""): link for link in model.findall("link")}
     for other in others:

@@ -10,6 +10,7 @@ from pydrake.systems.framework import DiagramBuilder
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.systems.effort_ramp import EffortRamp
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
@@ -36,6 +37,7 @@ class ArmController:
         mode: Mode,
         period: float,
         friction: FrictionCompensator | None = None,
+        gains: Gains | None = None,
     ) -> None:
         """Of `arm`, carried by `model`.
 
@@ -45,11 +47,12 @@ class ArmController:
             mode: "gravity" or "hold".
             period: in which statuses come [s].
             friction: takes friction off the hand in mode "gravity"; becomes part of this controller.
+            gains: to hold with; the arm's own by default.
         """
         builder = DiagramBuilder()
         self.arm, self._mode = arm, mode
         receiver = builder.AddSystem(DvrkStatusReceiver(arm))
-        self._controller = builder.AddSystem(GravityPidController(model, period=period, mode="gravity"))
+        self._controller = builder.AddSystem(GravityPidController(model, period=period, gains=gains, mode="gravity"))
         self._ramp = builder.AddSystem(EffortRamp(arm.num_joints, period=period))
         self._sender = builder.AddSystem(DvrkCommandSender(arm))
         builder.Connect(receiver.GetOutputPort("state_estimated"), self._controller.GetInputPort("state_estimated"))

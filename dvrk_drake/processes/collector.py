@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.collection_file import CollectionFile
+from dvrk_drake.models.nearby_pose import beside
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.processes.leg import Leg, beside
+from dvrk_drake.processes.leg import Leg
 from dvrk_drake.processes.live_status import takeover_reason
 from dvrk_drake.processes.rest_detector import RestDetector
 

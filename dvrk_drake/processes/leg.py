@@ -6,8 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.trajectories import PiecewisePolynomial
 
-from dvrk_drake.models.arm import Arm
-
 #: Least time of a leg [s]: short ones would begin and end with a jerk.
 LEAST_DURATION = 0.3
 
@@ -48,15 +46,3 @@ class Leg:
         """(2n,) q, then v at `time` [s] from 0 to the duration; outside of that, of its ends."""
         time = min(max(time, 0.0), self.duration)
         return np.concatenate([self._q.value(time).ravel(), self._v.value(time).ravel()])
-
-
-def beside(arm: Arm, pose: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """pose + offset (n,), where the offset of each joint is shortened so that no limit of `arm` is crossed."""
-    A, lower, upper = arm.limit_matrix()
-    change = A @ offset
-    room = np.where(change > 0, upper - A @ pose, A @ pose - lower)
-    share = np.clip(np.divide(room, np.abs(change), out=np.ones_like(room), where=change != 0), 0.0, 1.0)
-    joint_share = np.array([share[A[:, j] != 0].min() for j in range(arm.num_joints)])
-    point = pose + joint_share * offset
-    # Coupled limits with coefficients of both signs could be crossed by shortening one joint alone.
-    return pose if arm.limit_violations(point, 1e-9) else point

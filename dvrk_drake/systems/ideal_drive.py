@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
-from pydrake.systems.primitives import Adder, MatrixGain, PassThrough, Saturation
+from pydrake.systems.primitives import MatrixGain, PassThrough, Saturation
 
 from dvrk_drake.systems.plant_joints import PlantJoints
 
@@ -38,8 +38,11 @@ def add_ideal_drive(
     builder.Connect(clamp.get_output_port(), to_actuators.get_input_port())
     builder.Connect(to_actuators.get_output_port(), plant.get_actuation_input_port(instance))
     state = add_true_state(builder, plant, joints)
-    disturbance = add_disturbance(builder, plant, joints)
-    return DrivePorts(commanded.get_input_port(), disturbance, clamp.get_output_port(), state, state)
+    disturbance = builder.AddNamedSystem("effort_disturbance", PassThrough(n))
+    to_tree = builder.AddNamedSystem("to_tree", MatrixGain(D=joints.selection))
+    builder.Connect(disturbance.get_output_port(), to_tree.get_input_port())
+    builder.Connect(to_tree.get_output_port(), plant.get_applied_generalized_force_input_port())
+    return DrivePorts(commanded.get_input_port(), disturbance.get_input_port(), clamp.get_output_port(), state, state)
 
 
 def add_true_state(builder: DiagramBuilder, plant: MultibodyPlant, joints: PlantJoints) -> OutputPort:
@@ -48,21 +51,3 @@ def add_true_state(builder: DiagramBuilder, plant: MultibodyPlant, joints: Plant
     true = builder.AddNamedSystem("state_true", MatrixGain(D=np.kron(np.eye(2), S)))
     builder.Connect(plant.get_state_output_port(), true.get_input_port())
     return true.get_output_port()
-
-
-def add_disturbance(
-    builder: DiagramBuilder, plant: MultibodyPlant, joints: PlantJoints, torque: OutputPort | None = None
-) -> InputPort:
-    """For efforts (n) that act on the joints beside those of the motors, and of `torque`."""
-    n = len(joints.index)
-    outside = builder.AddNamedSystem("effort_disturbance", PassThrough(n))
-    total = outside.get_output_port()
-    if torque is not None:
-        adder = builder.AddNamedSystem("behind_motors", Adder(2, n))
-        builder.Connect(total, adder.get_input_port(0))
-        builder.Connect(torque, adder.get_input_port(1))
-        total = adder.get_output_port()
-    to_tree = builder.AddNamedSystem("to_tree", MatrixGain(D=joints.selection))
-    builder.Connect(total, to_tree.get_input_port())
-    builder.Connect(to_tree.get_output_port(), plant.get_applied_generalized_force_input_port())
-    return outside.get_input_port()

@@ -56,16 +56,16 @@ class DriveJoints:
     def add_motor(self, name: str, cable: Cable) -> None:
         """Puts the motor of an actuator on a joint of its own, tied to the arm by a cable that stretches.
 
-        What `along` says of that actuator is then the motor's. A rotor that the SDF states at the joint of that name
-        goes to the motor.
+        What `along` says of that actuator is then the motor's, and the rotor that the SDF states at its joint goes to
+        it.
 
         Raises:
-            StationError: the actuator slides: its cable is not known.
+            StationError: the actuator slides or moves more than its joint: then no rotor of its own is stated.
         """
         plant, i = self._plant, self._arm.joint_names.index(name)
-        if self._arm.prismatic[i]:
-            raise StationError(f"{self._arm.name}: effects.stretch: {name} slides; allowed are actuators that turn")
         row = joint_row(self._arm, f"actuator.{name}")
+        if self._arm.prismatic[i] or not np.array_equal(row, np.eye(len(row))[i]):
+            raise StationError(f"{self._arm.name}: stretch.{name}: allowed are actuators that turn one joint alone")
         joint = self._new(row, cable)
         motor = plant.AddJointActuator(f"motor_{name}", joint)
         at_joint = plant.GetJointActuatorByName(name, self._instance)

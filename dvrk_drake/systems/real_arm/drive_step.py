@@ -14,7 +14,7 @@ from dvrk_drake.dynamics.actuator_effects import effect_step
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.systems.gravity_pid_step import entry_point
-from dvrk_drake.systems.real_arm.motor_channel import in_steps
+from dvrk_drake.systems.real_arm.motors import in_steps
 from dvrk_drake.systems.real_arm.plant_effects import PlantEffects
 
 

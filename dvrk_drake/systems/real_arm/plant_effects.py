@@ -20,7 +20,8 @@ class PlantEffects:
     Attributes:
         drive: the joints that were added for coordinates of the drive.
         to_actuators: (n, nq) positions of the plant to those of the arm's actuators; after `finish`.
-        from_motors: (number of the plant's actuators, n) efforts of the motors to those of the plant; after `finish`.
+        from_motors: (nv, n) efforts of the motors to those on the plant; after `finish`.
+        joint_index: (n,) of the joints in the plant's q and v; after `finish`.
         sliders: friction that follows; after `finish`.
         num_actuators: of the plant's instance; after `finish`.
     """
@@ -58,8 +59,9 @@ class PlantEffects:
         self.sliders = [Slider.of(element, order) for element in self._elements]
         J = self._arm.transmission.matrix
         self.to_actuators: NDArray[np.float64] = np.ascontiguousarray(J @ joints.selection.T)
-        self.from_motors: NDArray[np.float64] = joints.actuation @ J.T
+        self.from_motors: NDArray[np.float64] = np.ascontiguousarray(joints.selection @ J.T)
+        self.joint_index = joints.index
         for i, name in enumerate(self._arm.joint_names):
             if (motor := self.drive.motors.get(name)) is not None:
-                self.to_actuators[i] = np.eye(self._plant.num_positions())[motor.joint().position_start()]
-                self.from_motors[:, i] = np.eye(len(order))[order.index(motor.index())]
+                own = np.eye(self._plant.num_positions())[motor.joint().position_start()]
+                self.to_actuators[i] = self.from_motors[:, i] = own

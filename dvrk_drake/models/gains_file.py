@@ -1,0 +1,42 @@
+"""Files of gains: what `tune` writes and what a scenario and `run` read."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from pydrake.common.yaml import yaml_dump, yaml_load_typed
+
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.models.atomic_file import atomic_write
+
+
+def load_gains(path: str | Path) -> Gains:
+    """Reads kp, kd and ki, one number a joint each; whether they fit an arm is the controller's to say.
+
+    Raises:
+        ControllerError: no such file, or not one of gains.
+    """
+    if not Path(path).is_file():
+        raise ControllerError(f"{path}: no such file of gains")
+    try:
+        gains = yaml_load_typed(schema=Gains, filename=str(path))
+    except Exception as error:
+        # yaml_load_typed raises many types, from YAML's to KeyError; each text names the field.
+        raise ControllerError(f"{path}: not a file of gains: {error}; allowed: kp, kd, ki") from error
+    for name, values in dataclasses.asdict(gains).items():
+        if not values:
+            raise ControllerError(f"{path}: {name} is missing; a file of gains has kp, kd and ki, one number a joint")
+    return gains
+
+
+def save_gains(gains: Gains, path: str | Path, remark: str) -> None:
+    """Writes a file of gains with a remark of one line at its top.
+
+    Raises:
+        DvrkDrakeError: it cannot be written.
+    """
+    with atomic_write(path) as stream:
+        stream.write(f"# {remark}\n# N m/rad, N m s/rad, N m/(rad s); N and m on a joint that slides.\n")
+        stream.write(yaml_dump(dataclasses.asdict(gains)))

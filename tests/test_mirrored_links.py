@@ -1,0 +1,106 @@
+"""A left arm's wrist mirrors a right arm's: in the equations, in files of real arms, in what is written."""
+
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.gravity_compensation import CompensationOptions, compensation_from_model, controller_torque
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.models.mirrored_links import mirror_links
+from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
+
+#: Mirrored in the plane x = 0, an arm has these joint angles in place of its own, and these torques.
+MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
+#: Column of the controller's file that the wrist's brackets beside the arm make: my5 - mz4.
+P6 = 5
+
+
+def torque(arm, q):
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    set_arm_positions(plant, context, arm, q)
+    return holding_torque(plant, context, arm)
+
+
+def p6(name):
+    options = CompensationOptions(tolerance=0.01)
+    return compensation_from_model(IdentifiedModel.from_arm(load_arm(name)), options).positive[P6]
+
+
+def test_left_and_right_are_mirror_images():
+    left, right = load_arm("mtml"), load_arm("mtmr")
+    for q in left.sample_poses(5, np.random.default_rng(0)):
+        np.testing.assert_allclose(torque(left, q), MIRROR * torque(right, MIRROR * q), atol=1e-12)
+        assert np.abs(torque(left, q) - torque(right, q)).max() > 0.01
+
+
+@pytest.mark.slow
+def test_the_wrists_brackets_are_on_the_sides_that_files_of_real_arms_say(shared_data):
+    folder = shared_data / "gc_json"
+    if not folder.is_dir():
+        pytest.skip(f"needs {folder}")
+    for name, serial in (("mtml", "MTML-22723"), ("mtml", "MTML-34863"), ("mtmr", "MTMR-32336")):
+        file = GravityCompensationFile.load(folder / f"gc-{serial}.json")
+        assert np.sign(p6(name)) == np.sign((file.positive + file.negative)[P6])
+
+
+def test_a_file_of_a_real_right_arm_mirrored_predicts_real_left_arms(shared_data):
+    folder = shared_data / "gc_json"
+    if not folder.is_dir():
+        pytest.skip(f"needs {folder}")
+    right = GravityCompensationFile.load(folder / "gc-MTMR-32336.json")
+    for serial in ("MTML-22723", "MTML-34863"):
+        left = GravityCompensationFile.load(folder / f"gc-{serial}.json")
+        q = np.random.default_rng(0).uniform(*left.sweep, (2000, 7))
+        q = q[np.abs(q[:, 1] + q[:, 2]) < 0.2]  # where the parallelogram lets both files' sweeps be
+        tau = controller_torque(left, q)
+        as_it_is = np.sqrt(np.mean((controller_torque(right, q) - tau) ** 2, axis=0))
+        mirrored = np.sqrt(np.mean((MIRROR * controller_torque(right, MIRROR * q) - tau) ** 2, axis=0))
+        assert np.all(mirrored[1:3] < 0.5 * as_it_is[1:3]) and mirrored[3] < as_it_is[3], (as_it_is, mirrored)
+
+
+def test_twice_mirrored_is_as_before_and_shapes_follow():
+    def read():
+        return ElementTree.parse(MODELS_FOLDER / "sdf" / "mtm.sdf").getroot()
+
+    link = "wrist_pitch_link"
+    before, after = read(), read()
+    mirror_links(after, [link], "mtm.sdf")
+    poses, mirrored = (
+        [p.text.split() for p in root.iterfind(f"model/link[@name='{link}']/*/pose")] for root in (before, after)
+    )
+    signs = np.array([-1, 1, 1, 1, -1, -1])
+    np.testing.assert_allclose(np.array(mirrored, float), signs * np.array(poses, float), atol=1e-12)
+    (mesh,) = after.iterfind(f"model/link[@name='{link}']/visual/geometry/mesh")
+    assert mesh.findtext("scale").split() == ["-1", "1", "1"]
+    mirror_links(after, [link], "mtm.sdf")
+    again = [p.text.split() for p in after.iterfind(f"model/link[@name='{link}']/*/pose")]
+    np.testing.assert_array_equal(np.array(again, float), np.array(poses, float))
+    assert mesh.findtext("scale").split() == ["1", "1", "1"]
+
+
+def test_what_cannot_be_mirrored_is_named():
+    root = ElementTree.fromstring('<sdf><model><link name="a"><visual><pose>1 2 3</pose></visual></link></model></sdf>')
+    with pytest.raises(ArmError, match=r'x\.sdf: has no link "b" to mirror; its links: a'):
+        mirror_links(root, ["b"], "x.sdf")
+    with pytest.raises(ArmError, match=r"x\.sdf: link a: to be mirrored, a <pose> must be x y z roll pitch yaw"):
+        mirror_links(root, ["a"], "x.sdf")
+
+
+@pytest.mark.slow
+def test_an_exported_left_arm_is_not_mirrored_again(tmp_path):
+    assert main(["export", "mtml", "--sdf", str(tmp_path / "left.sdf")]) == 0
+    for part, text in (("mechanisms/mtm", "sdf: package://dvrk_drake/sdf/mtm.sdf"), ("arms/mtml", "mechanism: mtm\n")):
+        new = {"mechanisms/mtm": "sdf: left.sdf", "arms/mtml": "mechanism: mtm.yaml\n"}[part]
+        content = (MODELS_FOLDER / f"{part}.yaml").read_text()
+        assert content.count(text) == 1
+        (tmp_path / f"{part.split('/')[1]}.yaml").write_text(content.replace(text, new))
+    left, own = load_arm("mtml"), load_arm(str(tmp_path / "mtml.yaml"))
+    for q in left.sample_poses(3, np.random.default_rng(0)):
+        np.testing.assert_allclose(torque(own, q), torque(left, q), atol=1e-12)

@@ -1,0 +1,38 @@
+"""Whitening: an autoregressive error becomes white, and what is linear stays linear."""
+
+import numpy as np
+from scipy.signal import lfilter
+
+from dvrk_drake.analysis.whitening import Whitening
+
+RATE, CUT_OFF = 40.0, 5.0
+STEP = 4
+
+
+def red(coefficients, rows, generator):
+    """Every `STEP`-th row, from each of the first ones on, is an autoregression of its own."""
+    x = np.empty(rows * STEP)
+    for first in range(STEP):
+        x[first::STEP] = lfilter([1.0], [1.0, *(-np.array(coefficients))], generator.normal(size=rows))
+    return x
+
+
+def test_the_autoregression_is_found_and_what_is_left_is_white():
+    generator = np.random.default_rng(0)
+    true = np.array([[1.2, -0.5], [0.0, 0.0]])
+    x = np.column_stack([red(own, 5000, generator) for own in true])
+    whitening = Whitening.of(x, 2, RATE, CUT_OFF)
+    assert whitening.step == STEP and whitening.lost == 2 * STEP
+    np.testing.assert_allclose(whitening.coefficients, true, atol=0.03)
+    for channel in range(2):
+        white = whitening(x[:, channel], channel)
+        assert len(white) == len(x) - whitening.lost
+        assert abs(np.corrcoef(white[STEP:], white[:-STEP])[0, 1]) < 0.02
+
+
+def test_it_is_linear_and_none_changes_nothing():
+    generator = np.random.default_rng(1)
+    x, y = generator.normal(size=(2, 100, 3))
+    whitening = Whitening(np.array([[0.5, -0.2]]), 3)
+    np.testing.assert_allclose(whitening(x + 2 * y, 0), whitening(x, 0) + 2 * whitening(y, 0), atol=1e-12)
+    np.testing.assert_array_equal(Whitening.none(1)(x, 0), x)
