@@ -70,7 +70,7 @@ LAWS = {
 
 
 @pytest.mark.parametrize("law", ["the arm's", *LAWS])
-@pytest.mark.parametrize("name", ["mtml", "psm"])
+@pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def test_friction_only_takes_energy(name, law):
     """Work on the friction, by what Drake says that it applies: never less than nothing, whatever the motion."""
     arm = weightless(name)
