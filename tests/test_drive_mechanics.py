@@ -88,7 +88,7 @@ def test_cables_and_springs_give_back_what_they_take(name):
     run = Run(arm, arm.effects.only(["cables", "springs"]))
     system = run.station.GetSubsystemByName("drive_force")
     context, index = system.CreateDefaultContext(), run.station._joints.index
-    phase = np.linspace(0, 2 * np.pi, 4001)
+    phase = np.linspace(0, 2 * np.pi, 2001)
     ranges = 0.4 * (arm.position_upper - arm.position_lower)
     q = middle(arm) + ranges * np.sin(np.outer(phase, np.arange(1, arm.num_joints + 1)) + 0.3)
     forces = []

@@ -22,7 +22,7 @@ def scenario(arm, *settings):
     return load_scenario(arm, [*parts, *settings])
 
 
-@pytest.mark.parametrize("name", ["mtml", "psm"])
+@pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def test_a_seed_gives_the_same_bits(name):
     one, two, other = (simulate(scenario(name, f"seed={seed}")).recording for seed in (5, 5, 6))
     for field in ("q", "qd", "tau"):
@@ -30,6 +30,7 @@ def test_a_seed_gives_the_same_bits(name):
     assert np.any(one.tau != other.tau)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ARMS)
 def test_a_controller_that_knows_only_gravity_holds_the_real_arm(name):
     arm = load_arm(name)
@@ -103,6 +104,7 @@ HAND = [
 ]
 
 
+@pytest.mark.slow
 def test_a_hand_moves_the_arm_and_lets_go():
     settings = ["duration=2.2", "controller.mode=gravity", "real_arm=[all]", *HAND]
     simulation = simulate(load_scenario("mtml", settings))
@@ -119,15 +121,13 @@ def test_a_hand_moves_the_arm_and_lets_go():
     assert np.ptp(simulation.state_true[-50:, :7], axis=0).max() < 5e-3
 
 
-@pytest.mark.parametrize(
-    ("name", "start"), [("mtml", [0, 0.2, -0.2, 0.5, 0.5, 0, 0]), ("psm", [0, 0, 0.1, 0.6, 0.6, 0.6, 0.2])]
-)
-def test_a_controller_that_knows_cables_and_springs_holds_them_exactly(name, start):
+@pytest.mark.slow
+def test_a_controller_that_knows_cables_and_springs_holds_them_exactly():
     """Gravity compensation alone, without friction: nothing is left that moves the arm."""
-    parts = ["real_arm=[cables, springs]", "duration=1", "controller.mode=gravity", f"start={start}"]
+    parts = ["real_arm=[cables, springs]", "duration=1", "controller.mode=gravity", f"start={TWO_POSES[1]}"]
     moved = {}
     for knows in ("[]", "[cables, springs]"):
-        path = simulate(load_scenario(name, [*parts, f"controller.knows={knows}"])).state_true
+        path = simulate(load_scenario("mtml", [*parts, f"controller.knows={knows}"])).state_true
         moved[knows] = np.abs(path[:, :7] - path[0, :7]).max()
     assert moved["[cables, springs]"] < 1e-3
     assert moved["[]"] > 0.05
