@@ -71,7 +71,7 @@ def test_a_typo_is_an_error(tmp_path):
         ("measurement: 1", "measurement: -1", "effects.delay.measurement = -1"),
         ("presliding, scale: 0.015", "stiction, scale: 0.015", 'effects.friction: kind "stiction"; allowed'),
         ("scale: 0.015", "scale: 0.0", "has scale 0"),
-        ("coefficient: 0.0019", "coefficient: -0.0019", "has coefficient -0.0019"),
+        ("coefficient: 0.0011", "coefficient: -0.0011", "has coefficient -0.0011"),
     ):
         assert old in text
         (tmp_path / "m.yaml").write_text(text.replace(old, new))
@@ -119,6 +119,20 @@ def test_a_hand_moves_the_arm_and_lets_go():
     assert np.ptp(simulation.state_true[-50:, :7], axis=0).max() < 5e-3
 
 
+@pytest.mark.parametrize(
+    ("name", "start"), [("mtml", [0, 0.2, -0.2, 0.5, 0.5, 0, 0]), ("psm", [0, 0, 0.1, 0.6, 0.6, 0.6, 0.2])]
+)
+def test_a_controller_that_knows_cables_and_springs_holds_them_exactly(name, start):
+    """Gravity compensation alone, without friction: nothing is left that moves the arm."""
+    parts = ["real_arm=[cables, springs]", "duration=1", "controller.mode=gravity", f"start={start}"]
+    moved = {}
+    for knows in ("[]", "[cables, springs]"):
+        path = simulate(load_scenario(name, [*parts, f"controller.knows={knows}"])).state_true
+        moved[knows] = np.abs(path[:, :7] - path[0, :7]).max()
+    assert moved["[cables, springs]"] < 1e-3
+    assert moved["[]"] > 0.05
+
+
 def test_saturation_shows_what_motors_cannot_follow():
     """From 0.05 to 0.9 rad in 0.25 s: more than the shoulder's motor has, though not than the joint's limit."""
     arm = load_arm("mtml")
@@ -160,6 +174,7 @@ def test_a_cable_of_a_scenario_stretches():
         ("hand.path=[{time: 0.1, pose: [0, 0, 0, 0, 0, 0, 0]}]", "hand.path needs two poses or more"),
         ("hand.path=[{time: 0.1, pose: [0, 0, 0]}]", r"hand.path\[0\].pose has 3 numbers"),
         ("hand.grip=1", "allowed"),
+        ("controller.knows=[friction]", 'controller.knows is "friction"; allowed: cables, springs'),
         ("controller.friction_ratio=0.5", 'controller.friction_ratio needs mode "gravity"'),
     ],
 )

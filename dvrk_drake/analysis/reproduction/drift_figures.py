@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.plots import MEASURED_COLOUR, MODEL_COLOUR, save_figure
 from dvrk_drake.analysis.reproduction import published
 from dvrk_drake.analysis.reproduction.laboratory import Laboratory
-from dvrk_drake.analysis.reproduction.releases import BAND, SAMPLE_PERIOD, Drifts
+from dvrk_drake.analysis.reproduction.releases import APPROACH, BAND, RESTING, SAMPLE_PERIOD, Drifts
 from dvrk_drake.analysis.reproduction.report import ResultTable, Section, numbers, share
 from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -33,11 +33,21 @@ def reproduce_figure_5(laboratory: Laboratory) -> Section:
     few = poses[: extent.paper_releases]
     ours = laboratory.release("mtml", mtm.truth, mtm.file, poses, "Fig. 5: releasing ours")
     paper = laboratory.release("mtml", mtm.truth, laboratory.paper_file, few, "Fig. 5: releasing the paper's")
+    led = laboratory.release(
+        "mtml", mtm.truth, mtm.file, poses[: extent.led_releases], "Fig. 5: leading and releasing ours", led=True
+    )
     frictionless = [name for name in EFFECT_NAMES if name != "friction"]
 
     def loose(model: Path, where: NDArray[np.float64], what: str, damped: bool = False) -> Drifts:
         return laboratory.release(
-            "mtml", mtm.truth, model, where, f"Fig. 5: no friction, {what}", frictionless, damped, LOOSE_DURATION
+            "mtml",
+            mtm.truth,
+            model,
+            where,
+            f"Fig. 5: no friction, {what}",
+            frictionless,
+            damped,
+            longest=LOOSE_DURATION,
         )
 
     loose_paper = loose(laboratory.paper_file, few, "the paper's")
@@ -48,7 +58,7 @@ def reproduce_figure_5(laboratory: Laboratory) -> Section:
         laboratory.folder, "fig5", "all torques on", ours, paper, published.FIGURE_5, published.FIGURE_5_MEANS
     )
     tables = (
-        _drift_table("fig5", "all torques on", published.FIGURE_5, published.FIGURE_5_MEANS, paper, ours),
+        _drift_table("fig5", "all torques on", published.FIGURE_5, published.FIGURE_5_MEANS, paper, ours, led),
         _torque_table(laboratory),
         _rate_table(without_friction),
     )
@@ -64,6 +74,10 @@ def reproduce_figure_5(laboratory: Laboratory) -> Section:
         "by more than friction holds, as it does in Fig. 4, since unweighted least squares had other joints to "
         "please and the model no spring. What differs from the published drifts: the real trials began wherever a "
         "hand had put the arm, with hysteresis in its cables, and the friction here is that of another MTM.",
+        f"**Led there**, from {APPROACH[0]:g} rad beside and held for {RESTING:g} s, the arm is let go with loaded "
+        "friction, which gives way as the hold ends: ours then holds every joint at "
+        f"{share(led.num_held, len(led.positions))}; the joints that leave are {_any_lost(led)}. Joint 7's friction "
+        "gives by 15 mrad before it slips, so its letting go alone can use up what is allowed.",
         "**Without friction** nothing but an exact model holds an arm: an error of torque over the inertia of a "
         f"wrist is tens of rad/s^2. So, in {LOOSE_DURATION:g} s, both models let it run into its limits, the "
         f"paper's at all but {_num_staying(loose_paper)}, ours at all but {_num_staying(loose_ours)} of {len(few)} "
@@ -112,6 +126,11 @@ def _lost(drifts: Drifts) -> str:
     return ", ".join(lost) if lost else "single joints"
 
 
+def _any_lost(drifts: Drifts) -> str:
+    lost = [f"{joint} ({n})" for joint, n in zip(_JOINTS, np.sum(~drifts.held, axis=0), strict=True) if n]
+    return ", ".join(lost) or "none"
+
+
 def _num_staying(drifts: Drifts) -> int:
     """Releases in which no joint comes near a limit that it was not near at the start."""
     arm = drifts.arm
@@ -129,19 +148,38 @@ def _per_joint(drifts: Drifts) -> str:
 
 
 def _drift_table(
-    name: str, what: str, trial: Sequence[float], means: Sequence[float], paper: Drifts, ours: Drifts
+    name: str,
+    what: str,
+    trial: Sequence[float],
+    means: Sequence[float],
+    paper: Drifts,
+    ours: Drifts,
+    led: Drifts | None = None,
 ) -> ResultTable:
-    rows = (
+    rows: tuple[tuple[str, ...], ...] = (
         ("published, the trial of the figure (final)", *_UNPUBLISHED, *numbers(np.abs(trial), "{:.4f}")),
         ("published, five trials (mean)", *_UNPUBLISHED, *numbers(means, "{:.4f}")),
         (f"the paper's, {len(paper.positions)} poses (mean)", *numbers(np.abs(paper.final).mean(axis=0), "{:.4f}")),
         (f"ours, {len(ours.positions)} poses (mean)", *numbers(np.abs(ours.final).mean(axis=0), "{:.4f}")),
-        ("the paper's (largest at any time)", *numbers(paper.largest.max(axis=0), "{:.4f}")),
-        ("ours (largest at any time)", *numbers(ours.largest.max(axis=0), "{:.4f}")),
-        ("the paper's, share held", *numbers(paper.held.mean(axis=0), "{:.3f}")),
-        ("ours, share held", *numbers(ours.held.mean(axis=0), "{:.3f}")),
+        ("the paper's (largest at any time)", *_largest(paper)),
+        ("ours (largest at any time)", *_largest(ours)),
+        ("the paper's, share held", *_shares(paper)),
+        ("ours, share held", *_shares(ours)),
     )
+    if led is not None:
+        rows += (
+            (f"ours, led there, {len(led.positions)} poses (largest at any time)", *_largest(led)),
+            ("ours, led there, share held", *_shares(led)),
+        )
     return ResultTable(name, f"Absolute drift after release [rad], {what}", ("", *_JOINTS), rows)
+
+
+def _largest(drifts: Drifts) -> tuple[str, ...]:
+    return numbers(drifts.largest.max(axis=0), "{:.4f}")
+
+
+def _shares(drifts: Drifts) -> tuple[str, ...]:
+    return numbers(drifts.held.mean(axis=0), "{:.3f}")
 
 
 def _torque_table(laboratory: Laboratory) -> ResultTable:
@@ -207,7 +245,7 @@ def _plots(
 def _plot_time(
     path: Path, what: str, ours: NDArray[np.float64], paper: NDArray[np.float64], trial: Sequence[float]
 ) -> None:
-    figure, axes = plt.subplots(2, 4, figsize=(13, 6.5), layout="constrained", sharex=True)
+    figure, axes = plt.subplots(2, 4, figsize=(13, 6.5), layout="constrained")
     t = SAMPLE_PERIOD * np.arange(len(ours))
     for j, ax in enumerate(axes.flat[:7]):
         ax.axhspan(-BAND[0], BAND[0], color="#dddddd", label="15 mrad")
@@ -231,7 +269,8 @@ def _plot_distribution(path: Path, what: str, ours: Drifts, paper: Drifts, means
     for j, ax in enumerate(axes.flat[:7]):
         for drifts, colour, label in ((paper, MEASURED_COLOUR, "the paper's parameters"), (ours, MODEL_COLOUR, "ours")):
             sizes = np.sort(np.maximum(drifts.largest[:, j], 1e-5))
-            ax.step(sizes, 100 * np.arange(1, len(sizes) + 1) / len(sizes), where="post", color=colour, label=label)
+            shares = 100 * np.arange(len(sizes) + 1) / len(sizes)
+            ax.step(np.append(sizes[0], sizes), shares, where="post", color=colour, label=label)
         ax.axvline(BAND[0], color="#8d8d8d", label="15 mrad")
         if j:
             ax.axvline(means[j - 1], color="black", linestyle=":", label="published, mean of five trials")

@@ -31,6 +31,7 @@ class Extent:
         collected: poses that an arm is identified from.
         releases: random poses that ours is released at.
         paper_releases: the first of these, for the paper's parameters.
+        led_releases: the first of these, for ours led there first.
         psm_releases: for the PSM.
         duration: of a release [s].
     """
@@ -38,6 +39,7 @@ class Extent:
     collected: int = 40
     releases: int = 200
     paper_releases: int = 20
+    led_releases: int = 40
     psm_releases: int = 40
     duration: float = DURATION
 
@@ -106,13 +108,14 @@ class Laboratory:
         what: str,
         parts: Sequence[str] = ("all",),
         damped: bool = False,
+        led: bool = False,
         longest: float = DURATION,
     ) -> Drifts:
-        """Of the arm `name`, at `poses` (m, n), under the model in a file, for at most `longest` [s]; `parts` and
-        `damped`: see `Release`."""
+        """Of the arm `name`, at `poses` (m, n), under the model in a file, for at most `longest` [s]; `parts`,
+        `damped` and `led`: see `Release`."""
         duration = min(self.extent.duration, longest)
         cases = [
-            Release(name, truth.arm, tuple(parts), str(model), pose, damped, duration, self.seed + i)
+            Release(name, truth.arm, tuple(parts), str(model), pose, damped, led, duration, self.seed + i)
             for i, pose in enumerate(poses)
         ]
         positions = release_all(cases, self.executor, lambda share: self.progress(what, share))

@@ -120,7 +120,8 @@ def _plot(path: Path, ours: Drifts, drawn: Drifts) -> None:
     for j, ax in enumerate(axes.flat[: len(names)]):
         for drifts, colour, label in ((drawn, "#8d8d8d", "model as drawn"), (ours, MODEL_COLOUR, "ours")):
             sizes = np.sort(np.maximum(drifts.largest[:, j], 1e-6))
-            ax.step(sizes, 100 * np.arange(1, len(sizes) + 1) / len(sizes), where="post", color=colour, label=label)
+            shares = 100 * np.arange(len(sizes) + 1) / len(sizes)
+            ax.step(np.append(sizes[0], sizes), shares, where="post", color=colour, label=label)
         ax.axvline(band[j], color="black", linestyle=":", label="15 mrad (1.5 mm)")
         ax.set_xscale("log")
         ax.set_title(names[j], fontsize=10)

@@ -11,20 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import LogVectorOutput
+from pydrake.systems.primitives import LogVectorOutput, TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.models.nearby_pose import beside
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
-from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
 
 #: Between two samples [s].
 SAMPLE_PERIOD = 0.02
 #: How long it is watched [s], and within how much of where it was let go it is held [rad], [m].
 DURATION = 10.0
 BAND = 0.015, 0.0015
+#: From how far it is led to where it is let go [rad], [m], in what time, and how long it is held there [s].
+APPROACH, LEADING, RESTING = (0.2, 0.02), 1.0, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +40,8 @@ class Release:
         true_arm: what is simulated.
         parts: of the true arm's effects that it has, as `ArmEffects.only` takes them.
         model: file of the controller's model.
-        start: (n,) pose at which it rests when it is let go, its friction unloaded [rad, m].
+        start: (n,) pose at which it rests when it is let go [rad, m], its friction unloaded.
+        led: the arm first comes there from `APPROACH` beside it, held until it rests, so that its friction is loaded.
         damped: whether the controller brakes with the damping gains of the arm beside carrying its weight.
         duration: [s].
         seed: of the effects' noise.
@@ -48,31 +53,52 @@ class Release:
     model: str
     start: NDArray[np.float64]
     damped: bool = False
+    led: bool = False
     duration: float = DURATION
     seed: int = 0
 
 
 def release(case: Release) -> NDArray[np.float64]:
-    """True positions (samples, n) every `SAMPLE_PERIOD`, the start first."""
+    """True positions (samples, n) every `SAMPLE_PERIOD` from the release on."""
     arm = load_arm(case.arm)
     name = arm.name.lower()
     effects = case.true_arm.effects.only(case.parts)
     station = ArmStation(arm, plant_arm=case.true_arm, effects=effects, seed=case.seed)
     builder = DiagramBuilder()
-    add_closed_loop(builder, station, _controller(case, arm))
+    way = _way(case, arm)
+    controller = GravityPidController(_model(case.model), gains=_gains(case, arm), mode=_mode(case))
+    add_closed_loop(builder, station, controller, TrajectorySource(way, output_derivative_order=1))
     log = LogVectorOutput(station.GetOutputPort(f"{name}.state_true"), builder, SAMPLE_PERIOD)
     simulator = Simulator(builder.Build())
-    station.set_positions(station.GetMyMutableContextFromRoot(simulator.get_mutable_context()), case.start)
-    simulator.AdvanceTo(case.duration)
-    positions: NDArray[np.float64] = log.FindLog(simulator.get_context()).data()[: arm.num_joints].T
-    return positions.copy()
+    context = simulator.get_mutable_context()
+    station.set_positions(station.GetMyMutableContextFromRoot(context), way.value(0.0).ravel())
+    before = 0.0
+    if case.led:
+        before = LEADING + RESTING
+        simulator.AdvanceTo(before)
+        controller.SetMode(controller.GetMyMutableContextFromRoot(context), "gravity")
+    simulator.AdvanceTo(before + case.duration)
+    positions: NDArray[np.float64] = log.FindLog(context).data()[: arm.num_joints].T
+    return positions[round(before / SAMPLE_PERIOD) :].copy()
 
 
-def _controller(case: Release, arm: Arm) -> GravityPidController:
+def _mode(case: Release) -> Mode:
+    return "hold" if case.damped or case.led else "gravity"
+
+
+def _gains(case: Release, arm: Arm) -> Gains:
     none = [0.0] * arm.num_joints
-    return GravityPidController(
-        _model(case.model), gains=Gains(none, arm.gains.kd, none), mode="hold" if case.damped else "gravity"
-    )
+    return Gains(none, arm.gains.kd, none) if case.damped else arm.gains
+
+
+def _way(case: Release, arm: Arm) -> PiecewisePolynomial:
+    """To where it is let go, in `LEADING`."""
+    q = from_where = np.asarray(case.start, float)
+    if case.led:
+        sides = np.random.default_rng(case.seed).choice([-1.0, 1.0], arm.num_joints)
+        from_where = beside(arm, q, sides * arm.per_joint(*APPROACH))
+    knots = np.column_stack([from_where, q])
+    return PiecewisePolynomial.CubicHermite([0.0, LEADING], knots, np.zeros_like(knots))
 
 
 @cache

@@ -19,6 +19,8 @@ from dvrk_drake.models.arm import load_arm
 #: The arm's side is not stated; joint 1 bottoms at the left one's limit, and the joints of Fig. 4 do not depend on it.
 ARM = "mtml"
 _FILE = "fig4.png"
+#: Smaller squared errors are drawn as this [(N m)^2]: efforts that were measured as exactly 0.
+FLOOR = 1e-9
 
 
 def reproduce_figure_4(
@@ -88,7 +90,7 @@ def reproduce_figure_4(
         "with, are left out (crosses in the figure). With those left in, the paper's reads better on J2: it fits "
         "the stop along with gravity.",
     )
-    shows = "Squared torque error of joints 2-7 at each of the 72 poses, predicted from the other poses; log scale"
+    shows = "Squared torque error of joints 2-7 at each of the 72 poses, predicted from the others; below 1e-9 as 1e-9"
     return Section("fig4", "Fig. 4: torque errors", remarks, (squared, left_out), {_FILE: shows})
 
 
@@ -114,10 +116,11 @@ def _plot(
             (paper.left_out_residuals, "the paper's least squares", MEASURED_COLOUR, "."),
             (ours.left_out_residuals, "ours", MODEL_COLOUR, "."),
         ):
-            squared = np.maximum(values[:, j] ** 2, 1e-12)
+            squared = np.maximum(values[:, j] ** 2, FLOOR)
             use = undoubted[:, j]
             ax.semilogy(pose[use], squared[use], marker, color=colour, markersize=6, label=label)
             ax.semilogy(pose[~use], squared[~use], "x", color=colour, markersize=4)
+        ax.set_ylim(bottom=FLOOR / 2)
         ax.set_title(f"J{j + 1} {ours.model.joints[j].name}", fontsize=10)
         ax.set_ylabel("squared error [(N m)$^2$]", fontsize=8)
         ax.tick_params(labelsize=7)
