@@ -182,10 +182,7 @@ def test_only_the_joint_that_takes_part_most_is_slowed_down():
 def test_the_least_damped_mode_names_its_joint():
     sampling = Sampling()
     loop = SampledLoop(np.diag([0.1, 0.01]), sampling)
-    for gains, joint in (
-        (Gains([10.0, 1.0], [0.0, 0.2], [0.0] * 2), 0),
-        (Gains([10.0, 1.0], [2.0, 0.0], [0.0] * 2), 1),
-    ):
+    for kd, joint in (([0.0, 0.2], 0), ([2.0, 0.0], 1)):
         growth, shares = loop.least_damped_mode(Gains([10.0, 1.0], kd, [0.0, 0.0]))
         assert growth > 1.0  # a double integrator with delay and no damping
         np.testing.assert_allclose(shares, np.eye(2)[joint], atol=1e-9)
