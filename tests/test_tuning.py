@@ -168,7 +168,7 @@ def test_only_the_joint_that_takes_part_most_is_slowed_down():
     arm = load_arm("mtml")
     sampling, design = sampling_of(arm), design_arm(arm)
     alone = [design_joint(fact, sampling) for fact in design.facts]
-    slowed = [joint.limited_by == "the other joints" for joint in design.joints]
+    slowed = [joint.limited_by == "other joints" for joint in design.joints]
     assert any(slowed) and not all(slowed)
     assert [a == b for a, b in zip(alone, design.joints, strict=True)] == [not slow for slow in slowed]
     # Alone they are not stable together, with a tick more and less inertia; as designed they are, at other poses too.
@@ -215,11 +215,11 @@ def test_a_design_keeps_its_margins_and_says_what_limits_it():
     assert design.ki <= (0.1 + 0.2 * 0.5) / (1e-3 * 0.25) + 1e-9
     coarse = dataclasses.replace(fact, count=1e-3, dry_friction=0.0)
     design = design_joint(coarse, sampling)
-    assert design.limited_by == "a count of its encoder"
+    assert design.limited_by == "encoder count"
     assert (
         coarse.count * (design.kp + design.kd * (1 - sampling.decay) / sampling.period) <= SHAKE * coarse.effort_limit
     )
-    with pytest.raises(ControllerError, match="a count of its encoder is in the way"):
+    with pytest.raises(ControllerError, match="limited by: encoder count"):
         design_joint(dataclasses.replace(coarse, count=1.0), sampling)
     later = design_joint(fact, Sampling(ticks=4))
     assert later.frequency < 0.8 * design_joint(fact, sampling).frequency
