@@ -65,7 +65,7 @@ def print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
     console.print(table)
     console.print(
         "inertia in the joint box: least, all other joints free, and largest, all others held [kg m^2; kg]; margins\n"
-        "of phase [deg] and gain: there. Limited by other joints: slower than alone, so that all are stable together.\n",
+        "of phase [deg] and gain: there. Limited by other joints: slower than alone, so that all are stable at once.\n",
         markup=False,
     )
 
