@@ -129,19 +129,19 @@ def design_joint(fact: JointFacts, sampling: Sampling, slowed: float = 1.0) -> J
     Raises:
         ControllerError: something speaks against all gains.
     """
-    limited_by = "the fastest frequency that is tried"
+    limited_by = "fastest tried"
     for w in FREQUENCIES:
         design = _joint_gains(fact, sampling, w)
         if reason := _objection(fact, sampling, design):
             limited_by = reason
             continue
         if slowed < 1.0:
-            limited_by = "the other joints"
+            limited_by = "other joints"
             design = _joint_gains(fact, sampling, slowed * w)
         kp, kd, ki = design
         low, high = (SampledLoop(M, sampling, fact.viscous).margins(Gains([kp], [kd], [ki])) for M in fact.inertia)
         return JointDesign(kp, kd, ki, float(slowed * w), (low, high), limited_by)
-    raise ControllerError(f"no gains of {FREQUENCIES[-1]:g} rad/s or more: {limited_by} is in the way")
+    raise ControllerError(f"no gains for {FREQUENCIES[-1]:g} rad/s or more, limited by: {limited_by}")
 
 
 def _joint_gains(fact: JointFacts, sampling: Sampling, w: float) -> tuple[float, float, float]:
@@ -157,7 +157,7 @@ def _objection(fact: JointFacts, sampling: Sampling, design: tuple[float, float,
     # One count in one period, before the low-pass has spread it.
     jolt = fact.count * (kp + kd * (1.0 - sampling.decay) / sampling.period)
     if jolt > max(fact.dry_friction, SHAKE * fact.effort_limit):
-        return "a count of its encoder"
+        return "encoder count"
     for M in fact.inertia:
         margins = SampledLoop(M, sampling, fact.viscous).margins(Gains([kp], [kd], [ki]))
         if margins.phase < PHASE_MARGIN:

@@ -50,22 +50,22 @@ def print_procedure(console: Console, arm: Arm, joints: tuple[JointProcedure, ..
 
 def print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
     """What the model says of each joint, and the gains that follow."""
-    columns = ("joint", "inertia", "rad/s", "phase margin", "gain margin", "Kp", "Kv", "Ki", "limited by")
+    columns = ("joint", "inertia", "rad/s", "phase", "gain", "Kp", "Kv", "Ki", "limited by")
     table = make_table(f"{arm.name} by the model", *columns)
     for name, fact, joint in zip(arm.joint_names, design.facts, design.joints, strict=True):
         table.add_row(
             name,
-            "{:.3g} .. {:.3g}".format(*fact.inertia),
+            "{:.3g}..{:.3g}".format(*fact.inertia),
             f"{joint.frequency:.1f}",
-            " .. ".join(f"{np.degrees(margins.phase):.0f}" for margins in joint.margins) + " deg",
-            " .. ".join(f"{margins.gain:.1f}" for margins in joint.margins),
+            "..".join(f"{np.degrees(margins.phase):.0f}" for margins in joint.margins),
+            "..".join(f"{margins.gain:.1f}" for margins in joint.margins),
             *(f"{value:.3g}" for value in (joint.kp, joint.kd, joint.ki)),
             joint.limited_by,
         )
     console.print(table)
     console.print(
         "inertia in the joint box: least, all other joints free, and largest, all others held [kg m^2; kg]; margins\n"
-        "at these. Limited by the other joints: slower than alone, so that all are stable together.\n",
+        "of phase [deg] and gain: there. Limited by other joints: slower than alone, so that all are stable at once.\n",
         markup=False,
     )
 
