@@ -8,6 +8,8 @@ import pytest
 
 from dvrk_drake.analysis.reproduction import published
 from dvrk_drake.analysis.reproduction.dh_table import published_row, recomputed_table, reproduce_table_1
+from dvrk_drake.analysis.reproduction.drift_figures import reproduce_figure_5
+from dvrk_drake.analysis.reproduction.laboratory import Extent, Identified, Laboratory
 from dvrk_drake.analysis.reproduction.paper_parameters import paper_model, paper_torque, with_zeroed
 from dvrk_drake.analysis.reproduction.psm import mechanism_errors
 from dvrk_drake.analysis.reproduction.recordings import PaperRecordings
@@ -28,7 +30,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
-from dvrk_drake.models.recording import read_recording
+from dvrk_drake.models.recording import Recording, read_recording
 
 ARM = load_arm("mtml")
 
@@ -93,6 +95,7 @@ def test_torque_of_the_papers_parameters_is_that_of_its_regressor(parameters):
     np.testing.assert_allclose(paper_torque(ARM, q, parameters), expected, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_the_papers_model_in_our_parameters_is_the_same_and_can_be_zeroed():
     q = ARM.sample_poses(30, np.random.default_rng(3))
     model = paper_model(ARM)
@@ -274,3 +277,28 @@ def test_psm_keeps_its_remote_centre_and_its_wrist_axes_apart():
     remote, angle = mechanism_errors(load_arm("psm"))
     assert remote < 1e-9
     assert angle == pytest.approx(np.pi / 2, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_figure_5_writes_what_it_names_and_holds_with_an_exact_model(tmp_path):
+    truth = unlike_its_drawing("mtml", tmp_path, seed=8)
+    file = tmp_path / "exact.yaml"
+    truth.model.save(file)
+    q = ARM.sample_poses(20, np.random.default_rng(9))
+    poses = Recording(q=q, tau=truth.model.holding_torque(q), source="computed")
+    extent = Extent(releases=3, paper_releases=2, led_releases=1, duration=1.0)
+    with ThreadPoolExecutor(1) as executor:
+        laboratory = Laboratory(tmp_path, PaperRecordings(None), executor, extent=extent)
+        laboratory.__dict__["mtm"] = Identified(truth, poses, truth.model, file)
+        section = reproduce_figure_5(laboratory)
+    page = write_page(tmp_path, [section], []).read_text()
+    assert len(section.figures) == 2
+    assert all((tmp_path / figure).read_bytes().startswith(b"\x89PNG") for figure in section.figures)
+    drift = {row[0]: row[1:] for row in section.tables[0].rows}
+    assert [float(x) for x in drift["published, five trials (mean)"][1:]] == list(published.FIGURE_5_MEANS)
+    assert drift["ours, share held"] == ("1.000",) * 7
+    assert "3 of 3 (100.0 %" in page
+    # Its torque is exact, so its error is 0 in the table that says why, and the paper's method's is not.
+    torques = {row[0]: np.array(row[1:], float) for row in section.tables[1].rows}
+    np.testing.assert_array_equal(torques["ours"], 0.0)
+    assert torques["the paper's"].max() > 0.01

@@ -39,8 +39,8 @@ class Extent:
     collected: int = 40
     releases: int = 200
     paper_releases: int = 20
-    led_releases: int = 40
-    psm_releases: int = 40
+    led_releases: int = 20
+    psm_releases: int = 20
     duration: float = DURATION
 
 
