@@ -102,7 +102,7 @@ class SampledLoop:
     def poles(self, gains: Gains) -> NDArray[np.complex128]:
         """Of the closed loop, in s [rad/s]: log(z) / period, the slowest to decay first; of a delay -infinity."""
         z = np.linalg.eigvals(self.closed_loop(gains)).astype(complex)
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             s = np.log(z) / self._sampling.period
         return s[np.argsort(-s.real)]
 
