@@ -52,6 +52,6 @@ def _wrong_sign(joints: Recording, arm: Arm) -> list[Finding]:
         what = f"efforts are opposite to the gravity torque of the model file (correlation {cosine[j]:.2f})"
         advice = "efforts must be positive towards +q, and --gravity must be that of the mounting"
         findings.append(
-            Finding("warning", "effort sign", arm.joint_names[j], what, advice, (int(j),), float(cosine[j]))
+            Finding("refusal", "effort sign", arm.joint_names[j], what, advice, (int(j),), float(cosine[j]))
         )
     return findings

@@ -24,6 +24,8 @@ LEAST_COVERAGE = 0.1
 LIMIT_MARGIN = 0.005, 0.0005
 #: A motion's effort beyond its limit by this factor is a spike of the measurement, whatever the limit's own error.
 IMPOSSIBLE_EFFORT = 5.0
+#: Nor does it go so far beyond the stops of its linkage [rad].
+IMPOSSIBLE_EXCESS = 0.3
 #: Fewest rows in a flat top, and share of all rows that make it one: an effort that stays at its extreme is clipped.
 FLAT_ROWS, FLAT_SHARE = 5, 0.002
 #: Times that q and qd contradict by more than this factor are in another unit or at another rate.
@@ -103,7 +105,13 @@ def _positions(joints: Recording, arm: Arm, numbers: tuple[JointSignals, ...]) -
         )
         advice = "there it may press on a stop, and its effort is not the arm's own; check its zero and its limits"
         moved = tuple(int(j) for j in np.flatnonzero(A[i]))
-        findings.append(Finding("warning", "outside limits", names[i], what, advice, moved, float(excess[row, i])))
+        severity: Severity = "warning"
+        if i >= arm.num_joints and excess[row, i] > IMPOSSIBLE_EXCESS:
+            severity = "refusal"
+            advice = (
+                "no arm goes there, its links would cross: are these positions of actuators (--coordinates actuator)?"
+            )
+        findings.append(Finding(severity, "outside limits", names[i], what, advice, moved, float(excess[row, i])))
     still = [j for j, least in enumerate(arm.per_joint(*LEAST_RANGE)) if numbers[j].range < least]
     for j, joint in enumerate(numbers):
         if j in still:
@@ -118,6 +126,9 @@ def _positions(joints: Recording, arm: Arm, numbers: tuple[JointSignals, ...]) -
 
 
 def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str) -> list[Finding]:
+    if not np.any(tau):
+        advice = "the motors were off or are not recorded"
+        return [Finding("refusal", "no effort", "efforts", "all of them are always 0", advice)]
     findings = []
     for j, name in enumerate(arm.joint_names):
         if not np.any(tau[:, j]):

@@ -199,7 +199,7 @@ class Scenario:
             if fault := effect_fault(arm, law, POSITION_KINDS):
                 raise ScenarioError(f"effects[{i}].{fault}")
             _check_number(f"effects[{i}].coefficient", effect.coefficient, -1e3, 1e3)
-        if self.model.load_arm().joint_names != arm.joint_names:
+        if self.model.load_arm().name != arm.name:
             raise ScenarioError(f"controller.model {self.controller.model} is of {self.model.arm}, not of {self.arm}")
 
     def _check_targets(self, name: str, targets: list[Target], after: float) -> None:

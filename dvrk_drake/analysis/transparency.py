@@ -96,12 +96,19 @@ def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> Piecewi
     """The motion of a recording, inside the arm's limits, `speed` times as fast.
 
     Raises:
-        ScenarioError: no times, or no positive speed.
+        ScenarioError: no times, no positive speed, or a motion that leaves the limits by more than 0.1 rad or m.
     """
     if recording.t is None:
         raise ScenarioError(f"{recording.source}: has no times; a path needs column t")
     if not 0 < speed <= 10:
         raise ScenarioError(f"speed is {speed:g}; allowed: above 0, up to 10")
+    outside = np.max(np.maximum(arm.position_lower - recording.q, recording.q - arm.position_upper), axis=0)
+    if np.any(outside > 0.1):
+        j = int(np.argmax(outside))
+        raise ScenarioError(
+            f"{recording.source}: {arm.joint_names[j]} leaves the limits of {arm.name} by {outside[j]:.2g} rad or m; "
+            "is it a motion of this arm's joints?"
+        )
     t, keep = np.unique(recording.t, return_index=True)
     q = np.clip(recording.q[keep], arm.position_lower, arm.position_upper)
     return PiecewisePolynomial.CubicShapePreserving((t - t[0]) / speed, q.T, zero_end_point_derivatives=True)

@@ -94,7 +94,7 @@ def _compensations(options: argparse.Namespace, arm: Arm) -> list[Compensation]:
         if not equals or not name or name in models:
             raise ModelError(f"--model {given}: must be NAME=MODEL.yaml, each name once")
         models[name] = IdentifiedModel.load(path)
-        if models[name].load_arm().joint_names != arm.joint_names:
+        if models[name].load_arm().name != arm.name:
             raise ModelError(f"{path}: is of {models[name].arm}, not of {arm.name}")
     if not models:
         models["SDF"] = IdentifiedModel.from_arm(arm)

@@ -11,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.dynamics.nearest_links import nearest_links
-from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import make_arm_plant
 
 
@@ -40,6 +40,12 @@ def model_bodies(model: IdentifiedModel) -> ModelBodies:
     """
     arm = model.load_arm()
     left_out = _static_effects(model)
+    expected = load_arm(model.arm).gravity
+    if not np.allclose(arm.gravity, expected, atol=0.02):
+        gravity = ", ".join(f"{x:.3f}" for x in arm.gravity)
+        left_out.append(
+            f"gravity ({gravity}) m/s^2 in the base frame: set it in the world that the file is loaded into"
+        )
     if model.dynamics is None:
         base_values = np.array([p.value for p in model.base_parameters])
         return ModelBodies(nearest_links(arm, base_values), {}, left_out)
