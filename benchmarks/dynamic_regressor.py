@@ -21,6 +21,7 @@ import numpy as np
 import pinocchio
 from numpy.typing import NDArray
 from pydrake.multibody.plant import MultibodyPlant
+from timing import measured_times
 
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.arm import Arm, load_arm
@@ -72,17 +73,6 @@ def assert_same_torque(ours: DynamicRegressor, model: pinocchio.Model, motion: l
     without_rotors = ours.values.copy()
     without_rotors[10 * len(ours.links) :] = 0.0
     np.testing.assert_allclose(ours.torque(*motion, without_rotors), reference, rtol=0, atol=1e-10)
-
-
-def measured_times(functions: dict[str, Callable[[], object]], repetitions: int) -> dict[str, NDArray]:
-    """Seconds of each function, called in turn so that drift of the machine's speed hits all alike."""
-    times: dict[str, list[float]] = {name: [] for name in functions}
-    for _ in range(repetitions):
-        for name, function in functions.items():
-            start = time.perf_counter()
-            function()
-            times[name].append(time.perf_counter() - start)
-    return {name: np.array(values) for name, values in times.items()}
 
 
 def pinocchio_loop(model: pinocchio.Model, motion: list[NDArray]) -> Callable[[], None]:

@@ -11,12 +11,12 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pinocchio
 from pydrake.multibody.plant import MultibodyPlant
+from timing import measured_times
 
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
@@ -43,17 +43,6 @@ def build_pinocchio(arm: Arm, plant: MultibodyPlant) -> pinocchio.Model:
         model.appendBodyToJoint(index, pinocchio.Inertia(mass, com, I_Bcm), pinocchio.SE3.Identity())
         parent, p_parent = index, p
     return model
-
-
-def median_time(functions: dict[str, Callable[[], object]], repetitions: int) -> dict[str, float]:
-    """Median seconds of each function, called in turn so that drift of the machine's speed hits all alike."""
-    times: dict[str, list[float]] = {name: [] for name in functions}
-    for _ in range(repetitions):
-        for name, function in functions.items():
-            start = time.perf_counter()
-            function()
-            times[name].append(time.perf_counter() - start)
-    return {name: float(np.median(values)) for name, values in times.items()}
 
 
 def main() -> int:
@@ -100,8 +89,9 @@ def main() -> int:
             pinocchio.computeGeneralizedGravity(pin_model, pin_data, pose)
 
     model.regressor(q)
-    batch = median_time({"ours": lambda: model.regressor(q), "pinocchio": pinocchio_regressors}, 15)
-    single = median_time({"ours": single_ours, "pinocchio": single_pinocchio}, 15)
+    batches = measured_times({"ours": lambda: model.regressor(q), "pinocchio": pinocchio_regressors}, 15)
+    singles = measured_times({"ours": single_ours, "pinocchio": single_pinocchio}, 15)
+    batch, single = ({k: float(np.median(v)) for k, v in times.items()} for times in (batches, singles))
     result = {
         "derivation_s": derivation,
         "compilation_s": compilation,

@@ -12,6 +12,7 @@ import sys
 
 import numpy as np
 
+from dvrk_drake.analysis.effect_selection import StaticProblem
 from dvrk_drake.analysis.static_identification import identify_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
@@ -33,12 +34,15 @@ def main() -> int:
     arm = load_arm("mtmr")
     truth = compile_static_model(arm, tuple(TRUE_EFFECTS))
     beta = truth.gravity.base_values
-    base, effects, spurious = [], [], 0
+    theta = np.array([*beta, *TRUE_EFFECTS.values()])
+    base, effects, given, spurious = [], [], [], 0
     for seed in range(options.recordings):
         generator = np.random.default_rng(seed)
         q = arm.sample_poses(options.poses, generator, margin=0.05)
         tau = truth.torque(q, [*beta, *TRUE_EFFECTS.values()])
         tau += options.noise * arm.effort_limits * generator.normal(size=q.shape)
+        right = StaticProblem(arm, q, tau, np.ones(q.shape, dtype=bool)).fit(tuple(TRUE_EFFECTS)).fit
+        given.append(np.abs(right.theta - theta) < 1.96 * np.sqrt(np.diag(right.covariance)))
         model = identify_static(Recording(q=q, tau=tau, source=f"seed {seed}"), arm).model
         for estimate, value in zip(model.base_parameters, beta, strict=True):
             base.append(abs(estimate.value - value) < 1.96 * estimate.standard_error)
@@ -48,6 +52,8 @@ def main() -> int:
             effects.append(abs(e.value - (value or 0.0)) < 1.96 * e.standard_error)
     print(f"{options.recordings} recordings of {options.poses} poses, noise {options.noise:g} of the effort limit")
     print(f"95 % intervals hold the truth: base parameters {np.mean(base):.0%}, chosen effects {np.mean(effects):.0%}")
+    of_base, of_effects = np.mean(np.array(given)[:, : len(beta)]), np.mean(np.array(given)[:, len(beta) :])
+    print(f"the same, given which effects there are: base parameters {of_base:.0%}, effects {of_effects:.0%}")
     print(f"effects chosen that are not there: {spurious / options.recordings:.1f} a recording")
     return 0
 

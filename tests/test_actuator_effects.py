@@ -4,27 +4,30 @@ import numpy as np
 import pytest
 
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_coordinates, slides
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.effect_shapes import effect_shapes
 from dvrk_drake.models.arm import load_arm
 
 T = np.arange(0, 4, 1e-3)
 X = 0.3 * np.sin(2 * np.pi * 0.7 * T) + 0.1 * np.sin(2 * np.pi * 1.9 * T)
 V = np.gradient(X, 1e-3)
+LOAD = np.abs(np.cos(X))
 
 
 @pytest.mark.parametrize("kind", EFFECT_KINDS)
 def test_a_step_in_time_gives_the_column(kind):
     effect = ActuatorEffect("actuator.pitch", kind, 0.05)
     state, before, played = 0.0, X[0], []
-    for x, v in zip(X, V, strict=True):
-        state, shape = effect.step(state, x - before, x, v)
+    for x, v, load in zip(X, V, LOAD, strict=True):
+        state, shape = effect.step(state, x - before, x, v, load)
         played.append(shape)
         before = x
-    np.testing.assert_array_equal(played, effect.column(X, V))
+    np.testing.assert_array_equal(played, effect.column(X, V, LOAD))
 
 
 @pytest.mark.parametrize("kind", [kind for kind, what in EFFECT_KINDS.items() if what.dissipative])
 def test_friction_takes_energy_over_every_closed_path(kind):
-    column = ActuatorEffect("actuator.pitch", kind, 0.02).column(X, V)
+    column = ActuatorEffect("actuator.pitch", kind, 0.02).column(X, V, LOAD)
     # What a spring would still hold at the end is little beside what friction took on the way.
     work = np.sum(0.5 * (column[1:] + column[:-1]) * np.diff(X))
     assert work > 0
@@ -38,6 +41,21 @@ def test_a_presliding_element_is_a_spring_until_it_slips_and_remembers():
     np.testing.assert_allclose(shape[:50], path[:50] / d, atol=1e-12)
     assert shape[99] == 1.0
     np.testing.assert_allclose(shape[100:], 1 - (0.5 - path[100:]) / d, atol=1e-12)
+
+
+def test_friction_under_load_is_coulomb_times_what_the_arm_weighs_there():
+    """In the model and in the columns that identify it."""
+    arm = load_arm("psm")
+    regressor = DynamicRegressor(arm)
+    q = arm.sample_poses(40, np.random.default_rng(0))
+    v = np.random.default_rng(1).normal(size=q.shape)
+    rest = np.zeros_like(q)
+    weight = arm.transmission.inverse().pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
+    for i, name in enumerate(arm.joint_names):
+        plain, loaded = (ActuatorEffect(f"actuator.{name}", kind, 0.02) for kind in ("coulomb", "load coulomb"))
+        a, b = effect_shapes(regressor, [plain, loaded], q, v)
+        np.testing.assert_allclose(b, a * np.abs(weight[:, i]), atol=1e-12)
+    assert np.ptp(weight[:, 1]) > 0.1
 
 
 def test_effects_do_the_same_work_on_actuators_and_along_their_coordinate():

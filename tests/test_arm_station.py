@@ -326,5 +326,6 @@ def test_two_stations_in_one_diagram_and_again():
         simulator.AdvanceTo(0.01)
         context = simulator.get_context()
         q = [s.get_positions(s.GetMyContextFromRoot(context)) for s in (left, right)]
-        np.testing.assert_array_equal(*q)
+        # Mirror images, but for motor 4, which elbow and platform turn alike on both sides.
+        np.testing.assert_allclose(q[0], np.array([-1, 1, 1, -1, 1, -1, -1]) * q[1], atol=2e-5)
         assert np.any(q[0])

@@ -29,7 +29,7 @@ def folder(tmp_path_factory):
         tau += 0.003 * arm.effort_limits * generator.normal(size=q.shape)
         write_recording(Recording(q=q, tau=tau), folder / f"{name}.csv")
     command = ["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", f"{folder}/model.yaml"]
-    assert main([*command, "--plots", f"{folder}/plots"]) == 0
+    assert main([*command, "--plots", f"{folder}/plots", "--tables", f"{folder}/tables.txt"]) == 0
     return folder
 
 
@@ -50,6 +50,12 @@ def test_identify_writes_a_model_and_plots(folder):
     error = (model.holding_torque(q) - nominal.holding_torque(q)) / limits
     assert np.sqrt(np.mean(error[:, 1:6] ** 2, axis=0)).max() < 0.005
     assert {p.name for p in (folder / "plots").iterdir()} == {"torque_error.png", "predicted.png"}
+
+
+def test_identify_writes_its_tables(folder):
+    text = "".join((folder / "tables.txt").read_text().split())
+    for parameter in IdentifiedModel.load(folder / "model.yaml").base_parameters:
+        assert "".join(parameter.name.split()) in text
 
 
 def test_validate_writes_json(folder, capsys):

@@ -182,7 +182,7 @@ def test_run_prints_what_is_new_and_nothing_twice(controller, monkeypatch, capsy
             tell(LiveStatus(state, pace, problem))
 
     monkeypatch.setattr(
-        "dvrk_drake.cli.lcm.ready_controller", lambda options, mode, friction, reset: (controller, "", 1e-3)
+        "dvrk_drake.cli.lcm.ready_controller", lambda options, mode, friction, gains, reset: (controller, "", 1e-3)
     )
     monkeypatch.setattr("dvrk_drake.processes.control.control", control)
     monkeypatch.setattr("dvrk_drake.processes.control.ArmLink", lambda arm, url: None)

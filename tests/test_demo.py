@@ -6,12 +6,10 @@ import pytest
 from dvrk_drake.analysis import demo
 from dvrk_drake.analysis.collection import visiting_trajectory
 from dvrk_drake.analysis.true_arm import make_true_arm
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.models.recording import read_recording
-from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 
 
 @pytest.fixture(scope="module")
@@ -87,15 +85,3 @@ def test_trajectory_rests_at_each_pose_and_stays_inside_the_limits():
     assert not any(arm.limit_violations(trajectory.value(t).ravel(), tolerance=1e-9) for t in times)
     speed = max(np.abs(trajectory.EvalDerivative(t)).max() for t in times)
     assert speed < 1.7 + 1e-6
-
-
-def test_joint_effect_torque_is_minus_what_identification_calls_the_effect():
-    arm = load_arm("mtml")
-    effects = [ActuatorEffect("joint.wrist_pitch", "cable sine", 1.0), ActuatorEffect("actuator.elbow_pitch", "offset")]
-    system = JointEffectTorque(arm, effects, [0.2, 0.1])
-    context = system.CreateDefaultContext()
-    q = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
-    system.get_input_port().FixValue(context, np.concatenate([q, np.ones(7)]))
-    np.testing.assert_allclose(
-        system.get_output_port().Eval(context), [0, -0.1, -0.1, 0, -0.2 * np.sin(0.5), 0, 0], atol=1e-16
-    )

@@ -6,7 +6,7 @@ from real_arm import ARMS, Run, middle, weightless
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.effects_schema import ArmEffects, Cable, FrictionEffect
+from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect, FrictionEffect
 from dvrk_drake.systems.arm_station import ArmStation
 
 
@@ -71,6 +71,16 @@ def test_the_coupled_stop_gives_no_energy(direction):
     assert energy[1][-1] < 0.8 * energy[1][0] < energy[0][100]
 
 
+def test_a_cables_effort_is_minus_what_identification_calls_the_effect():
+    arm, q = load_arm("mtml"), np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
+    sine = DriveEffect("joint.wrist_pitch", "cable sine", 1.0, 0.2)
+    offset = DriveEffect("actuator.elbow_pitch", "offset", 0.0, 0.1)
+    run = Run(arm, ArmEffects(cables=[sine], springs=[offset]), q)
+    force = run.station.GetSubsystemByName("drive_force")
+    effort = force.get_output_port().Eval(force.GetMyContextFromRoot(run.context))[run.station._joints.index]
+    np.testing.assert_allclose(effort, [0, -0.1, -0.1, 0, -0.2 * np.sin(0.5), 0, 0], atol=1e-16)
+
+
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_cables_and_springs_give_back_what_they_take(name):
     """Round a closed path of the joints their work is nothing."""
@@ -78,7 +88,7 @@ def test_cables_and_springs_give_back_what_they_take(name):
     run = Run(arm, arm.effects.only(["cables", "springs"]))
     system = run.station.GetSubsystemByName("drive_force")
     context, index = system.CreateDefaultContext(), run.station._joints.index
-    phase = np.linspace(0, 2 * np.pi, 4001)
+    phase = np.linspace(0, 2 * np.pi, 2001)
     ranges = 0.4 * (arm.position_upper - arm.position_lower)
     q = middle(arm) + ranges * np.sin(np.outer(phase, np.arange(1, arm.num_joints + 1)) + 0.3)
     forces = []

@@ -4,10 +4,16 @@ import itertools
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
 from real_arm import ARMS, STEP, Run, weightless
 
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, EffortEffect, EncoderEffect
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.closed_loop import add_closed_loop
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 5])
@@ -116,3 +122,25 @@ def test_efforts_have_steps_and_noise():
     quiet = Run(arm, ArmEffects(effort=EffortEffect(command_resolution=effort.command_resolution)))
     quiet.fix("effort_commanded", command)
     np.testing.assert_allclose(inverse.T @ quiet.get("effort_measured"), 10 * steps, rtol=1e-9)
+
+
+@pytest.mark.parametrize("effects", [None, ArmEffects()])
+def test_a_controller_sees_the_arm_before_the_step_of_its_command(effects):
+    arm = load_arm("mtml")
+    model = IdentifiedModel.from_arm(arm)
+    builder = DiagramBuilder()
+    station, controller = ArmStation(arm, effects=effects), GravityPidController(model, mode="gravity")
+    add_closed_loop(builder, station, controller)
+    simulator = Simulator(builder.Build())
+    context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    station.set_positions(context, np.full(7, 0.3))
+    station.GetInputPort("mtml.effort_disturbance").FixValue(context, 0.2 * arm.effort_limits)
+    simulator.Initialize()
+    port, own = controller.GetOutputPort("effort"), controller.GetMyContextFromRoot(simulator.get_context())
+    for k in range(1, 30):
+        before = station.get_positions(context)
+        simulator.AdvanceTo(k * STEP)
+        now = station.get_positions(context)
+        limited = [np.clip(model.holding_torque(q), -arm.effort_limits, arm.effort_limits) for q in (before, now)]
+        np.testing.assert_allclose(port.Eval(own), limited[0], atol=1e-12)
+    assert np.abs(limited[1] - limited[0]).max() > 1e-6

@@ -12,6 +12,7 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.real_arm.dry_friction import RELAXATION
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ARMS)
 def test_friction_sticks_below_its_limit_and_does_not_creep(name):
     arm = weightless(name)
@@ -35,7 +36,7 @@ def test_friction_sticks_below_its_limit_and_does_not_creep(name):
     assert ripple < 5e-8
 
 
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def test_friction_slides_above_its_limit(name):
     arm = weightless(name)
     n = arm.num_joints
@@ -69,7 +70,7 @@ LAWS = {
 
 
 @pytest.mark.parametrize("law", ["the arm's", *LAWS])
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def test_friction_only_takes_energy(name, law):
     """Work on the friction, by what Drake says that it applies: never less than nothing, whatever the motion."""
     arm = weightless(name)

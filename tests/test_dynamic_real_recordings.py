@@ -14,7 +14,7 @@ from dvrk_drake.analysis.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic_validation import validate_motion
 from dvrk_drake.cli import main
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import write_recording
+from dvrk_drake.models.recording import read_recording, write_recording
 
 pytestmark = pytest.mark.slow
 
@@ -44,6 +44,7 @@ def percent(model, which):
 
 
 def test_phases_predict_each_other_better_than_the_published_model_another_motion(case):
+    """By models that know nothing of them: neither parameters nor effects nor how the base leans."""
     name, _, _, result = case
     error = percent(result.model, "rms_cross_validation")
     assert np.mean(error) <= TARGET[name]
@@ -88,6 +89,26 @@ def test_the_verbs_take_a_real_motion(case, tmp_path, capsys):
     ratio = np.linalg.norm((predicted - measured)[200:-200], axis=0) / np.linalg.norm(measured[200:-200], axis=0)
     assert np.all(ratio < 1)
     assert {p.name for p in plots.iterdir()} == {"efforts.png", "residuals.png", "error_budget.png"}
+
+
+def test_effects_that_hold_an_arm_make_no_joint_worse(case, shared_data):
+    """On poses of other years: an offset of a motion where weight acts is none at rest."""
+    name, _, _, result = case
+    if name != "mtmr":
+        pytest.skip("poses at rest were recorded of the MTM")
+    model = result.model
+    for file in ("mtmr_2017_sweep40.csv", "mtmr_2017_coupled12_may10.csv"):
+        poses = read_recording(shared_data / "mtm_static" / file)
+        theta = model.theta.copy()
+        theta[len(model.base_parameters) :] = 0.0
+        errors = [
+            np.sqrt(np.mean((tau - poses.measured_effort()) ** 2, axis=0))
+            for tau in (model.holding_torque(poses.q), model.static_model.torque(poses.q, theta))
+        ]
+        assert np.all(errors[0] <= 1.02 * errors[1] + 1e-4)
+        # Little is left of the weight at shoulder and elbow, and of the spring at the wrist pitch.
+        zero = np.sqrt(np.mean(poses.measured_effort() ** 2, axis=0))
+        assert np.all(errors[0][[1, 2, 4]] < [0.15 * zero[1], 0.35 * zero[2], 0.25 * errors[1][4]])
 
 
 def test_another_day_keeps_the_rigid_body(case, shared_data):

@@ -18,6 +18,7 @@ from dvrk_drake.dynamics.actuator_effects import (
     position_along,
     slides,
 )
+from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics
 from dvrk_drake.dynamics.static_model import compile_static_model
@@ -62,11 +63,25 @@ def case(request):
 
 
 def test_the_holding_torque_is_the_dynamics_at_rest(case):
+    """But for offsets where weight acts and no cable's cosine does: of all these, only the PSM's insertion has one."""
     arm, model, dynamics = case
+    kept = [e for e in dynamics.section.effects if (e.coordinate, e.kind) != ("actuator.insertion", "offset")]
+    assert len(dynamics.section.effects) - len(kept) == (arm.name == "PSM")
+    dynamics = DynamicModel(arm, dataclasses.replace(dynamics.section, effects=kept))
     q = arm.sample_poses(200, np.random.default_rng(0))
     at_rest = arm.transmission.pull_back_effort(dynamics.effort(q, 0 * q, 0 * q))
     assert np.ptp(dynamics.effect_effort(q, 0 * q), axis=0).min() > 0.1  # there is something to compare
     np.testing.assert_allclose(model.holding_torque(q), at_rest, rtol=0, atol=1e-10)
+
+
+def test_an_offset_holds_where_no_weight_acts():
+    """The MTM's outer yaw is vertical as it is expected to be mounted, also if a motion shows that it leans."""
+    _, model, _ = model_of_all_effects("mtmr", np.array([0.4, 0.2, 0.0]))
+    offsets = [e for e in model.dynamics.effects if e.kind == "offset" and e.coordinate.startswith("actuator.")]
+    level = [float(g) for g in load_arm("mtmr").gravity]
+    section = dataclasses.replace(model.dynamics, effects=offsets, gravity_expected=level)
+    holding = DynamicModel(load_arm("mtmr"), section).holding_effects
+    assert [offsets[i].coordinate for i in holding] == ["actuator.outer_yaw"]
 
 
 def test_of_a_loaded_file_too_and_what_contradicts_itself_is_refused(case, tmp_path):

@@ -173,7 +173,7 @@ def test_limits_hold_what_is_needed_and_what_the_motors_have():
     model = balanced()
     arm = model.load_arm()
     file = compensation_from_model(model)
-    tau = model.holding_torque(arm.sample_poses(20000, np.random.default_rng(12)))
+    tau = model.holding_torque(arm.sample_poses(100000, np.random.default_rng(12)))
     assert np.all((tau >= file.torque_lower) & (tau <= file.torque_upper))
     assert np.all(np.abs([file.torque_lower, file.torque_upper]) <= arm.effort_limits)
     # A tenth on both sides; the extremes of two samples differ by a few hundredths.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.gravity_compensation import CompensationOptions, compensation_from_model
+from dvrk_drake.dynamics.gravity_compensation import CompensationOptions, compensation_from_model, controller_torque
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import load_arm
@@ -48,6 +48,21 @@ def test_the_wrists_brackets_are_on_the_sides_that_files_of_real_arms_say(shared
     for name, serial in (("mtml", "MTML-22723"), ("mtml", "MTML-34863"), ("mtmr", "MTMR-32336")):
         file = GravityCompensationFile.load(folder / f"gc-{serial}.json")
         assert np.sign(p6(name)) == np.sign((file.positive + file.negative)[P6])
+
+
+def test_a_file_of_a_real_right_arm_mirrored_predicts_real_left_arms(shared_data):
+    folder = shared_data / "gc_json"
+    if not folder.is_dir():
+        pytest.skip(f"needs {folder}")
+    right = GravityCompensationFile.load(folder / "gc-MTMR-32336.json")
+    for serial in ("MTML-22723", "MTML-34863"):
+        left = GravityCompensationFile.load(folder / f"gc-{serial}.json")
+        q = np.random.default_rng(0).uniform(*left.sweep, (2000, 7))
+        q = q[np.abs(q[:, 1] + q[:, 2]) < 0.2]  # where the parallelogram lets both files' sweeps be
+        tau = controller_torque(left, q)
+        as_it_is = np.sqrt(np.mean((controller_torque(right, q) - tau) ** 2, axis=0))
+        mirrored = np.sqrt(np.mean((MIRROR * controller_torque(right, MIRROR * q) - tau) ** 2, axis=0))
+        assert np.all(mirrored[1:3] < 0.5 * as_it_is[1:3]) and mirrored[3] < as_it_is[3], (as_it_is, mirrored)
 
 
 def test_twice_mirrored_is_as_before_and_shapes_follow():

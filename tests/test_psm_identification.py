@@ -41,7 +41,6 @@ def recording(arm, true_arm):
         arm.sample_poses(COUNT, generator, margin=0.1),
         effort_noise=0.0,
         generator=generator,
-        effects=true_arm.effect_torque(),
         prepare=true_arm.prepare,
     )
 

@@ -1,5 +1,7 @@
 """`dvrk-drake study` as a user meets it: what is refused, in one line, before anything runs."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -103,6 +105,11 @@ def test_schedulers_that_are_none_are_refused(study, capsys, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra dask")
     assert "is no address of a scheduler; allowed: tcp://HOST:PORT" in refusal(capsys, study, "--scheduler", "here")
     assert "no Dask scheduler answers there" in refusal(capsys, study, "--scheduler", "tcp://127.0.0.1:1")
+
+
+def test_the_example_is_a_study():
+    study = load_study(Path(__file__).resolve().parents[1] / "examples" / "release_study.yaml")
+    assert len(study.cases) == 60
 
 
 def test_settings_of_the_command_line_come_after_the_files(study):

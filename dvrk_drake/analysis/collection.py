@@ -17,7 +17,6 @@ from dvrk_drake.models.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 
 #: Highest joint speed between poses [rad/s], [m/s].
 TRAVEL_SPEED = 1.7, 0.2
@@ -62,7 +61,6 @@ def collect_static_poses(
     *,
     effort_noise: float,
     generator: np.random.Generator,
-    effects: JointEffectTorque | None = None,
     prepare: Callable[[ArmStation, Context], None] = lambda station, context: None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Recording:
@@ -74,7 +72,6 @@ def collect_static_poses(
         poses: (m, n) inside the limits (steps 1 to 3).
         effort_noise: standard deviation of one effort sample as a share of the effort limit.
         generator: of the noise.
-        effects: torques at the joints beside the plant's own.
         prepare: called with the station and its context before the start, e.g. to change inertias.
         progress: called with the finished share, 0..1.
 
@@ -86,7 +83,7 @@ def collect_static_poses(
     trajectory, settled = visiting_trajectory(arm, poses)
     builder = DiagramBuilder()
     desired = TrajectorySource(trajectory, output_derivative_order=1)
-    add_closed_loop(builder, station, GravityPidController(model), desired, effects)
+    add_closed_loop(builder, station, GravityPidController(model), desired)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     prepare(station, context)

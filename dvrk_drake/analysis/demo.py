@@ -139,7 +139,6 @@ def run_demo(
             poses,
             effort_noise=EFFORT_NOISE,
             generator=generator,
-            effects=true_arm.effect_torque(),
             prepare=true_arm.prepare,
             progress=lambda share: progress(what, share),
         )
@@ -207,7 +206,7 @@ def _closed_loop(
     station, controller = true_arm.station(meshcat), GravityPidController(model)
     desired = ConstantVectorSource(_at_rest(q_start))
     builder = DiagramBuilder()
-    add_closed_loop(builder, station, controller, desired, true_arm.effect_torque())
+    add_closed_loop(builder, station, controller, desired)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     true_arm.prepare(station, context)

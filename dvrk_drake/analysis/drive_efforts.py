@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.motion_grid import MotionGrid
 from dvrk_drake.dynamics.actuator_effects import effect_coordinates
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
+from dvrk_drake.dynamics.effect_shapes import effect_shapes
 
 FrictionPart = Literal["dry", "viscous"]
 #: Which kinds of effects are friction, and of which part: what a change of temperature or of grease changes together.
-FRICTION_PARTS: dict[str, FrictionPart] = {"coulomb": "dry", "presliding": "dry", "viscous": "viscous"}
+FRICTION_PARTS: dict[str, FrictionPart] = {
+    **dict.fromkeys(("coulomb", "load coulomb", "stribeck", "presliding"), "dry"),
+    "viscous": "viscous",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +46,12 @@ def drive_efforts(model: DynamicModel, grid: MotionGrid) -> DriveEfforts:
     """What `model` expects of the motion on `grid`."""
     other = model.rigid_body_effort(grid.q, grid.v, grid.vd)
     friction: dict[tuple[str, FrictionPart], NDArray[np.float64]] = {}
-    a, a_dot = model.arm.transmission.position(grid.q), model.arm.transmission.velocity(grid.v)
     rows = effect_coordinates(model.arm)
-    for effect, coefficient in zip(model.effects, model.coefficients, strict=True):
+    shapes = effect_shapes(model.regressor, model.effects, grid.q, grid.v)
+    for effect, coefficient, shape in zip(model.effects, model.coefficients, shapes, strict=True):
         if not coefficient:
             continue
-        h = rows[effect.coordinate]
-        effort = coefficient * effect.column(a @ h, a_dot @ h)[:, None] * h
+        effort = coefficient * shape[:, None] * rows[effect.coordinate]
         if effect.kind in FRICTION_PARTS:
             key = (effect.coordinate, FRICTION_PARTS[effect.kind])
             friction[key] = friction.get(key, 0.0) + effort

@@ -1,4 +1,4 @@
-"""Effects in the drives and the direction of gravity, as a motion shows them; how well its phases predict each other."""
+"""Effects in the drives and the direction of gravity, as a motion shows them; how well phases predict each other."""
 
 from __future__ import annotations
 
@@ -88,28 +88,35 @@ def left_out_errors(
         IdentificationError: the solver did not converge.
     """
     problem, tilts = choice.problem, len(choice.problem.columns.tilts)
+    firsts = range(0, choice.selection.equations.folds, TOGETHER)
     parts = []
-    for first in range(0, choice.selection.equations.folds, TOGETHER):
-        selection = choice.selection.without(first, TOGETHER)
-        found = selection.choose(choice.start, problem.candidates)
-        parts.append((first, selection, found, selection.fit(found)))
-        progress(0.3 * (first + TOGETHER) / choice.selection.equations.folds)
-    used = np.unique(np.concatenate([found[found < problem.num_effects] for _, _, found, _ in parts]))
-    leaning = [(problem.columns.tilts[:, :, i] @ phi).T for i in range(len(problem.efforts))]
-    stacked = [np.hstack([problem.chosen_columns(i, used), X]) for i, X in enumerate(leaning)]
+    for first in firsts:
+        parts.append(_part(choice, first))
+        progress(0.3 * len(parts) / len(firsts))
+    used = np.unique(np.concatenate([chosen for chosen, _, _ in parts]))
+    leaning = ((problem.columns.tilts[:, :, i] @ phi).T for i in range(len(problem.efforts)))
+    stacked = (np.hstack([problem.chosen_columns(i, used), X]) for i, X in enumerate(leaning))
     equations = NormalEquations.of(stacked, problem.columns.tau, problem.fold, problem.edge)
     errors = np.zeros(len(problem.efforts))
-    for k, (first, selection, found, x) in enumerate(parts):
-        progress(0.4 + 0.6 * k / len(parts))
-        chosen = found[found < problem.num_effects]
+    for first, (chosen, weights, tilt) in zip(firsts, parts, strict=True):
+        progress(0.4 + 0.6 * first / equations.folds)
         kept = np.append(np.arange(problem.num_rigid), problem.num_rigid + np.searchsorted(used, chosen))
         # What gravity does that leans as these phases say, is taken from the efforts.
-        change = x[-tilts:] - problem.tilt if tilts else np.zeros(0)
+        change = tilt - problem.tilt[:tilts]
         T = np.zeros((equations.products.shape[-1], len(kept) + 1))
         T[kept, np.arange(len(kept))] = 1.0
         T[-1 - tilts :, -1] = np.append(-change, 1.0)
-        learnt = T.T @ equations.without(first, TOGETHER).total() @ T
-        predicted = T.T @ equations.of_folds(first, TOGETHER) @ T
-        y = ConsistentProgram(problem, chosen).solve(learnt, selection.weights)
+        learnt = T.T @ equations.without_fold(first, TOGETHER) @ T
+        predicted = T.T @ equations.of_fold(first, TOGETHER) @ T
+        y = ConsistentProgram(problem, chosen).solve(learnt, weights)
         errors += squared_errors(predicted, y)
     return errors
+
+
+def _part(choice: EffectChoice, first: int) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+    """Indices of the effects, weights of the actuators and tilt that the phases without a part say."""
+    problem = choice.problem
+    selection = choice.selection.without(first, TOGETHER)
+    found = selection.choose(choice.start, problem.candidates)
+    x = selection.fit(found)
+    return found[found < problem.num_effects], selection.weights, x[len(x) - len(problem.columns.tilts) :]

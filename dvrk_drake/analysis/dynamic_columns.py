@@ -18,6 +18,7 @@ from dvrk_drake.dynamics.actuator_effects import (
     slides,
 )
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.effect_shapes import effect_shapes
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 
@@ -82,12 +83,13 @@ def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
 
 
 def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """What a motion may show beside that: everything that an arm's file can name, and more friction at low speeds."""
+    """What a motion may show beside: what an arm's file can name, friction that grows at low speeds or with load."""
     effects = []
     for name, x, v in _coordinates(arm, grid):
         if v.std() == 0:
             continue
-        effects.append(ActuatorEffect(name, "stribeck", _rounded(DIRECTION_WIDTH * v.std())))
+        kinds = ["stribeck", "load coulomb"] if name.startswith("actuator.") else ["stribeck"]
+        effects += [ActuatorEffect(name, kind, _rounded(DIRECTION_WIDTH * v.std())) for kind in kinds]
         known = arm.motion.known_effects.get(name, [])
         for which in NAMED_EFFECTS:
             # Beside known torques by position, others say the same between the poses of a motion, and run apart beyond.
@@ -137,8 +139,7 @@ def dynamic_columns(
             # Efforts are linear in gravity: those at rest under a gravity of one are the derivative.
             lying = DynamicRegressor(arm.with_gravity([float(g) for g in axis]))
             tilts.append(_filtered(grid, lying.regressor(grid.q, rest, rest)[..., :p]))
-    coordinates = {name: (x, v) for name, x, v in _coordinates(arm, grid)}
-    on_grid = np.column_stack([effect.column(*coordinates[effect.coordinate]) for effect in effects])
+    on_grid = np.column_stack(list(effect_shapes(regressor, effects, grid.q, grid.v)))
     rows = np.array([effect_coordinates(arm)[effect.coordinate] for effect in effects])
     by_delay = {d: grid.behind_filter(grid.at_rows(on_grid, i)) for i, d in enumerate(grid.settings.effort_delay)}
     shapes = tuple(by_delay[d] for d in grid.settings.effort_delay)

@@ -61,11 +61,13 @@ def identify_dynamic(
 ) -> DynamicIdentification:
     """Identifies the dynamics of `arm` from a motion.
 
-    Efforts and all that explains them are compared behind the same low-pass. Every drive gets an offset and viscous,
-    smoothed Coulomb and presliding friction at its actuators and at the joints that actuators share; springs, cable
-    torques and friction that differs by direction are chosen by cross-validation over the phases of the motion. The
-    links' parameters are those nearest to the recording that bodies can have, the SDF's where it says nothing
-    (`consistent_parameters`). The direction of gravity is found along where the arm's file says that its base may tilt.
+    Efforts and all that explains them are compared behind the same low-pass. Every drive gets an offset, and viscous,
+    smoothed Coulomb and presliding friction at its actuators and at the joints that actuators share; springs, cables
+    and friction that differs by direction are there where the arm's files know of them, others are chosen by
+    cross-validation over the phases of the motion. The links' parameters are those nearest to the recording that bodies
+    can have, the SDF's where it says nothing (`consistent_parameters`). The direction of gravity is found along where
+    the arm's file says that its base may tilt. The cross-validated errors are of models that know nothing of the phases
+    they predict (`left_out_errors`).
 
     Args:
         recording: a motion with t and tau, in either coordinates.

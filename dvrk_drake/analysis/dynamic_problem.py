@@ -129,11 +129,11 @@ class DynamicProblem:
             phi: (p,) the parameters about which the tilt is linearised: if the arm's base may tilt, it is two unknowns
                 more, which follow the effects'. By default the tilt stays as it is.
         """
-        columns = [self._reduced_columns(i, phi) for i in range(len(self.efforts))]
+        columns = (self._reduced_columns(i, phi) for i in range(len(self.efforts)))
         left = self.columns.tau - self.rigid @ self.prior
         tilts = len(self.columns.tilts) if phi is not None else 0
-        if tilts:
-            left += np.column_stack([X[:, -tilts:] @ self.tilt for X in columns])
+        if phi is not None and tilts:
+            left += np.tensordot(self.tilt, self.columns.tilts @ phi, axes=(0, 0))
         informative = self._informative.shape[1]
         precision = [np.ones(informative), self.effect_precision, np.full(tilts, 1 / (9.81 * TILT_DEVIATION) ** 2)]
         non_negative = [effect.dissipative for effect in self.columns.effects]

@@ -129,8 +129,8 @@ def _print_base_parameters(console: Console, section: DynamicSection, full: bool
     untold = sum(p.told < LEAST_TOLD for p in rest)
     vague = sum(p.told >= LEAST_TOLD and abs(p.value) < 2 * p.standard_error for p in rest)
     console.print(
-        f"of {len(parameters)}: {len(rest) - untold - vague} more known to a half, {vague} not told from zero, "
-        f"{untold} that this motion tells less of than the SDF",
+        f"of {len(parameters)}: {len(rest) - untold - vague} more known to a half, {vague} not told from 0, "
+        f"{untold} better told by the SDF",
         style="dim",
         soft_wrap=True,
     )

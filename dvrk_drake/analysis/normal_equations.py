@@ -71,18 +71,14 @@ class NormalEquations:
         """(n, k + 1, k + 1) over the whole motion."""
         return self.products.sum(axis=(1, 2))
 
-    def of_fold(self, fold: int) -> NDArray[np.float64]:
-        """(n, k + 1, k + 1) over one fold."""
-        return self.products[:, fold].sum(axis=1)
+    def of_fold(self, fold: int, count: int = 1) -> NDArray[np.float64]:
+        """(n, k + 1, k + 1) over `count` folds from one on."""
+        return self.products[:, np.arange(fold, fold + count) % self.folds].sum(axis=(1, 2))
 
-    def of_folds(self, first: int, count: int) -> NDArray[np.float64]:
-        """(n, k + 1, k + 1) over `count` folds from `first` on."""
-        return self.products[:, np.arange(first, first + count) % self.folds].sum(axis=(1, 2))
-
-    def without_fold(self, fold: int) -> NDArray[np.float64]:
-        """(n, k + 1, k + 1) over all rows but those of one fold and those of its neighbours that touch it."""
-        before, after = (fold - 1) % self.folds, (fold + 1) % self.folds
-        return self.total() - self.of_fold(fold) - self.products[:, before, 2] - self.products[:, after, 0]
+    def without_fold(self, fold: int, count: int = 1) -> NDArray[np.float64]:
+        """(n, k + 1, k + 1) over all rows but those of `count` folds from one on and those of neighbours that touch."""
+        before, after = (fold - 1) % self.folds, (fold + count) % self.folds
+        return self.total() - self.of_fold(fold, count) - self.products[:, before, 2] - self.products[:, after, 0]
 
 
 def squared_errors(products: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:

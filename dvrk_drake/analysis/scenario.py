@@ -38,11 +38,13 @@ class ControllerScenario:
     `friction_ratio` is the share of the friction that the arm's files state which is compensated, 0..0.9; in mode
     "gravity" only. `parameter_error` makes the model wrong:
     each of its base parameters is multiplied by a factor of its own from 1 - `parameter_error`..1 + `parameter_error`,
-    drawn by the scenario's seed.
+    drawn by the scenario's seed. `knows` names those of "cables" and "springs" of the arm's own effects that the model
+    has beside the SDF; not for a model from a file.
     """
 
     mode: str = "hold"
     model: str = ""
+    knows: list[str] = field(default_factory=list)
     gains: Gains | None = None
     friction_ratio: float = 0.0
     parameter_error: float = 0.0
@@ -128,7 +130,8 @@ class Scenario:
     def model(self) -> IdentifiedModel:
         """What the controller believes."""
         file, error = self.controller.model, self.controller.parameter_error
-        model = IdentifiedModel.load(file) if file else IdentifiedModel.from_arm(self.mounted_arm)
+        known = [effect for part in self.controller.knows for effect in getattr(self.mounted_arm.effects, part)]
+        model = IdentifiedModel.load(file) if file else IdentifiedModel.from_arm(self.mounted_arm, known)
         if error == 0.0:
             return model
         # A stream of its own: the seed alone is the noise's.
@@ -182,6 +185,10 @@ class Scenario:
         self._check_targets("targets", self.targets, 0.0)
         self._check_targets("hand.path", self.hand.path, -1.0)
         self._check_hand()
+        for part in self.controller.knows:
+            _check_choice("controller.knows", part, ("cables", "springs"))
+        if self.controller.knows and self.controller.model:
+            raise ScenarioError("controller.knows is of a model from the arm's files; controller.model names another")
         _check_number("controller.friction_ratio", self.controller.friction_ratio, 0.0, 0.9)
         if self.controller.friction_ratio and self.controller.mode != "gravity":
             raise ScenarioError(f'controller.friction_ratio needs mode "gravity"; it is "{self.controller.mode}"')

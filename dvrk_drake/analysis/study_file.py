@@ -110,7 +110,10 @@ class Study:
             "scenarios": {name: dataclasses.asdict(scenario) for name, scenario in self.scenarios.items()},
             "models": [yaml_dump_typed(scenario.model) for scenario in self.scenarios.values()],
             "arms": [dataclasses.asdict(scenario.mounted_arm) for scenario in self.scenarios.values()],
-            "sdf": [tostring(compose_sdf(scenario.mounted_arm.sdf), "unicode") for scenario in self.scenarios.values()],
+            "sdf": [
+                tostring(compose_sdf(scenario.mounted_arm.sdf, scenario.mounted_arm.mirrored_links), "unicode")
+                for scenario in self.scenarios.values()
+            ],
             "cases": [dataclasses.astuple(case) for case in self.cases],
             "measures": [dataclasses.asdict(measure) for measure in self.measures],
         }

@@ -34,7 +34,7 @@ class ParquetStudyTable(StudyTable):
         if pyarrow is None:
             raise StudyError(f"{path}: Parquet needs pyarrow: pip install 'dvrk-drake[parquet]', or name a .csv")
         self._parquet = Path(path)
-        finished = _read(self._parquet, study) if self._parquet.exists() else {}
+        finished = _finished_rows(self._parquet, study) if self._parquet.exists() else {}
         super().__init__(f"{path}.rows.csv", study)
         self.rows.update(finished)
 
@@ -57,7 +57,7 @@ class ParquetStudyTable(StudyTable):
         return pyarrow.schema([(name, types.get(name, number)) for name in self._header])
 
 
-def _read(path: Path, study: Study) -> dict[int, Row]:
+def _finished_rows(path: Path, study: Study) -> dict[int, Row]:
     """The rows of a finished study."""
     try:
         content = pyarrow.parquet.read_table(path).to_pylist()

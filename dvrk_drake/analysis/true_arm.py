@@ -14,9 +14,9 @@ from pydrake.systems.framework import Context
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.plant import Closure, add_arm, set_joint_damping
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,13 @@ class TrueArm:
 
     def station(self, meshcat: Meshcat | None = None) -> ArmStation:
         """A station that simulates it, once `prepare` was called with a context."""
-        return ArmStation(self.arm, meshcat=meshcat, closure=self.closure, modify_plant=self._damp)
+        terms = zip(self.effects, self.coefficients, strict=True)
+        effects = ArmEffects(cables=[DriveEffect(e.coordinate, e.kind, e.scale, value) for e, value in terms])
+        return ArmStation(self.arm, meshcat=meshcat, closure=self.closure, modify_plant=self._damp, effects=effects)
 
     def prepare(self, station: ArmStation, context: Context) -> None:
         """Puts the true inertias into a station's context."""
         station.set_link_inertias(context, self.inertias)
-
-    def effect_torque(self) -> JointEffectTorque:
-        """A new system that plays the effects."""
-        return JointEffectTorque(self.arm, self.effects, self.coefficients)
 
     def _damp(self, plant: MultibodyPlant) -> None:
         set_joint_damping(plant, self.arm, self.damping)

@@ -31,7 +31,8 @@ def refuse_unusable(console: Console, recording: Recording, arm: Arm, warn: bool
         if finding.severity == "refusal" or (warn and finding.severity == "warning" and report.kind == "motion"):
             console.print(str(finding), style="yellow", markup=False, soft_wrap=True)
     if report.refusals:
-        raise RecordingError(f"{recording.source or 'recording'}: refused, see above and dvrk-drake check")
+        first = report.refusals[0]
+        raise RecordingError(f"{recording.source or 'recording'}: refused: {first.where}: {first.what}")
 
 
 def identify_motion(options: argparse.Namespace, recording: Recording, arm: Arm, plots: Path | None) -> None:

@@ -82,8 +82,8 @@ def _identify(options: argparse.Namespace) -> None:
         check_output(options.tables, options.recording, options.output)
     plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
-    refuse_unusable(console, recording, arm, warn=True)
     recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
+    refuse_unusable(console, recording, arm, warn=True)
     if moves:
         identify_motion(options, recording, arm, plots)
         return
@@ -126,8 +126,8 @@ def _validate(options: argparse.Namespace) -> None:
         check_output(options.json, options.recording, options.model)
     plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
-    refuse_unusable(console, recording, arm, warn=True)
     recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
+    refuse_unusable(console, recording, arm, warn=True)
     if moves and model.dynamics is not None:
         validate_in_motion(options, model, recording, plots)
         return
@@ -165,9 +165,8 @@ def _predict(options: argparse.Namespace) -> None:
     arm = model.load_arm()
     recording = read_recording(options.recording, arm, options.coordinates)
     print_notes(options.recording, recording.notes)
-    if recording.tau is not None:  # of poses a prediction needs none
-        refuse_unusable(make_console(), recording, arm, warn=True)
     if model.dynamics is not None and find_poses(recording, arm).moves:
+        refuse_unusable(make_console(), recording, arm, warn=True)
         tau = predict_motion(model, recording)
         if recording.coordinates == "joint":
             tau = arm.transmission.pull_back_effort(tau)

@@ -30,6 +30,7 @@ class EffectKind:
         scale: what `ActuatorEffect.scale` is of this kind; "" if it has none.
         dissipative: it takes energy in all motions, so its coefficient is not negative.
         revolute: only of a coordinate that turns.
+        loaded: its shape is times the load that the coordinate carries [N m, N].
         code: what the compiled step calls it, if it depends on velocity or has a state.
         of_position: (x, scale) -> the shape, if position is all that it depends on; such effects act at rest too.
     """
@@ -38,6 +39,7 @@ class EffectKind:
     scale: str = ""
     dissipative: bool = False
     revolute: bool = False
+    loaded: bool = False
     code: int = 0
     of_position: Callable[[sympy.Expr, sympy.Expr], sympy.Expr] | None = None
 
@@ -52,6 +54,8 @@ EFFECT_KINDS: dict[str, EffectKind] = {
     "stribeck": EffectKind("N m", _WIDTH, code=4),
     "presliding": EffectKind("N m", "travel until it slips [rad, m]", dissipative=True, code=5),
     "presliding forward": EffectKind("N m", "travel until it slips [rad, m]", code=6),
+    # Friction of gears and cables that press harder under load.
+    "load coulomb": EffectKind("1", _WIDTH, dissipative=True, loaded=True, code=2),
     # It pulls no more than at the travel that a recording covered: a straight line runs away outside of it.
     "spring": EffectKind(
         "N m/rad",
@@ -120,23 +124,30 @@ class ActuatorEffect:
         assert shape is not None, f"{self} depends on more than position"
         return shape(x, sympy.Integer(int(self.scale)) if self.scale.is_integer() else sympy.Float(self.scale))
 
-    def step(self, state: float, dx: float, x: float, v: float) -> tuple[float, float]:
+    def step(self, state: float, dx: float, x: float, v: float, load: float = 0.0) -> tuple[float, float]:
         """The next state, and the shape there: for a simulation.
 
         Args:
             state: dimensionless, 0 at the start; only the kinds of presliding have one.
             dx: travel of the coordinate since the last step [rad, m].
             x, v: its position [rad, m] and velocity now.
+            load: size of the effort that it carries [N m, N], of kinds that are loaded.
         """
         if self.kind in POSITION_KINDS:
             return state, float(_numeric(self.kind)(x, self.scale))
-        return effect_step(EFFECT_KINDS[self.kind].code, state, dx, v, self.scale)
+        kind = EFFECT_KINDS[self.kind]
+        state, shape = effect_step(kind.code, state, dx, v, self.scale)
+        return state, shape * load if kind.loaded else shape
 
-    def column(self, x: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The shape (m,) over a motion of the coordinate, x and v (m,), from state 0."""
+    def column(
+        self, x: NDArray[np.float64], v: NDArray[np.float64], load: NDArray[np.float64] | float = 0.0
+    ) -> NDArray[np.float64]:
+        """The shape (m,) over a motion of the coordinate, x and v (m,), from state 0; load: (m,), see `step`."""
         if self.kind in POSITION_KINDS:
             return np.array(np.broadcast_to(_numeric(self.kind)(x, self.scale), x.shape))
-        return _run(EFFECT_KINDS[self.kind].code, np.ascontiguousarray(x), np.ascontiguousarray(v), self.scale)
+        kind = EFFECT_KINDS[self.kind]
+        shape = _run(kind.code, np.ascontiguousarray(x), np.ascontiguousarray(v), self.scale)
+        return shape * load if kind.loaded else shape
 
 
 @cache

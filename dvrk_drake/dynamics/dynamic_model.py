@@ -7,12 +7,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.dynamics.actuator_effects import effect_coordinates, effect_fault
+from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, effect_coordinates, effect_fault
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
+from dvrk_drake.dynamics.effect_shapes import effect_shapes, nominal_weight
 from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES, LinkInertia, pseudo_inertia
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
+
+#: An actuator that needs no more than this at so many poses bears no weight [N m, N].
+LEAST_WEIGHT, WEIGHING_POSES = 1e-9, 20
 
 
 class DynamicModel:
@@ -48,6 +52,26 @@ class DynamicModel:
         """The identified links, to be written into a plant or an SDF."""
         return tuple(LinkInertia(link.link, np.array(link.parameters)) for link in self.section.links)
 
+    @cached_property
+    def holding_effects(self) -> tuple[int, ...]:
+        """Which effects act at rest as they do in motion.
+
+        Those of position alone, but for the offset of an actuator that bears weight: weight that is not modelled quite
+        right looks like one, and so does friction that differs by direction (the -0.22 N m at the shoulder of the
+        public MTM are not there at rest; the -0.07 N m at its outer yaw are). Where the coordinate has a cable's
+        cosine, the offset is part of that curve, and stays.
+        """
+        arm = self.arm.with_gravity(self.section.gravity_expected or self.section.gravity)
+        poses = arm.sample_poses(WEIGHING_POSES, np.random.default_rng(0))
+        weight = np.abs(nominal_weight(DynamicRegressor(arm), poses)).max(axis=0)
+        left_out = {f"actuator.{name}" for name, w in zip(arm.joint_names, weight, strict=True) if w > LEAST_WEIGHT}
+        left_out -= {e.coordinate for e in self.effects if e.kind == "cable cosine"}
+        return tuple(
+            i
+            for i, e in enumerate(self.effects)
+            if e.kind in POSITION_KINDS and (e.kind != "offset" or e.coordinate not in left_out)
+        )
+
     def rigid_body_effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
         """(m, n) efforts of the actuators [N m, N] without effects, from motions (m, n) of the joints."""
         tau = self.regressor.torque(q, v, vd, self.parameters)
@@ -55,13 +79,11 @@ class DynamicModel:
 
     def effect_effort(self, q: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
         """(m, n) efforts of the actuators [N m, N] against the effects, over an evenly sampled motion of the joints."""
-        a, a_dot = self.arm.transmission.position(q), self.arm.transmission.velocity(v)
         rows = effect_coordinates(self.arm)
-        tau = np.zeros(a.shape)
-        for effect, coefficient in zip(self.effects, self.coefficients, strict=True):
-            if coefficient:
-                h = rows[effect.coordinate]
-                tau += coefficient * effect.column(a @ h, a_dot @ h)[:, None] * h
+        tau = np.zeros(np.shape(q))
+        shapes = effect_shapes(self.regressor, self.effects, q, v)
+        for effect, coefficient, shape in zip(self.effects, self.coefficients, shapes, strict=True):
+            tau += coefficient * shape[:, None] * rows[effect.coordinate]
         return tau
 
     def effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:

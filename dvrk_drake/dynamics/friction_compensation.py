@@ -38,7 +38,7 @@ class Friction:
 
     @classmethod
     def of(cls, arm: Arm, effects: Sequence[ActuatorEffect], coefficients: ArrayLike) -> Friction:
-        """The dissipative ones among the effects of an arm; the others are left out.
+        """The dissipative ones among the effects of an arm; the others, and what depends on the load, are left out.
 
         Raises:
             ControllerError: an effect that the arm cannot have, or a coefficient of friction that is negative or no
@@ -47,7 +47,12 @@ class Friction:
         values = np.asarray(coefficients, float)
         if values.shape != (len(effects),):
             raise ControllerError(f"friction: {len(effects)} effects need as many coefficients, not {values.shape}")
-        kept = [k for k, effect in enumerate(effects) if effect.kind not in EFFECT_KINDS or effect.dissipative]
+        loaded = [kind for kind, what in EFFECT_KINDS.items() if what.loaded]
+        kept = [
+            k
+            for k, effect in enumerate(effects)
+            if effect.kind not in EFFECT_KINDS or (effect.dissipative and effect.kind not in loaded)
+        ]
         for k in kept:
             if fault := effect_fault(arm, effects[k]):
                 raise ControllerError(f"friction: {fault}")
@@ -58,12 +63,12 @@ class Friction:
 
     @classmethod
     def of_arm(cls, arm: Arm) -> Friction:
-        """What the arm's files state.
+        """What the arm's files state, without what falls with speed: compensated, it would push an arm that slides.
 
         Raises:
             ControllerError: they state none.
         """
-        effects = arm.effects.friction
+        effects = [effect for effect in arm.effects.friction if not effect.fall_speed]
         if not effects:
             raise ControllerError(f"friction: the files of {arm.name} state none")
         return cls.of(

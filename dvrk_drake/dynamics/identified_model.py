@@ -1,6 +1,7 @@
 """What an identification leaves behind: parameters with their uncertainty, and where they came from. Stored as YAML."""
 
 # No postponed annotations here: yaml_load_typed reads the types at run time.
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,7 @@ from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.effects_schema import DriveEffect
 
 
 @dataclass
@@ -87,8 +89,11 @@ class IdentifiedModel:
     dynamics: DynamicSection | None = None
 
     @classmethod
-    def from_arm(cls, arm: Arm) -> "IdentifiedModel":
-        """The model that the arm's SDF states: its own inertias, no effects."""
+    def from_arm(cls, arm: Arm, effects: Sequence[DriveEffect] = ()) -> "IdentifiedModel":
+        """The model that the arm's SDF states: its own inertias, and `effects` of position if any are given.
+
+        E.g. `arm.effects.cables + arm.effects.springs`, what the arm's files know of them.
+        """
         gravity = derive_gravity(arm)
         return cls(
             arm=arm.source,
@@ -97,6 +102,7 @@ class IdentifiedModel:
                 BaseParameterEstimate(name, float(value), 0.0, True)
                 for name, value in zip(gravity.base.names, gravity.base_values, strict=True)
             ],
+            effects=[ActuatorEffectEstimate(e.coordinate, e.kind, e.scale, e.coefficient, 0.0) for e in effects],
             joints=[JointStatistics(name=name) for name in arm.joint_names],
             provenance=Provenance(recording=" ".join(arm.sdf), method="nominal"),
         )
@@ -158,17 +164,10 @@ class IdentifiedModel:
 
     @property
     def holding_effects(self) -> list[ActuatorEffectEstimate]:
-        """The effects that act at rest as they do in motion: those of position alone.
-
-        An offset that a motion shows does not hold an arm: friction that differs by direction looks like one (the
-        -0.22 N m at the shoulder of the public MTM are not there at rest). Where the coordinate has a cable's cosine,
-        the offset is part of that curve, and stays.
-        """
+        """The effects that act at rest as they do in motion (`DynamicModel.holding_effects`)."""
         if self.dynamics is None:
             return self.effects
-        effects = self.dynamics.effects
-        curves = {e.coordinate for e in effects if e.kind == "cable cosine"}
-        return [e for e in effects if e.kind in POSITION_KINDS and (e.kind != "offset" or e.coordinate in curves)]
+        return [self.dynamics.effects[i] for i in self.dynamic_model.holding_effects]
 
     @property
     def theta(self) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""The wires between an arm's station, its controller, what is desired of it and the effects at its joints."""
+"""The wires between an arm's station, its controller and what is desired of it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pydrake.systems.framework import DiagramBuilder, System
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.joint_effect_torque import JointEffectTorque
 
 
 def add_closed_loop(
@@ -15,7 +14,6 @@ def add_closed_loop(
     station: ArmStation,
     controller: GravityPidController,
     desired: System | None = None,
-    effects: JointEffectTorque | None = None,
     friction: FrictionCompensator | None = None,
 ) -> None:
     """Adds all that is given to `builder` and connects it.
@@ -25,16 +23,10 @@ def add_closed_loop(
         station: the arm.
         controller: of an arm with the same joints.
         desired: a source with one output port: q_d, then v_d (2n,). Without it the controller holds where it starts.
-        effects: torques at the joints beside the plant's own.
         friction: takes a share of the arm's friction off a hand.
     """
     builder.AddSystem(station)
     connect_controller(builder, station, controller, desired, friction)
-    if effects is not None:
-        name = station.arm.name.lower()
-        builder.AddSystem(effects)
-        builder.Connect(station.GetOutputPort(f"{name}.state_estimated"), effects.get_input_port())
-        builder.Connect(effects.get_output_port(), station.GetInputPort(f"{name}.effort_disturbance"))
 
 
 def connect_controller(

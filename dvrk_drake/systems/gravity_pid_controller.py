@@ -49,8 +49,9 @@ class GravityPidController(LeafSystem):
     - `fault` (1): 1 while `state_estimated` (or a `desired_state` that is read) is not finite or beyond 1e6, else 0.
 
     **Time.** Inputs are sampled and the outputs change every `period` seconds, and at initialization, which
-    also empties the integrator and latches the pose. Beside a discrete plant of the same period the command
-    is therefore one period late, as it is on hardware. A forced discrete update is the same step, for loops
+    also empties the integrator and latches the pose. Beside a discrete plant of the same period without sampled
+    output ports, as that of ArmStation, the command is therefore one period late, as it is on hardware; beside one that
+    has them, Drake's default, it is not: such a plant steps first. A forced discrete update is the same step, for loops
     that are driven by messages. Gains and mode are part of the Context and can be changed while running.
 
     **Saturation.** `effort` is clamped to the effort limits. Anti-windup is by conditional integration

@@ -42,7 +42,7 @@ class Condition:
     ticks: int = 0
 
 
-NOMINAL = Condition("as modelled")
+NOMINAL = Condition("modelled")
 
 
 @dataclass(frozen=True, eq=False)

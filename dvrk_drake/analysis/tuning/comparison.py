@@ -17,11 +17,11 @@ from dvrk_drake.models.arm_schema import Gains
 DURATION, REST = 2.0, 0.4
 CONDITIONS = (
     NOMINAL,
-    Condition("gravity +20 %", gravity=1.2),
-    Condition("gravity -20 %", gravity=0.8),
-    Condition("inertia +20 %", inertia=1.2),
-    Condition("inertia -20 %", inertia=0.8),
-    Condition("1 tick later", ticks=1),
+    Condition("G +20 %", gravity=1.2),
+    Condition("G -20 %", gravity=0.8),
+    Condition("M +20 %", inertia=1.2),
+    Condition("M -20 %", inertia=0.8),
+    Condition("+1 tick", ticks=1),
 )
 #: Poses of the joint box, and the seed that draws them.
 POSES, SEED = 6, 3

@@ -50,22 +50,23 @@ def print_procedure(console: Console, arm: Arm, joints: tuple[JointProcedure, ..
 
 def print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
     """What the model says of each joint, and the gains that follow."""
-    columns = ("joint", "inertia", "rad/s", "phase margin", "gain margin", "Kp", "Kv", "Ki", "limited by")
+    columns = ("joint", "inertia", "rad/s", "phase", "gain", "Kp", "Kv", "Ki", "limited by")
     table = make_table(f"{arm.name} by the model", *columns)
     for name, fact, joint in zip(arm.joint_names, design.facts, design.joints, strict=True):
         table.add_row(
             name,
-            "{:.3g} .. {:.3g}".format(*fact.inertia),
+            "{:.3g}..{:.3g}".format(*fact.inertia),
             f"{joint.frequency:.1f}",
-            " .. ".join(f"{np.degrees(margins.phase):.0f}" for margins in joint.margins) + " deg",
-            " .. ".join(f"{margins.gain:.1f}" for margins in joint.margins),
+            "..".join(f"{np.degrees(margins.phase):.0f}" for margins in joint.margins),
+            "..".join(f"{margins.gain:.1f}" for margins in joint.margins),
             *(f"{value:.3g}" for value in (joint.kp, joint.kd, joint.ki)),
             joint.limited_by,
         )
     console.print(table)
     console.print(
         "inertia in the joint box: least, all other joints free, and largest, all others held [kg m^2; kg]; margins\n"
-        f"at these. All frequencies were multiplied by {design.slowed:.2f}, so that all joints are stable together.\n"
+        "of phase [deg] and gain: there. Limited by other joints: slower than alone, so that all are stable at once.\n",
+        markup=False,
     )
 
 
@@ -75,14 +76,15 @@ def print_comparison(console: Console, comparison: Comparison) -> None:
     console.print(
         f"All joints of {arm.name} step at once, from {poses} poses. Settling time [s]: afterwards the joint stays\n"
         f"inside its band, 2 % of the step or a count of its encoder; the slowest pose; n/{poses}: from n poses it\n"
-        f"has not settled in {DURATION - REST:g} s. Overshoot, error left, unrest (peak to peak of effort at rest,\n"
-        "over its limit): the worst pose, arm as modelled.\n"
+        f"has not settled in {DURATION - REST:g} s. Overshoot, what is left, unrest (peak to peak of effort at rest,\n"
+        "over its limit): the worst pose, arm as modelled. G, M: true gravity torque, true inertia over the model's.\n",
+        markup=False,
     )
     for j, joint in enumerate(arm.joint_names):
         unit, size = ("mm", step_size(arm)[j]) if arm.prismatic[j] else ("mrad", step_size(arm)[j])
         title = f"{joint}, step {1e3 * size:g} {unit}, band {1e3 * band(arm)[j]:.2g} {unit}"
         names = [condition.name for condition in comparison.conditions]
-        table = make_table(title, "", *names, "overshoot", "error left", "unrest")
+        table = make_table(title, "", *names, "overshoot", "left", "unrest")
         for which in comparison.gains:
             settling = comparison.table(which, "settling")[:, :, j]
             worst = [comparison.table(which, name)[0, :, j].max() for name in ("overshoot", "steady_error", "unrest")]
@@ -101,7 +103,7 @@ def print_comparison(console: Console, comparison: Comparison) -> None:
 def _print_poses(console: Console, comparison: Comparison) -> None:
     n = comparison.arm.num_joints
     table = make_table(
-        f"Joints of {n} that settle, mean settling time [s] of those: arm as modelled",
+        f"Joints of {n} that settle, and their mean settling time [s]",
         "pose [rad, m]",
         *comparison.gains,
     )

@@ -1,0 +1,109 @@
+"""Effects that drives are known to have, those that a motion must ask for, and parts that nothing is learnt from."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dvrk_drake.analysis.dynamic_columns import drive_effects, optional_effects
+from dvrk_drake.analysis.dynamic_selection import EffectSelection
+from dvrk_drake.analysis.normal_equations import NormalEquations
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm import load_arm
+
+FOLDS, ROWS = 12, 1200
+
+
+def arm_that_knows(**known):
+    arm = load_arm("psm")
+    return replace(
+        arm, motion=replace(arm.motion, known_effects={f"actuator.{j}": kinds for j, kinds in known.items()})
+    )
+
+
+def moving(arm):
+    q = arm.sample_poses(30, np.random.default_rng(0))
+    return SimpleNamespace(q=q, v=np.random.default_rng(1).normal(size=q.shape))
+
+
+def of(effects, coordinate):
+    return {(e.kind, e.scale if "cable" in e.kind else 0.0) for e in effects if e.coordinate == coordinate}
+
+
+def test_what_an_arms_file_knows_is_always_there_and_no_candidate():
+    arm = arm_that_knows(pitch=["cable 1"], jaw=["asymmetric friction"])
+    always, candidates = drive_effects(arm, moving(arm)), optional_effects(arm, moving(arm))
+    assert not set(always) & set(candidates)
+    assert {("cable sine", 1.0), ("cable cosine", 1.0)} <= of(always, "actuator.pitch")
+    # Beside a torque by position no other one is tried; friction is.
+    assert of(candidates, "actuator.pitch") == {(k, 0.0) for k in ("coulomb forward", "stribeck", "load coulomb")}
+    assert ("coulomb forward", 0.0) in of(always, "actuator.jaw")
+    assert {("spring", 0.0), ("cable sine", 2.0)} <= of(candidates, "actuator.jaw")
+    # What slides has no turns.
+    assert not any("cable" in kind for kind, _ in of(candidates, "actuator.insertion"))
+
+
+@pytest.mark.parametrize(
+    ("known", "message"),
+    [
+        (
+            {"pitch": ["magnet"]},
+            'actuator.pitch: unknown "magnet"; known: spring, cable 1, cable 2, asymmetric friction',
+        ),
+        ({"elbow": ["spring"]}, "unknown coordinate actuator.elbow; known: actuator.yaw"),
+        ({"insertion": ["cable 1"]}, "cable sine is of an angle, and actuator.insertion slides"),
+    ],
+)
+def test_what_no_arm_can_know_is_refused(known, message):
+    arm = arm_that_knows(**known)
+    with pytest.raises(ArmError, match=message):
+        drive_effects(arm, moving(arm))
+
+
+def equations(generator, true):
+    X = generator.normal(size=(ROWS, len(true)))
+    tau = X @ true + 0.3 * generator.normal(size=ROWS)
+    fold = np.arange(ROWS) * FOLDS // ROWS
+    place = np.arange(ROWS) * FOLDS % ROWS / ROWS
+    return X, tau, fold, np.column_stack([place < 0.1, place >= 0.9])
+
+
+def test_parts_are_left_out_with_the_rows_that_touch_them():
+    X, tau, fold, edge = equations(np.random.default_rng(0), np.ones(3))
+    whole = NormalEquations.of([X], tau[:, None], fold, edge)
+    for first in (0, 4, 10, 11):
+        out = np.isin(fold, [first, (first + 1) % FOLDS])
+        touches = ((fold == (first - 1) % FOLDS) & edge[:, 1]) | ((fold == (first + 2) % FOLDS) & edge[:, 0])
+        rows = np.column_stack([X, tau])
+        kept = rows[~(out | touches)]
+        np.testing.assert_allclose(whole.without_fold(first, 2)[0], kept.T @ kept, atol=1e-9)
+        np.testing.assert_allclose(whole.of_fold(first, 2)[0], rows[out].T @ rows[out], atol=1e-9)
+        others = whole.without(first, 2)
+        assert others.folds == FOLDS - 2
+        np.testing.assert_allclose(others.total()[0], kept.T @ kept, atol=1e-9)
+        # And again: a fold of the others, with what touches it.
+        second = others.without_fold(3)
+        out = fold == (first + 2 + 3) % FOLDS
+        touches |= ((fold == (first + 4) % FOLDS) & edge[:, 1]) | ((fold == (first + 6) % FOLDS) & edge[:, 0])
+        kept = rows[~(out | touches | np.isin(fold, [first, (first + 1) % FOLDS]))]
+        np.testing.assert_allclose(second[0], kept.T @ kept, atol=1e-9)
+
+
+def test_an_effect_that_is_there_is_chosen_and_noise_is_not():
+    """One column always, one that explains half of the effort, twenty of nothing; also without two of the parts."""
+    true = np.zeros(22)
+    true[:2] = 1.0
+    for seed in range(5):
+        X, tau, fold, edge = equations(np.random.default_rng(seed), true)
+        selection = EffectSelection(
+            equations=NormalEquations.of([X], tau[:, None], fold, edge),
+            efforts=np.array([[np.sum(tau[fold == f] ** 2)] for f in range(FOLDS)]),
+            rows=np.bincount(fold),
+            num_rigid=0,
+            precision=np.ones(len(true)),
+            non_negative=np.zeros(len(true), dtype=bool),
+            independent=0.1,
+        )
+        for part in (selection, selection.without(4, 2)):
+            np.testing.assert_array_equal(part.choose(np.array([0]), np.arange(1, 22)), [0, 1])
