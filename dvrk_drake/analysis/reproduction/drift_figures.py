@@ -107,8 +107,9 @@ def reproduce_figure_6(laboratory: Laboratory) -> Section:
         f"{share(paper.num_held, len(few))} of the poses, with ours at {share(ours.num_held, len(few))}. Zeroing "
         "hides wrong torques and adds no right ones: joint 5 still falls where the spring and the weight that it "
         "should balance exceed its friction.",
-        "What differs: the true arm's joints 6 and 7 carry what the recording of 72 poses shows of them, which is less "
-        "than their friction, so here they stay; the team's did not. See the true arm of Fig. 5.",
+        "What differs: of the weight of joints 6 and 7 the true arm has only what the recording of 72 poses shows, "
+        "which is about what their friction holds, so they drift less here than the team's did. See the true arm of "
+        "Fig. 5.",
     )
     return Section("fig6", "Fig. 6: drift after release, joints 5-7 zeroed", remarks, (table,), figures)
 
