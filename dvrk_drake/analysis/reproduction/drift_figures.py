@@ -74,10 +74,12 @@ def reproduce_figure_5(laboratory: Laboratory) -> Section:
         "by more than friction holds, as it does in Fig. 4, since unweighted least squares had other joints to "
         "please and the model no spring. What differs from the published drifts: the real trials began wherever a "
         "hand had put the arm, with hysteresis in its cables, and the friction here is that of another MTM.",
-        f"**Led there**, from {APPROACH[0]:g} rad beside and held for {RESTING:g} s, the arm is let go with loaded "
-        "friction, which gives way as the hold ends: ours then holds every joint at "
-        f"{share(led.num_held, len(led.positions))}; the joints that leave are {_any_lost(led)}. Joint 7's friction "
-        "gives by 15 mrad before it slips, so its letting go alone can use up what is allowed.",
+        f"**Led there**, from {APPROACH[0]:g} rad beside and held for {RESTING:g} s, the arm is let go with friction "
+        f"that the way has loaded. Then ours holds every joint at {share(led.num_held, len(led.positions))} only; "
+        f"the joints that leave are {_any_lost(led)}. Gravity compensation cannot know how friction is loaded: "
+        "hysteresis with a travel of 0.06-0.25 rad pushes joints 2 and 3 back and leaves less friction for what the "
+        "model errs by, and joint 7's friction gives by 15 mrad before it slips. An exact model is let down alike. "
+        "The published drifts of joints 2 and 3, up to 0.13 rad, are as large.",
         "**Without friction** nothing but an exact model holds an arm: an error of torque over the inertia of a "
         f"wrist is tens of rad/s^2. So, in {LOOSE_DURATION:g} s, both models let it run into its limits, the "
         f"paper's at all but {_num_staying(loose_paper)}, ours at all but {_num_staying(loose_ours)} of {len(few)} "
@@ -105,8 +107,9 @@ def reproduce_figure_6(laboratory: Laboratory) -> Section:
         f"{share(paper.num_held, len(few))} of the poses, with ours at {share(ours.num_held, len(few))}. Zeroing "
         "hides wrong torques and adds no right ones: joint 5 still falls where the spring and the weight that it "
         "should balance exceed its friction.",
-        "What differs: the true arm's joints 6 and 7 carry what the recording of 72 poses shows of them, which is less "
-        "than their friction, so here they stay; the team's did not. See the true arm of Fig. 5.",
+        "What differs: of the weight of joints 6 and 7 the true arm has only what the recording of 72 poses shows, "
+        "which is about what their friction holds, so they drift less here than the team's did. See the true arm of "
+        "Fig. 5.",
     )
     return Section("fig6", "Fig. 6: drift after release, joints 5-7 zeroed", remarks, (table,), figures)
 

@@ -33,6 +33,7 @@ def reproduce_psm(laboratory: Laboratory) -> Section:
     drawn = laboratory.release("psm", psm.truth, nominal, poses, "PSM: releasing the model as drawn")
     _plot(laboratory.folder / _FILE, ours, drawn)
     names = ours.arm.joint_names
+    untrusted = [joint.name for joint in psm.model.joints if joint.trust == 0.0]
     rows = (
         ("model as drawn (mean)", *numbers(np.abs(drawn.final).mean(axis=0), "{:.4f}")),
         ("ours (mean)", *numbers(np.abs(ours.final).mean(axis=0), "{:.4f}")),
@@ -47,8 +48,10 @@ def reproduce_psm(laboratory: Laboratory) -> Section:
         f"random pose inside the limits, watched for {extent.duration:g} s under gravity compensation alone. **Every "
         f"joint stays within {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm) at "
         f"{share(ours.num_held, len(poses))}** of the poses with ours, at {share(drawn.num_held, len(poses))} with "
-        "the model as drawn. Its linkage balances it and its friction is large beside its wrist's weight, so much "
-        "of that is friction's doing.",
+        "the model as drawn.",
+        f"`identify` gives no torque to {', '.join(untrusted) or 'no joint'}: what it measured there is below 2 % of "
+        "the effort limit or no better than zero. Friction alone must hold these, and where the spring of the roll "
+        "exceeds it, far from its middle, it does not.",
     )
     release = ResultTable("psm_release", "Absolute drift after release [rad; insertion m]", ("", *names), rows)
     shows = "PSM: largest drift of each release, sorted"

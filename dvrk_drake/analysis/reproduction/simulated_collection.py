@@ -18,7 +18,7 @@ from dvrk_drake.systems.arm_station import ArmStation
 
 #: From how far on either side a pose is approached, so that dry friction cancels [rad], [m].
 APPROACH = 0.2, 0.02
-#: Free at both ends of each range, as a share of it; and how far a person turns a handle or a roll [rad].
+#: Free at both ends of each range, as a share of it; and how far a handle is turned that turns more than twice [rad].
 MARGIN, REACH = 0.05, 1.6
 #: Poses that are collected in one go.
 _CHUNK = 10
@@ -39,7 +39,7 @@ def collect(
     """
     arm = load_arm(name)
     poses = arm.sample_poses(count, np.random.default_rng(seed), margin=MARGIN)
-    wide = (arm.position_upper - arm.position_lower > 2 * np.pi) & ~arm.prismatic
+    wide = (arm.position_upper - arm.position_lower > 4 * np.pi) & ~arm.prismatic
     poses[:, wide] = np.clip(poses[:, wide], -REACH, REACH)
     chunks = np.array_split(poses, -(-count // _CHUNK))
     futures = [executor.submit(_collect_chunk, name, truth.arm, c, seed + i) for i, c in enumerate(chunks)]
