@@ -50,16 +50,16 @@ def test_each_compensation_takes_more_off_the_hand():
 
 def test_the_path_of_a_recording_keeps_inside_the_limits_and_has_its_speed():
     t = np.linspace(3.0, 5.0, 50)
-    q = REST + 2.0 * np.sin(t)[:, None]
+    middle, half = (ARM.position_upper + ARM.position_lower) / 2, (ARM.position_upper - ARM.position_lower) / 2
+    q = middle + (half + 0.05) * np.sin(t)[:, None]
     path = recorded_path(ARM, Recording(q=q, t=t, tau=np.zeros_like(q)), speed=0.5)
     assert path.start_time() == 0 and path.end_time() == pytest.approx(4.0)
     values = np.array([path.value(x).ravel() for x in np.linspace(0, 4, 500)])
     assert np.all(values <= ARM.position_upper + 1e-12) and np.all(values >= ARM.position_lower - 1e-12)
-    np.testing.assert_allclose(
-        path.value(2.0).ravel()[3:],
-        np.clip(REST + 2 * np.sin(4.0), ARM.position_lower, ARM.position_upper)[3:],
-        atol=1e-3,
-    )
+    expected = np.clip(middle + (half + 0.05) * np.sin(4.0), ARM.position_lower, ARM.position_upper)
+    np.testing.assert_allclose(path.value(2.0).ravel(), expected, atol=2e-3)
+    with pytest.raises(ScenarioError, match="leaves the limits of MTML"):
+        recorded_path(ARM, Recording(q=middle + (half + 0.2) * np.sin(t)[:, None], t=t, tau=np.zeros_like(q)))
     with pytest.raises(ScenarioError, match="speed is 0"):
         recorded_path(ARM, Recording(q=q, t=t, tau=np.zeros_like(q)), speed=0)
     with pytest.raises(ScenarioError, match="no times"):
