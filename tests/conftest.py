@@ -7,6 +7,35 @@ from pathlib import Path
 
 import pytest
 
+#: Files of which CI runs one Python only: what they test uses nothing of Drake that differs between its versions.
+ONE_PYTHON = (
+    *(
+        "test_collect",
+        "test_command_guard",
+        "test_convert",
+        "test_guard_",
+        "test_lcm_log",
+        "test_payload",
+        "test_pose_file",
+    ),
+    *(
+        "test_recalibration",
+        "test_record",
+        "test_static_identification",
+        "test_slow_parts",
+        "test_study",
+        "test_teacher",
+    ),
+    *("test_tuning", "test_whitening", "test_dynamic_identification", "test_dynamic_choice", "test_psm_identification"),
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks the tests of these files."""
+    for item in items:
+        if item.path.name.startswith(ONE_PYTHON):
+            item.add_marker("one_python")
+
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:

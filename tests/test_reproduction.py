@@ -9,6 +9,7 @@ import pytest
 from dvrk_drake.analysis.reproduction import published
 from dvrk_drake.analysis.reproduction.dh_table import published_row, recomputed_table, reproduce_table_1
 from dvrk_drake.analysis.reproduction.drift_figures import reproduce_figure_5
+from dvrk_drake.analysis.reproduction.felt import reproduce_transparency
 from dvrk_drake.analysis.reproduction.laboratory import Extent, Identified, Laboratory
 from dvrk_drake.analysis.reproduction.paper_parameters import paper_model, paper_torque, with_zeroed
 from dvrk_drake.analysis.reproduction.psm import mechanism_errors
@@ -302,3 +303,19 @@ def test_figure_5_writes_what_it_names_and_holds_with_an_exact_model(tmp_path):
     torques = {row[0]: np.array(row[1:], float) for row in section.tables[1].rows}
     np.testing.assert_array_equal(torques["ours"], 0.0)
     assert torques["the paper's"].max() > 0.01
+
+
+@pytest.mark.slow
+def test_the_hand_feels_less_with_each_compensation(tmp_path):
+    truth = unlike_its_drawing("mtml", tmp_path, seed=8)
+    file = tmp_path / "exact.yaml"
+    truth.model.save(file)
+    q = ARM.sample_poses(20, np.random.default_rng(9))
+    poses = Recording(q=q, tau=truth.model.holding_torque(q), source="computed")
+    with ThreadPoolExecutor(1) as executor:
+        laboratory = Laboratory(tmp_path, PaperRecordings(None), executor, extent=Extent(path_poses=2))
+        laboratory.__dict__["mtm"] = Identified(truth, poses, truth.model, file)
+        section = reproduce_transparency(laboratory)
+    force = [float(row[1]) for row in section.tables[0].rows]
+    assert force[0] > force[2] > force[3] > 0  # limp, ours, ours with friction compensation
+    assert (tmp_path / "transparency.png").read_bytes().startswith(b"\x89PNG")

@@ -6,7 +6,7 @@ import argparse
 
 from dvrk_drake.cli.support import ProgressBar, made_folder, quiet_drake, seed
 
-NAMES = ("table1", "fig4", "fig5", "fig6", "fig7", "psm")
+NAMES = ("table1", "fig4", "fig5", "fig6", "fig7", "psm", "transparency")
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:

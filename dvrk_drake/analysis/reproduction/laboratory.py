@@ -33,6 +33,7 @@ class Extent:
         paper_releases: the first of these, for the paper's parameters.
         led_releases: the first of these, for ours led there first.
         psm_releases: for the PSM.
+        path_poses: that a hand leads the arm through.
         duration: of a release [s].
     """
 
@@ -41,6 +42,7 @@ class Extent:
     paper_releases: int = 20
     led_releases: int = 20
     psm_releases: int = 20
+    path_poses: int = 5
     duration: float = DURATION
 
 

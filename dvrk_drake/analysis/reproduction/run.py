@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dvrk_drake.analysis.reproduction.dh_table import reproduce_table_1
 from dvrk_drake.analysis.reproduction.drift_figures import reproduce_figure_5, reproduce_figure_6
+from dvrk_drake.analysis.reproduction.felt import reproduce_transparency
 from dvrk_drake.analysis.reproduction.laboratory import Extent, Laboratory
 from dvrk_drake.analysis.reproduction.psm import reproduce_psm
 from dvrk_drake.analysis.reproduction.recordings import PaperRecordings
@@ -25,6 +26,7 @@ _MAKERS: dict[str, Callable[[Laboratory], Section]] = {
     "fig6": reproduce_figure_6,
     "fig7": reproduce_figure_7,
     "psm": reproduce_psm,
+    "transparency": reproduce_transparency,
 }
 #: What can be redone, in the order of the page.
 NAMES = tuple(_MAKERS)

@@ -1,0 +1,83 @@
+"""What an operator feels of the paper's arm: with nothing, with the paper's compensation, with ours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dvrk_drake.analysis.reproduction.laboratory import Laboratory
+from dvrk_drake.analysis.reproduction.report import ResultTable, Section
+from dvrk_drake.analysis.transparency import Compensation, Felt, feel, rambling_path
+from dvrk_drake.analysis.transparency_report import plot_transparency
+from dvrk_drake.dynamics.friction_compensation import Friction
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.arm import Arm, load_arm
+
+#: Share of the friction that is compensated in the last row.
+FRICTION_RATIO = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Lead:
+    """One hand on one arm, as a process can be given it; `model` is a file, "" for limp motors."""
+
+    name: str
+    arm: Arm
+    model: str
+    friction_ratio: float
+    poses: int
+    seed: int
+
+
+def led(lead: Lead) -> Felt:
+    """What the hand feels along a path through random poses."""
+    model = IdentifiedModel.load(lead.model) if lead.model else None
+    # Which friction there is, a controller knows from the same files as the arm; its weight it has to identify.
+    friction = Friction.of_arm(load_arm("mtml"))
+    compensation = Compensation(lead.name, model, lead.friction_ratio, friction)
+    path = rambling_path(lead.arm, lead.poses, seed=lead.seed)
+    return feel(lead.arm, path, compensation, effects=lead.arm.effects, seed=lead.seed)
+
+
+def reproduce_transparency(laboratory: Laboratory) -> Section:
+    """Leads the handle along one path with each compensation."""
+    mtm, paper = laboratory.mtm, laboratory.paper_file
+    poses, seed = laboratory.extent.path_poses, laboratory.seed
+    rows: list[tuple[str, Path | None, float]] = [
+        ("limp motors", None, 0.0),
+        ("the paper's compensation", paper, 0.0),
+        ("ours", mtm.file, 0.0),
+        (f"ours, friction {FRICTION_RATIO:g}", mtm.file, FRICTION_RATIO),
+    ]
+    leads = [Lead(name, mtm.truth.arm, str(model or ""), ratio, poses, seed) for name, model, ratio in rows]
+    felt = []
+    for one in laboratory.executor.map(led, leads):
+        felt.append(one)
+        laboratory.progress("a hand leads the MTM", len(felt) / len(leads))
+    plot_transparency(laboratory.folder / "transparency.png", mtm.truth.arm, felt)
+    table = ResultTable(
+        "transparency",
+        "What the hand must exert",
+        ("", "force, RMS [N]", "force, 95 % [N]", "torque, RMS [mN m]", "torque, 95 % [mN m]"),
+        tuple(_row(one) for one in felt),
+    )
+    remarks = (
+        "The paper wishes for it and gives no number: force and torque at the handle while a hand (a spring and damper "
+        "of a person's stiffness) leads the true arm along a path through random poses, slowly.",
+        mtm.truth.origin,
+        f"The last row also takes {FRICTION_RATIO:g} of the friction off the hand, less where what remains must hold "
+        "the arm against the error of the identified gravity (docs/friction_compensation.md).",
+    )
+    return Section(
+        "transparency",
+        "Transparency: what the operator feels",
+        remarks,
+        (table,),
+        {"transparency.png": "Force and torque of the hand over time"},
+    )
+
+
+def _row(felt: Felt) -> tuple[str, ...]:
+    force, torque = felt.peak()
+    values = (f"{felt.rms_force:.2f}", f"{force:.2f}", f"{1e3 * felt.rms_torque:.0f}", f"{1e3 * torque:.0f}")
+    return felt.name, *values
