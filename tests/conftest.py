@@ -26,6 +26,8 @@ ONE_PYTHON = (
         "test_study",
         "test_teacher",
     ),
+    *("test_gravity_compensation", "test_kinematic_compensation", "test_reproduction", "test_transparency", "test_leg"),
+    *("test_parameter_uncertainty", "test_nearest_links", "test_measures", "test_live_line", "test_dynamic_statics"),
     *("test_tuning", "test_whitening", "test_dynamic_identification", "test_dynamic_choice", "test_psm_identification"),
 )
 
