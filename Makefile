@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 # Which tests test-fast runs, as pytest's -m; TESTS= runs all of them, as CI does.
 TESTS ?= not slow
+# CI leaves out the PSM's collection, which is the MTM's again with another arm.
+RECORDINGS ?= tests/test_record_udp.py tests/test_collect_udp.py tests/test_collect_psm_udp.py
 BIN := $(VENV)/bin
 
 .PHONY: demo test test-fast test-udp test-recordings lint benchmark clean
@@ -19,9 +21,9 @@ test-fast: $(VENV)/.installed-test
 test-udp: $(VENV)/.installed-test
 	$(BIN)/python -m pytest tests/test_lcm_udp.py
 
-# Recordings over UDP, and collections of both arms from the first pose to the release: minutes that CI takes.
+# Recordings over UDP, and collections of both arms from the first pose to the release: minutes.
 test-recordings: $(VENV)/.installed-test
-	$(BIN)/python -m pytest tests/test_record_udp.py tests/test_collect_udp.py tests/test_collect_psm_udp.py
+	$(BIN)/python -m pytest $(RECORDINGS)
 
 lint: $(VENV)/.installed-lint
 	$(BIN)/ruff check .

@@ -9,7 +9,6 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
-from scipy.sparse import block_diag, csr_matrix, hstack, vstack
 from scipy.sparse.csgraph import connected_components
 
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_fault, joint_row
@@ -156,12 +155,12 @@ def _largest(
     corners = [np.array([1.0, *signs]) * error for signs in product((1.0, -1.0), repeat=len(error) - 1)]
     m, c = len(corners), len(rows)
     # Unknowns: the ratios, then the forces along the coordinates at each corner.
-    identity, limits = csr_matrix(np.eye(m * c)), csr_matrix(np.tile(np.diag(holding), (m, 1)))
+    identity, limits = np.eye(m * c), np.tile(np.diag(holding), (m, 1))
     done = linprog(
         np.concatenate([-np.ones(c), np.zeros(m * c)]),
-        A_ub=vstack([hstack([limits, identity]), hstack([limits, -identity])]),
+        A_ub=np.block([[limits, identity], [limits, -identity]]),
         b_ub=np.tile(holding, 2 * m),
-        A_eq=hstack([csr_matrix((m * len(error), c)), block_diag([rows.T] * m)]),
+        A_eq=np.hstack([np.zeros((m * len(error), c)), np.kron(np.eye(m), rows.T)]),
         b_eq=np.concatenate(corners),
         bounds=[*[(0.0, most)] * c, *[(None, None)] * (m * c)],
     )
