@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from paper_regressor import paper_regressor
 
 from dvrk_drake.analysis.reproduction import published
 from dvrk_drake.analysis.reproduction.dh_table import published_row, recomputed_table, reproduce_table_1
@@ -34,45 +35,6 @@ from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_sele
 from dvrk_drake.models.recording import Recording, read_recording
 
 ARM = load_arm("mtml")
-
-
-def paper_regressor(q):
-    """Y (7, 12) as the paper's section III.H has it, without g: written out by hand, nothing of ours."""
-    _, s2, s3, s4, s5, s6, s7 = np.sin(q)
-    _, c2, c3, c4, c5, c6, c7 = np.cos(q)
-    S, C = s2 * c3 + c2 * s3, c2 * c3 - s2 * s3
-    A, B = C * c5 - S * c4 * s5, C * s5 + S * c4 * c5
-    D, F = S * s4 * c6 + B * s6, B * c6 - S * s4 * s6
-    w = [
-        C,
-        S,
-        -(C * c4 * s5 + S * c5),
-        C * (c4 * c5 * c6 - s4 * s6) - S * s5 * c6,
-        C * c4,
-        C * s4,
-        S * s5 - C * c4 * c5,
-        S * s5 * s6 - C * (s4 * c6 + c4 * c5 * s6),
-        S * (c5 * s7 + s5 * s6 * c7) + C * (c4 * s5 * s7 - s4 * c6 * c7 - c4 * c5 * s6 * c7),
-        S * (s5 * s6 * s7 - c5 * c7) - C * (c4 * s5 * c7 + s4 * c6 * s7 + c4 * c5 * s6 * s7),
-    ]
-    Y = np.zeros((7, 12))
-    Y[1], Y[2, 2:] = [s2, -c2, *w], w
-    Y[3, 4:] = S * np.array(
-        [
-            s4 * s5,
-            -(c4 * s6 + c5 * c6 * s4),
-            -s4,
-            c4,
-            c5 * s4,
-            -(c4 * c6 - c5 * s4 * s6),
-            -(s4 * s5 * s7 + c4 * c6 * c7 - c5 * c7 * s4 * s6),
-            c7 * s4 * s5 - c4 * c6 * s7 + c5 * s4 * s6 * s7,
-        ]
-    )
-    Y[4, [4, 5, 8, 9, 10, 11]] = [-B, c6 * A, -A, -s6 * A, s7 * B - c7 * s6 * A, -(c7 * B + s6 * s7 * A)]
-    Y[5, [5, 9, 10, 11]] = [-D, -F, -c7 * F, -s7 * F]
-    Y[6, [10, 11]] = [s7 * D - c7 * A, -(s7 * A + c7 * D)]
-    return Y
 
 
 # Table I.
@@ -280,18 +242,22 @@ def test_psm_keeps_its_remote_centre_and_its_wrist_axes_apart():
     assert angle == pytest.approx(np.pi / 2, abs=1e-9)
 
 
-@pytest.mark.slow
-def test_figure_5_writes_what_it_names_and_holds_with_an_exact_model(tmp_path):
-    truth = unlike_its_drawing("mtml", tmp_path, seed=8)
-    file = tmp_path / "exact.yaml"
+def exact_laboratory(folder, executor, extent):
+    """One whose MTM was identified without any error."""
+    truth, file = unlike_its_drawing("mtml", folder, seed=8), folder / "exact.yaml"
     truth.model.save(file)
     q = ARM.sample_poses(20, np.random.default_rng(9))
     poses = Recording(q=q, tau=truth.model.holding_torque(q), source="computed")
+    laboratory = Laboratory(folder, PaperRecordings(None), executor, extent=extent)
+    laboratory.__dict__["mtm"] = Identified(truth, poses, truth.model, file)
+    return laboratory
+
+
+@pytest.mark.slow
+def test_figure_5_writes_what_it_names_and_holds_with_an_exact_model(tmp_path):
     extent = Extent(releases=3, paper_releases=2, led_releases=1, duration=1.0)
     with ThreadPoolExecutor(1) as executor:
-        laboratory = Laboratory(tmp_path, PaperRecordings(None), executor, extent=extent)
-        laboratory.__dict__["mtm"] = Identified(truth, poses, truth.model, file)
-        section = reproduce_figure_5(laboratory)
+        section = reproduce_figure_5(exact_laboratory(tmp_path, executor, extent))
     page = write_page(tmp_path, [section], []).read_text()
     assert len(section.figures) == 2
     assert all((tmp_path / figure).read_bytes().startswith(b"\x89PNG") for figure in section.figures)
@@ -307,15 +273,8 @@ def test_figure_5_writes_what_it_names_and_holds_with_an_exact_model(tmp_path):
 
 @pytest.mark.slow
 def test_the_hand_feels_less_with_each_compensation(tmp_path):
-    truth = unlike_its_drawing("mtml", tmp_path, seed=8)
-    file = tmp_path / "exact.yaml"
-    truth.model.save(file)
-    q = ARM.sample_poses(20, np.random.default_rng(9))
-    poses = Recording(q=q, tau=truth.model.holding_torque(q), source="computed")
     with ThreadPoolExecutor(1) as executor:
-        laboratory = Laboratory(tmp_path, PaperRecordings(None), executor, extent=Extent(path_poses=2))
-        laboratory.__dict__["mtm"] = Identified(truth, poses, truth.model, file)
-        section = reproduce_transparency(laboratory)
+        section = reproduce_transparency(exact_laboratory(tmp_path, executor, Extent(path_poses=2)))
     force = [float(row[1]) for row in section.tables[0].rows]
     assert force[0] > force[2] > force[3] > 0  # limp, ours, ours with friction compensation
     assert (tmp_path / "transparency.png").read_bytes().startswith(b"\x89PNG")
