@@ -15,13 +15,14 @@ from pathlib import Path
 from xml.etree.ElementTree import tostring
 
 import numpy as np
-from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+from pydrake.common.yaml import yaml_dump_typed
 
 from dvrk_drake.analysis.measures import KINDS, Measure
 from dvrk_drake.analysis.scenario import Scenario, check_pose, load_scenario
 from dvrk_drake.errors import DvrkDrakeError, StudyError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.sdf_model import compose_sdf
+from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 #: The columns of the results beside start and measures.
 RESERVED = ("study", "case", "variation", "pose", "seed", "error")
@@ -188,11 +189,7 @@ def load_study(path: str | Path, settings: Sequence[str] = ()) -> Study:
     """
     if not Path(path).is_file():
         raise StudyError(f"{path}: no such study file")
-    try:
-        study = yaml_load_typed(schema=Study, filename=str(path))
-    except Exception as error:
-        # yaml_load_typed raises many types, from YAML's to TypeError.
-        raise StudyError(f"{path}: {error}; {_known_keys()}") from error
+    study = load_typed_yaml(Study, path, StudyError, allowed=_known_keys())
     study.set = [*study.set, *settings]
     try:
         study.check()
@@ -219,4 +216,4 @@ def _known_keys() -> str:
     groups = {"random_poses": RandomPoses, "variations": Variation, "measures": Measure}
     texts = [f"in {key}: {', '.join(f.name for f in dataclasses.fields(schema))}" for key, schema in groups.items()]
     kinds = f"kinds of measures: {', '.join(KINDS)}"
-    return f"allowed: {', '.join(f.name for f in dataclasses.fields(Study))}; {'; '.join(texts)}; {kinds}"
+    return f"{', '.join(f.name for f in dataclasses.fields(Study))}; {'; '.join(texts)}; {kinds}"

@@ -11,7 +11,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.common.yaml import yaml_load_typed
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_schema import (
@@ -27,11 +26,11 @@ from dvrk_drake.models.arm_schema import (
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, compose_sdf, read_sdf_facts
+from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 #: A joint that slides further has its limits in another unit [m].
 LONGEST_TRAVEL = 2.0
 
-Schema = TypeVar("Schema", ArmDescription, Mechanism, Instrument)
 Part = TypeVar("Part", Mechanism, Instrument)
 
 
@@ -167,7 +166,7 @@ def _load_arm(name: str) -> Arm:
             raise ArmError(f'unknown arm "{name}"; known arms: {", ".join(known_arms())}')
     if not path.is_file():
         raise ArmError(f"{path}: no such arm file")
-    description = _load_yaml(ArmDescription, path)
+    description = load_typed_yaml(ArmDescription, path, ArmError)
     mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)
     instrument = Instrument()
     if description.instrument:
@@ -175,20 +174,12 @@ def _load_arm(name: str) -> Arm:
     return _build_arm(name, path, description, mechanism, instrument)
 
 
-def _load_yaml(schema: type[Schema], path: Path) -> Schema:
-    try:
-        return yaml_load_typed(schema=schema, filename=str(path))
-    except Exception as error:
-        # yaml_load_typed raises many types, from YAML's to KeyError; each text names the field.
-        raise ArmError(f"{path}: {error}") from error
-
-
 def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part:
     if name.endswith((".yaml", ".yml")):
         path = (arm_path.parent / name).resolve()
         if not path.is_file():
             raise ArmError(f"{arm_path}: {kind} {path}: no such file")
-        part = _load_yaml(schema, path)
+        part = load_typed_yaml(schema, path, ArmError)
         if part.sdf and not part.sdf.startswith(PACKAGE_URL):
             part.sdf = str(path.parent / part.sdf)
         return part
@@ -197,7 +188,7 @@ def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
         raise ArmError(f'{arm_path}: unknown {kind} "{name}"; known {kind}s: {known}, or the path of a YAML file')
-    return _load_yaml(schema, path)
+    return load_typed_yaml(schema, path, ArmError)
 
 
 def _build_arm(

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from pydrake.common.yaml import yaml_dump, yaml_load_typed
+from pydrake.common.yaml import yaml_dump
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 
 def load_gains(path: str | Path) -> Gains:
@@ -20,11 +21,7 @@ def load_gains(path: str | Path) -> Gains:
     """
     if not Path(path).is_file():
         raise ControllerError(f"{path}: no such file of gains")
-    try:
-        gains = yaml_load_typed(schema=Gains, filename=str(path))
-    except Exception as error:
-        # yaml_load_typed raises many types, from YAML's to KeyError; each text names the field.
-        raise ControllerError(f"{path}: not a file of gains: {error}; allowed: kp, kd, ki") from error
+    gains = load_typed_yaml(Gains, path, ControllerError, what="a file of gains", allowed="kp, kd, ki")
     for name, values in dataclasses.asdict(gains).items():
         if not values:
             raise ControllerError(f"{path}: {name} is missing; a file of gains has kp, kd and ki, one number a joint")

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.yaml import yaml_load_typed
 
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.recording import SAME_POSE, Recording
+from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 #: A pose written with few digits may stand on a limit [rad, m].
 _ROUNDING = 1e-9
@@ -36,11 +36,7 @@ def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
     """
     if not Path(path).is_file():
         raise CollectionError(f"{path}: no such file of poses; --teach or --random makes one")
-    try:
-        content = yaml_load_typed(schema=PoseFile, filename=str(path))
-    except Exception as error:
-        # yaml_load_typed raises many types, from YAML's to TypeError.
-        raise CollectionError(f"{path}: not a file of poses: {error}; allowed: format, arm, poses") from error
+    content = load_typed_yaml(PoseFile, path, CollectionError, what="a file of poses", allowed="format, arm, poses")
     if content.format != PoseFile.format:
         raise CollectionError(f'{path}: format is "{content.format}", this version reads "{PoseFile.format}"')
     if content.arm.lower() != arm.name.lower():
