@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.scenario import Scenario, Target, load_scenario
+from dvrk_drake.analysis.scenario import Scenario, Target
+from dvrk_drake.analysis.scenario_file import load_scenario
 from dvrk_drake.analysis.simulation import simulate
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel

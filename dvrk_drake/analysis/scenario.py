@@ -1,4 +1,4 @@
-"""What to simulate, as a file: the schema of a scenario, read strictly, and what of it makes no sense.
+"""What to simulate: the schema of a scenario, and what of it makes no sense; `scenario_file` reads it.
 
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
@@ -7,12 +7,10 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
 from dvrk_drake.dynamics.arm_frame import ArmFrame
@@ -21,7 +19,6 @@ from dvrk_drake.errors import ArmError, ScenarioError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
-from dvrk_drake.models.gains_file import load_gains
 from dvrk_drake.models.plant import Closure
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.hand import Grip
@@ -221,89 +218,6 @@ class Scenario:
             raise ScenarioError("hand.path needs two poses or more: from when to when the hand holds on")
         for grip in dataclasses.fields(Grip):
             _check_number(f"hand.{grip.name}", getattr(self.hand, grip.name), 1e-6, 1e6)
-
-
-def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
-    """Reads a scenario file, or makes the scenario of an arm that holds its home pose; changes it, and checks it.
-
-    Args:
-        arm_or_file: path of a YAML file, or the name of an arm.
-        settings: "key=value" in YAML; a dot goes into a group: "controller.mode=gravity", "targets=[...]".
-
-    Raises:
-        ScenarioError: the file cannot be read, has an unknown key, or asks for what makes no sense.
-    """
-    path = Path(arm_or_file)
-    if path.suffix in (".yaml", ".yml"):
-        if not path.is_file():
-            raise ScenarioError(f"{path}: no such scenario file")
-        try:
-            content = _parse(path.read_text(encoding="utf-8"), str(path))
-        except (OSError, UnicodeDecodeError) as error:
-            raise ScenarioError(f"{path}: not a text file in UTF-8: {error}") from error
-        if not isinstance(content, dict):
-            raise ScenarioError(f"{path}: must be keys and values; {_known_keys()}")
-        if "mechanism" in content:
-            raise ScenarioError(f"{path}: is an arm's file, not a scenario; give an arm's name and --set arm={path}")
-    else:
-        content = {"arm": arm_or_file}
-    for setting in settings:
-        _change(content, setting)
-    _load_gains_of(content)
-    for key, value in content.items():
-        try:
-            yaml_load_typed(schema=Scenario, data=yaml_dump({key: value}))
-        except Exception as error:
-            # yaml_load_typed raises many types, from RuntimeError to TypeError, and does not always name the key.
-            raise ScenarioError(f"{arm_or_file}: {key}: {error}; {_known_keys()}") from error
-    scenario = yaml_load_typed(schema=Scenario, data=yaml_dump(content))
-    try:
-        scenario.check()
-    except ScenarioError as error:
-        raise ScenarioError(f"{arm_or_file}: {error}") from error
-    return scenario
-
-
-def _load_gains_of(content: dict[str, Any]) -> None:
-    """Puts what is in a file of gains in the place of its name."""
-    controller = content.get("controller")
-    if isinstance(controller, dict) and isinstance(controller.get("gains"), str):
-        controller["gains"] = dataclasses.asdict(load_gains(controller["gains"]))
-
-
-def _change(content: dict[str, Any], setting: str) -> None:
-    key, equals, value = setting.partition("=")
-    if not equals or not key:
-        raise ScenarioError(f'--set {setting}: must be key=value, e.g. "duration=2" or "controller.mode=gravity"')
-    *groups, last = key.strip().split(".")
-    group: Any = content
-    for name in groups:
-        group = group.setdefault(name, {})
-        if not isinstance(group, dict):
-            raise ScenarioError(f"--set {setting}: {name} has no keys of its own; {_known_keys()}")
-    group[last] = _parse(value, f"--set {setting}")
-
-
-def _parse(text: str, where: str) -> Any:
-    try:
-        return yaml_load(data=text)
-    except Exception as error:
-        raise ScenarioError(f"{where}: not YAML: {error}") from error
-
-
-def _known_keys() -> str:
-    def names(schema: type) -> str:
-        return ", ".join(f.name for f in dataclasses.fields(schema))
-
-    groups = {
-        "controller": ControllerScenario,
-        "controller.gains": Gains,
-        "targets": Target,
-        "effects": DriveEffect,
-        "stretch.<actuator>": Cable,
-        "hand": HandScenario,
-    }
-    return f"allowed: {names(Scenario)}; " + "; ".join(f"in {key}: {names(schema)}" for key, schema in groups.items())
 
 
 def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:

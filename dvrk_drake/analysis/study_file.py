@@ -18,7 +18,8 @@ import numpy as np
 from pydrake.common.yaml import yaml_dump_typed
 
 from dvrk_drake.analysis.measures import KINDS, Measure
-from dvrk_drake.analysis.scenario import Scenario, check_pose, load_scenario
+from dvrk_drake.analysis.scenario import Scenario, check_pose
+from dvrk_drake.analysis.scenario_file import load_scenario
 from dvrk_drake.errors import DvrkDrakeError, StudyError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.sdf_model import compose_sdf

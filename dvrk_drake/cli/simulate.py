@@ -32,7 +32,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.scenario import load_scenario
+    from dvrk_drake.analysis.scenario_file import load_scenario
     from dvrk_drake.analysis.simulation import simulate
     from dvrk_drake.analysis.tables import make_console, print_simulation
     from dvrk_drake.models.recording import write_recording
