@@ -23,8 +23,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from dvrk_drake.analysis.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.dynamic_validation import validate_motion
+from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
 from dvrk_drake.models.arm import Arm, load_arm

@@ -12,8 +12,8 @@ import sys
 
 import numpy as np
 
-from dvrk_drake.analysis.effect_selection import StaticProblem
-from dvrk_drake.analysis.static_identification import identify_static
+from dvrk_drake.analysis.static.effect_selection import StaticProblem
+from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.models.arm import load_arm

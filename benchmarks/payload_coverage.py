@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvrk_drake.analysis.payload import estimate_payload
+from dvrk_drake.analysis.payload.payload import estimate_payload
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 from loaded_arm import two_days

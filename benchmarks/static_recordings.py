@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from dvrk_drake.analysis.static_identification import identify_static
-from dvrk_drake.analysis.validation import validate
+from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.analysis.static.validation import validate
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import Recording, read_recording

@@ -2,7 +2,7 @@
 
 import sys
 
-from dvrk_drake.analysis.static_identification import identify_static
+from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import read_recording
 

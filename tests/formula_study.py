@@ -8,8 +8,8 @@ import time
 
 import numpy as np
 
-import dvrk_drake.analysis.study as study_module
-from dvrk_drake.analysis.simulation import Simulation
+import dvrk_drake.analysis.study.study as study_module
+from dvrk_drake.analysis.simulation.simulation import Simulation
 from dvrk_drake.models.recording import Recording
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import scipy.io
 
-from dvrk_drake.analysis.convert import convert, detect_format
-from dvrk_drake.analysis.team_mat import read_team_mat
-from dvrk_drake.analysis.wpi_csv import read_wpi_csv
+from dvrk_drake.analysis.convert.convert import convert, detect_format
+from dvrk_drake.analysis.convert.team_mat import read_team_mat
+from dvrk_drake.analysis.convert.wpi_csv import read_wpi_csv
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.recording import read_recording
 

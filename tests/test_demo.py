@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis import demo
 from dvrk_drake.analysis.collection import visiting_trajectory
-from dvrk_drake.analysis.true_arm import make_true_arm
+from dvrk_drake.analysis.demo import demo
+from dvrk_drake.analysis.demo.true_arm import make_true_arm
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant

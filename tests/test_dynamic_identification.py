@@ -8,10 +8,10 @@ import pytest
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 from rich.console import Console
 
-from dvrk_drake.analysis.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.dynamic_statics import base_parameter_map
-from dvrk_drake.analysis.dynamic_tables import print_dynamics
-from dvrk_drake.analysis.dynamic_validation import predict_motion, validate_motion
+from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.dynamic.statics import base_parameter_map
+from dvrk_drake.analysis.dynamic.tables import print_dynamics
+from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
 from dvrk_drake.analysis.tables import TABLE_WIDTH
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters

@@ -9,9 +9,9 @@ import json
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.convert import read_wpi_csv, wpi_in_joint_coordinates
-from dvrk_drake.analysis.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.dynamic_validation import validate_motion
+from dvrk_drake.analysis.convert.convert import read_wpi_csv, wpi_in_joint_coordinates
+from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.cli import main
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import read_recording, write_recording

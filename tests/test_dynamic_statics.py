@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from motions import true_dynamics
 
-from dvrk_drake.analysis.dynamic_statics import base_parameter_estimates
-from dvrk_drake.analysis.effect_selection import effect_column
+from dvrk_drake.analysis.dynamic.statics import base_parameter_estimates
+from dvrk_drake.analysis.static.effect_selection import effect_column
 from dvrk_drake.dynamics.actuator_effects import (
     POSITION_KINDS,
     ActuatorEffect,

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.compensation_comparison import compare_compensation
-from dvrk_drake.analysis.compensation_plot import plot_compensation
+from dvrk_drake.analysis.export.compensation_comparison import compare_compensation
+from dvrk_drake.analysis.export.plot import plot_compensation
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
 from dvrk_drake.dynamics.gravity_compensation import (

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_slow_parts import motion
 
-from dvrk_drake.analysis.convert import convert
+from dvrk_drake.analysis.convert.convert import convert
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError

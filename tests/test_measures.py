@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.measures import KINDS, Measure
-from dvrk_drake.analysis.scenario import Scenario, Target
-from dvrk_drake.analysis.simulation import Simulation
+from dvrk_drake.analysis.simulation.scenario import Scenario, Target
+from dvrk_drake.analysis.simulation.simulation import Simulation
+from dvrk_drake.analysis.study.measures import KINDS, Measure
 from dvrk_drake.errors import StudyError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import Recording

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.parameter_uncertainty import information_matrix, parameter_uncertainty
+from dvrk_drake.analysis.dynamic.parameter_uncertainty import information_matrix, parameter_uncertainty
 from dvrk_drake.errors import IdentificationError
 
 

@@ -7,10 +7,10 @@ import pytest
 from loaded_arm import two_days
 from pydrake.multibody.tree import MultibodyForces
 
-from dvrk_drake.analysis.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.payload import as_good, estimate_payload
-from dvrk_drake.analysis.payload_tables import print_payload
-from dvrk_drake.analysis.point_mass import point_mass_parameters
+from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.payload.payload import as_good, estimate_payload
+from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
+from dvrk_drake.analysis.payload.tables import print_payload
 from dvrk_drake.analysis.tables import make_console
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor

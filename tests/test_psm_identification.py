@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.collection import collect_static_poses
-from dvrk_drake.analysis.static_identification import identify_static
-from dvrk_drake.analysis.true_arm import make_true_arm
+from dvrk_drake.analysis.demo.true_arm import make_true_arm
+from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from real_arm import ARMS
 
-from dvrk_drake.analysis.scenario import HandScenario
-from dvrk_drake.analysis.scenario_file import load_scenario
-from dvrk_drake.analysis.simulation import simulate
+from dvrk_drake.analysis.simulation.scenario import HandScenario
+from dvrk_drake.analysis.simulation.scenario_file import load_scenario
+from dvrk_drake.analysis.simulation.simulation import simulate
 from dvrk_drake.dynamics.arm_frame import ArmFrame
 from dvrk_drake.errors import ArmError, ScenarioError, StationError
 from dvrk_drake.models.arm import load_arm

@@ -7,10 +7,10 @@ import pytest
 from loaded_arm import friction, other_day
 from motions import fourier_motion, recorded, true_dynamics
 
-from dvrk_drake.analysis.drive_efforts import FRICTION_PARTS
-from dvrk_drake.analysis.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.dynamic_validation import validate_motion
-from dvrk_drake.analysis.recalibration import recalibrate
+from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.recalibration.recalibration import recalibrate
+from dvrk_drake.analysis.signals.drive_efforts import FRICTION_PARTS
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.identified_model import IdentifiedModel

@@ -8,12 +8,12 @@ import pytest
 from rich.console import Console
 from synthetic_motion import EFFORT_NOISE, PERIOD, RATE, clean_motion
 
-from dvrk_drake.analysis.convert import read_wpi_csv, wpi_in_joint_coordinates
-from dvrk_drake.analysis.low_pass import low_pass
-from dvrk_drake.analysis.poses import find_poses
-from dvrk_drake.analysis.recording_check import check_recording
+from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.analysis.convert.convert import read_wpi_csv, wpi_in_joint_coordinates
+from dvrk_drake.analysis.signals.low_pass import low_pass
+from dvrk_drake.analysis.signals.poses import find_poses
+from dvrk_drake.analysis.signals.true_time import true_time
 from dvrk_drake.analysis.tables import make_table
-from dvrk_drake.analysis.true_time import true_time
 from dvrk_drake.cli import main
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.scenario import Scenario, Target
-from dvrk_drake.analysis.scenario_file import load_scenario
-from dvrk_drake.analysis.simulation import simulate
+from dvrk_drake.analysis.simulation.scenario import Scenario, Target
+from dvrk_drake.analysis.simulation.scenario_file import load_scenario
+from dvrk_drake.analysis.simulation.simulation import simulate
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ScenarioError

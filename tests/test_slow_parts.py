@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.convert import convert
-from dvrk_drake.analysis.poses import find_poses
-from dvrk_drake.analysis.rests import SAME_REST, rest_poses
-from dvrk_drake.analysis.slow_parts import slow_parts
-from dvrk_drake.analysis.static_identification import identify_static
+from dvrk_drake.analysis.convert.convert import convert
+from dvrk_drake.analysis.signals.poses import find_poses
+from dvrk_drake.analysis.signals.rests import SAME_REST, rest_poses
+from dvrk_drake.analysis.signals.slow_parts import slow_parts
+from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import load_arm

@@ -6,10 +6,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.doubts import find_doubts
-from dvrk_drake.analysis.linear_fit import robust_fit, weighted_fit
-from dvrk_drake.analysis.static_identification import identify_static
-from dvrk_drake.analysis.validation import predict, validate
+from dvrk_drake.analysis.static.doubts import find_doubts
+from dvrk_drake.analysis.static.linear_fit import robust_fit, weighted_fit
+from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.analysis.static.validation import predict, validate
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.static_model import compile_static_model
@@ -67,7 +67,7 @@ def test_standard_errors_cover_the_truth_at_the_nominal_rate(arm):
     for seed in range(40):
         recording, theta = simulated(arm, noise=0.02, seed=seed)
         usable = np.ones(recording.q.shape, dtype=bool)
-        from dvrk_drake.analysis.effect_selection import StaticProblem
+        from dvrk_drake.analysis.static.effect_selection import StaticProblem
 
         fit = StaticProblem(arm, recording.q, recording.tau, usable).fit(()).fit
         inside.append(np.abs(fit.theta - theta) < 1.96 * np.sqrt(np.diag(fit.covariance)))

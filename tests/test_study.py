@@ -10,14 +10,14 @@ import pytest
 from rich.console import Console
 from scipy.stats import norm
 
-import dvrk_drake.analysis.study as study_module
-from dvrk_drake.analysis.measures import Measure
-from dvrk_drake.analysis.simulation import Simulation
-from dvrk_drake.analysis.study import run_study
-from dvrk_drake.analysis.study_file import RandomPoses, Study, Variation
-from dvrk_drake.analysis.study_report import plot_study, print_study
-from dvrk_drake.analysis.study_summary import Quantiles, Share, summarise
-from dvrk_drake.analysis.study_table import StudyTable
+import dvrk_drake.analysis.study.study as study_module
+from dvrk_drake.analysis.simulation.simulation import Simulation
+from dvrk_drake.analysis.study.measures import Measure
+from dvrk_drake.analysis.study.report import plot_study, print_study
+from dvrk_drake.analysis.study.study import run_study
+from dvrk_drake.analysis.study.study_file import RandomPoses, Study, Variation
+from dvrk_drake.analysis.study.summary import Quantiles, Share, summarise
+from dvrk_drake.analysis.study.table import StudyTable
 from dvrk_drake.errors import StudyError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import Recording

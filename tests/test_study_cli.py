@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.study_file import load_study
+from dvrk_drake.analysis.study.study_file import load_study
 from dvrk_drake.cli import main
 from dvrk_drake.models.arm import load_arm
 
@@ -101,7 +101,7 @@ def test_numbers_of_workers_that_are_none_are_refused(study, capsys):
 
 
 def test_schedulers_that_are_none_are_refused(study, capsys, monkeypatch):
-    monkeypatch.setattr("dvrk_drake.analysis.study_executors.PATIENCE", 0.3)
+    monkeypatch.setattr("dvrk_drake.analysis.study.executors.PATIENCE", 0.3)
     pytest.importorskip("distributed", reason="needs the extra dask")
     assert "is no address of a scheduler; allowed: tcp://HOST:PORT" in refusal(capsys, study, "--scheduler", "here")
     assert "no Dask scheduler answers there" in refusal(capsys, study, "--scheduler", "tcp://127.0.0.1:1")

@@ -12,10 +12,10 @@ from pathlib import Path
 import formula_study
 import pytest
 
-import dvrk_drake.analysis.study as study_module
-from dvrk_drake.analysis.study import run_study
-from dvrk_drake.analysis.study_executors import dask_executor
-from dvrk_drake.analysis.study_file import load_study
+import dvrk_drake.analysis.study.study as study_module
+from dvrk_drake.analysis.study.executors import dask_executor
+from dvrk_drake.analysis.study.study import run_study
+from dvrk_drake.analysis.study.study_file import load_study
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePose
 
-from dvrk_drake.analysis.teleoperation_demo import (
+from dvrk_drake.analysis.demo.teleoperation import (
     SCALE,
     START_FOLLOWER,
     START_MASTER,

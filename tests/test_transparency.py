@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydrake.trajectories import PiecewisePolynomial
 
-from dvrk_drake.analysis.transparency import Compensation, feel, rambling_path, recorded_path
+from dvrk_drake.analysis.transparency.transparency import Compensation, feel, rambling_path, recorded_path
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ScenarioError

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from scipy.optimize import brentq
 
-from dvrk_drake.analysis.scenario_file import load_scenario
+from dvrk_drake.analysis.simulation.scenario_file import load_scenario
 from dvrk_drake.analysis.tuning.bench import Bench, Response
 from dvrk_drake.analysis.tuning.comparison import CONDITIONS, DURATION, REST, measure_step
 from dvrk_drake.analysis.tuning.joint_on_bench import JointOnBench

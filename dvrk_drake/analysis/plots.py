@@ -12,9 +12,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.doubts import Doubt, usable_measurements
-from dvrk_drake.analysis.static_identification import StaticIdentification
-from dvrk_drake.analysis.validation import Validation
+from dvrk_drake.analysis.static.doubts import Doubt, usable_measurements
+from dvrk_drake.analysis.static.static_identification import StaticIdentification
+from dvrk_drake.analysis.static.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.atomic_file import atomic_write

@@ -10,11 +10,11 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from dvrk_drake.analysis.demo import DemoResult
-from dvrk_drake.analysis.doubts import Doubt
-from dvrk_drake.analysis.simulation import Simulation
-from dvrk_drake.analysis.teleoperation_demo import TeleoperationResult
-from dvrk_drake.analysis.validation import Validation
+from dvrk_drake.analysis.demo.demo import DemoResult
+from dvrk_drake.analysis.demo.teleoperation import TeleoperationResult
+from dvrk_drake.analysis.simulation.simulation import Simulation
+from dvrk_drake.analysis.static.doubts import Doubt
+from dvrk_drake.analysis.static.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity, derive_gravity
 from dvrk_drake.models.arm import Arm, load_arm

@@ -22,9 +22,9 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.recording_check import check_recording
-    from dvrk_drake.analysis.recording_plots import plot_report
-    from dvrk_drake.analysis.recording_tables import print_report
+    from dvrk_drake.analysis.check.plots import plot_report
+    from dvrk_drake.analysis.check.recording_check import check_recording
+    from dvrk_drake.analysis.check.tables import print_report
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.atomic_file import atomic_write

@@ -32,7 +32,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.demo import run_demo
+    from dvrk_drake.analysis.demo.demo import run_demo
     from dvrk_drake.analysis.tables import make_console, print_demo
 
     quiet_drake()
@@ -48,8 +48,8 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _teleop(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.demo.teleoperation import play_teleoperation, run_live_teleoperation, start_scene
     from dvrk_drake.analysis.tables import make_console, print_teleoperation
-    from dvrk_drake.analysis.teleoperation_demo import play_teleoperation, run_live_teleoperation, start_scene
     from dvrk_drake.models.atomic_file import atomic_write
 
     quiet_drake()

@@ -28,7 +28,7 @@ def refuse_unusable(console: Console, recording: Recording, arm: Arm, warn: bool
     Raises:
         RecordingError: it refuses anything.
     """
-    from dvrk_drake.analysis.recording_check import check_recording
+    from dvrk_drake.analysis.check.recording_check import check_recording
 
     report = check_recording(recording, arm)
     for finding in report.findings:
@@ -53,9 +53,9 @@ def _warn_unexplained(console: Console, errors: dict[str, float]) -> None:
 
 def identify_motion(options: argparse.Namespace, recording: Recording, arm: Arm, plots: Path | None) -> None:
     """Identifies the dynamics, prints them in short, writes the model, all tables and the plots."""
-    from dvrk_drake.analysis.dynamic_identification import identify_dynamic
-    from dvrk_drake.analysis.dynamic_tables import print_dynamics
-    from dvrk_drake.analysis.dynamic_validation import validate_motion
+    from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+    from dvrk_drake.analysis.dynamic.tables import print_dynamics
+    from dvrk_drake.analysis.dynamic.validation import validate_motion
     from dvrk_drake.analysis.tables import make_console
 
     console = make_console()
@@ -72,7 +72,7 @@ def identify_motion(options: argparse.Namespace, recording: Recording, arm: Arm,
         write_tables(options.tables, lambda file: print_dynamics(file, result, full=True))
         console.print(f"all parameters: {options.tables}")
     if plots is not None:
-        from dvrk_drake.analysis.dynamic_plots import plot_motion
+        from dvrk_drake.analysis.dynamic.plots import plot_motion
 
         title = f"{arm.name}, fitted to {Path(recording.source).name}"
         plot_motion(plots, arm, validate_motion(result.model, recording), title)
@@ -83,8 +83,8 @@ def validate_in_motion(
     options: argparse.Namespace, model: IdentifiedModel, recording: Recording, plots: Path | None
 ) -> None:
     """Compares a dynamic model with a motion, prints the errors, writes the JSON and the plots."""
-    from dvrk_drake.analysis.dynamic_tables import print_dynamic_validation
-    from dvrk_drake.analysis.dynamic_validation import validate_motion
+    from dvrk_drake.analysis.dynamic.tables import print_dynamic_validation
+    from dvrk_drake.analysis.dynamic.validation import validate_motion
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.models.atomic_file import atomic_write
 
@@ -98,7 +98,7 @@ def validate_in_motion(
             json.dump(validation.as_dict(), stream, indent=2)
             stream.write("\n")
     if plots is not None:
-        from dvrk_drake.analysis.dynamic_plots import plot_motion
+        from dvrk_drake.analysis.dynamic.plots import plot_motion
 
         arm = model.load_arm()
         plot_motion(plots, arm, validation, f"{arm.name}, {Path(recording.source).name}")

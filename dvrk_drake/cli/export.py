@@ -70,7 +70,7 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _write_sdf(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.export_tables import print_changed_links
+    from dvrk_drake.analysis.export.tables import print_changed_links
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.dynamics.sdf_export import changed_links, write_sdf
@@ -100,7 +100,7 @@ def _print_difference(model: IdentifiedModel) -> None:
 
 
 def _write_gc(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.export_tables import print_compensation
+    from dvrk_drake.analysis.export.tables import print_compensation
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.dynamics.gravity_compensation import (
         CompensationOptions,
@@ -127,7 +127,7 @@ def _write_gc(model: IdentifiedModel, path: str, options: argparse.Namespace) ->
 
 
 def _write_kinematic(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.export_tables import print_kinematic_compensation
+    from dvrk_drake.analysis.export.tables import print_kinematic_compensation
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.dynamics.kinematic_compensation import kinematic_compensation
 
@@ -138,9 +138,9 @@ def _write_kinematic(model: IdentifiedModel, path: str, options: argparse.Namesp
 
 
 def _compare(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.compensation_comparison import compare_compensation
-    from dvrk_drake.analysis.compensation_plot import plot_compensation
-    from dvrk_drake.analysis.export_tables import print_comparison
+    from dvrk_drake.analysis.export.compensation_comparison import compare_compensation
+    from dvrk_drake.analysis.export.plot import plot_compensation
+    from dvrk_drake.analysis.export.tables import print_comparison
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.models.atomic_file import atomic_write
     from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile

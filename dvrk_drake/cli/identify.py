@@ -68,8 +68,8 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 def _identify(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_identification
-    from dvrk_drake.analysis.poses import find_poses
-    from dvrk_drake.analysis.static_identification import identify_static
+    from dvrk_drake.analysis.signals.poses import find_poses
+    from dvrk_drake.analysis.static.static_identification import identify_static
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_model
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.recording import read_recording
@@ -111,9 +111,9 @@ def _identify(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.plots import plot_validation
-    from dvrk_drake.analysis.poses import find_poses
+    from dvrk_drake.analysis.signals.poses import find_poses
+    from dvrk_drake.analysis.static.validation import validate
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
-    from dvrk_drake.analysis.validation import validate
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.atomic_file import atomic_write
     from dvrk_drake.models.recording import read_recording
@@ -153,10 +153,10 @@ def _validate(options: argparse.Namespace) -> None:
 
 
 def _predict(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.dynamic_validation import predict_motion
-    from dvrk_drake.analysis.poses import find_poses
+    from dvrk_drake.analysis.dynamic.validation import predict_motion
+    from dvrk_drake.analysis.signals.poses import find_poses
+    from dvrk_drake.analysis.static.validation import predict
     from dvrk_drake.analysis.tables import make_console
-    from dvrk_drake.analysis.validation import predict
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.recording import read_recording, write_csv
 
@@ -176,7 +176,7 @@ def _predict(options: argparse.Namespace) -> None:
 
 
 def _convert(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.convert import convert
+    from dvrk_drake.analysis.convert.convert import convert
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.models.arm import load_arm
 

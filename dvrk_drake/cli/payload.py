@@ -29,9 +29,9 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _payload(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.dynamic_identification import identify_dynamic
-    from dvrk_drake.analysis.payload import estimate_payload
-    from dvrk_drake.analysis.payload_tables import print_links, print_payload
+    from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+    from dvrk_drake.analysis.payload.payload import estimate_payload
+    from dvrk_drake.analysis.payload.tables import print_links, print_payload
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.errors import ModelError

@@ -18,8 +18,8 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _recalibrate(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.recalibration import recalibrate
-    from dvrk_drake.analysis.recalibration_tables import print_recalibration
+    from dvrk_drake.analysis.recalibration.recalibration import recalibrate
+    from dvrk_drake.analysis.recalibration.tables import print_recalibration
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.recording import read_recording

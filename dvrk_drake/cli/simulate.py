@@ -10,8 +10,8 @@ from dvrk_drake.cli.support import ProgressBar, check_output, made_folder, quiet
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from dvrk_drake.analysis.scenario import Scenario
-    from dvrk_drake.analysis.simulation import Simulation
+    from dvrk_drake.analysis.simulation.scenario import Scenario
+    from dvrk_drake.analysis.simulation.simulation import Simulation
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -32,8 +32,8 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.scenario_file import load_scenario
-    from dvrk_drake.analysis.simulation import simulate
+    from dvrk_drake.analysis.simulation.scenario_file import load_scenario
+    from dvrk_drake.analysis.simulation.simulation import simulate
     from dvrk_drake.analysis.tables import make_console, print_simulation
     from dvrk_drake.models.recording import write_recording
     from dvrk_drake.systems.arm_view import start_meshcat

@@ -41,10 +41,10 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _study(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.study import run_study
-    from dvrk_drake.analysis.study_executors import dask_executor, run_study_locally
-    from dvrk_drake.analysis.study_file import load_study
-    from dvrk_drake.analysis.study_report import plot_study, print_study
+    from dvrk_drake.analysis.study.executors import dask_executor, run_study_locally
+    from dvrk_drake.analysis.study.report import plot_study, print_study
+    from dvrk_drake.analysis.study.study import run_study
+    from dvrk_drake.analysis.study.study_file import load_study
     from dvrk_drake.analysis.tables import make_console
 
     quiet_drake()

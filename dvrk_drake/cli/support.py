@@ -32,7 +32,7 @@ def import_interruptibly() -> None:
 
     Nothing is half-written at that time. Where signals are not ours (a thread, a test) they are left alone.
     """
-    if threading.current_thread() is not threading.main_thread() or "dvrk_drake.analysis.demo" in sys.modules:
+    if threading.current_thread() is not threading.main_thread() or "dvrk_drake.analysis.demo.demo" in sys.modules:
         return
 
     def leave(*_: object) -> None:
@@ -41,7 +41,7 @@ def import_interruptibly() -> None:
 
     before = signal.signal(signal.SIGINT, leave)
     try:
-        importlib.import_module("dvrk_drake.analysis.demo")
+        importlib.import_module("dvrk_drake.analysis.demo.demo")
     finally:
         signal.signal(signal.SIGINT, before)
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from dvrk_drake.analysis.reproduction.laboratory import Laboratory
 from dvrk_drake.analysis.reproduction.report import ResultTable, Section
-from dvrk_drake.analysis.transparency import Compensation, Felt, feel, rambling_path
-from dvrk_drake.analysis.transparency_report import plot_transparency
+from dvrk_drake.analysis.transparency.report import plot_transparency
+from dvrk_drake.analysis.transparency.transparency import Compensation, Felt, feel, rambling_path
 from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm

@@ -17,7 +17,7 @@ from dvrk_drake.analysis.reproduction.recordings import PaperRecordings
 from dvrk_drake.analysis.reproduction.releases import DURATION, Drifts, Release, release_all
 from dvrk_drake.analysis.reproduction.simulated_collection import collect
 from dvrk_drake.analysis.reproduction.true_arms import KnownTruth, paper_arm, unlike_its_drawing
-from dvrk_drake.analysis.static_identification import identify_static
+from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import Recording, write_recording

@@ -14,7 +14,7 @@ from dvrk_drake.analysis.reproduction.recordings import PaperRecordings
 from dvrk_drake.analysis.reproduction.report import Section, write_page
 from dvrk_drake.analysis.reproduction.step_response import reproduce_figure_7
 from dvrk_drake.analysis.reproduction.torque_errors import reproduce_figure_4
-from dvrk_drake.analysis.study_executors import local_executor
+from dvrk_drake.analysis.study.executors import local_executor
 from dvrk_drake.errors import DvrkDrakeError
 
 _MAKERS: dict[str, Callable[[Laboratory], Section]] = {

@@ -13,7 +13,7 @@ from dvrk_drake.analysis.plots import MEASURED_COLOUR, MODEL_COLOUR, ZERO_COLOUR
 from dvrk_drake.analysis.reproduction.published import FIGURE_4_MEANS
 from dvrk_drake.analysis.reproduction.recordings import PaperRecordings
 from dvrk_drake.analysis.reproduction.report import ResultTable, Section, numbers
-from dvrk_drake.analysis.static_identification import StaticIdentification, identify_static
+from dvrk_drake.analysis.static.static_identification import StaticIdentification, identify_static
 from dvrk_drake.models.arm import load_arm
 
 #: The arm's side is not stated; joint 1 bottoms at the left one's limit, and the joints of Fig. 4 do not depend on it.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvrk_drake.analysis.static_identification import identify_static
+from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias

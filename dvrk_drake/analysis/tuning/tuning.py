@@ -7,7 +7,7 @@ from concurrent.futures import Executor, Future, as_completed
 from dataclasses import dataclass
 from typing import Literal
 
-from dvrk_drake.analysis.study_executors import local_executor
+from dvrk_drake.analysis.study.executors import local_executor
 from dvrk_drake.analysis.tuning.bench import Condition, Response
 from dvrk_drake.analysis.tuning.comparison import (
     CONDITIONS,

@@ -1,0 +1,1 @@
+"""What is wrong with a recording, before anything is identified from it."""

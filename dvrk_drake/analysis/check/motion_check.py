@@ -1,0 +1,253 @@
+"""Checks a motion: its clock, its channels against each other, its noise, and whether it repeats."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.check.report import Finding, JointSignals, RecordingReport
+from dvrk_drake.analysis.signals.effort_lag import LAG_STEP, LONGEST_LAG, EffortLag, effort_lag
+from dvrk_drake.analysis.signals.low_pass import resample
+from dvrk_drake.analysis.signals.motion_signals import MotionSignals, motion_signals
+from dvrk_drake.analysis.signals.noise import cut_offs, narrow_band, spectra
+from dvrk_drake.analysis.signals.repetition import find_period, repeatability_floor
+from dvrk_drake.analysis.signals.rests import LONGEST_PERIOD
+from dvrk_drake.analysis.signals.true_time import TrueTime, repeated_block, repeated_rows, true_time
+from dvrk_drake.analysis.signals.velocity_agreement import VelocityAgreement, velocity_agreement
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.recording import REST_SPEED, Recording
+
+#: Below this share, repeated rows are chance.
+LEAST_REPEATED = 0.005
+#: A block of channels that repeats itself in so much more rows comes from a slower topic.
+LEAST_EXTRA = 0.05
+#: A gap: an interval of so many median ones, and at least this long [s].
+GAP, LEAST_GAP = 5.0, LONGEST_PERIOD
+#: A clock that is off by more than this share of an interval is worth a line.
+LEAST_JITTER = 0.05
+#: A sign is wrong if Coulomb friction is so many standard errors below 0; or if the motor's work is below minus this
+#: share, and Coulomb friction not so many above 0.
+SURE, OPPOSITE, DOUBTFUL = 5.0, 0.05, 2.0
+#: Joints whose speeds correlate more can hardly be told apart.
+TOGETHER = 0.95
+#: Shorter motions are too short to judge lags, signs and noise [s].
+LEAST_DURATION = 10.0
+
+
+def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tuple[RecordingReport, list[Finding]]:
+    """The report with the motion's numbers, and what was found. t increases, and q, qd and t are in one system."""
+    interval = float(np.median(np.diff(np.asarray(recording.t))))
+    gaps = _gaps(np.asarray(recording.t), interval)
+    actuators = _longest_piece(recording.in_actuator_coordinates(arm), gaps)
+    clock = true_time(actuators)
+    t = np.asarray(actuators.t)
+    duration, rate = float(t[-1] - t[0]), 1 / interval
+    findings = [*_rows(actuators, clock), *_gap_findings(recording, gaps)]
+    report = replace(
+        report, rate=rate, duration=duration, jitter=clock.jitter, repeated=float(np.mean(repeated_rows(actuators)))
+    )
+    if duration < LEAST_DURATION or rate < 2 / LONGEST_PERIOD:
+        what = f"{duration:.3g} s at {rate:.3g} Hz"
+        advice = f"lags, noise and repetition are judged from {LEAST_DURATION:g} s at {2 / LONGEST_PERIOD:g} Hz on"
+        return report, [*findings, Finding("warning", "short or slow", "t", what, advice, size=duration)]
+    signals = motion_signals(actuators, 20.0, rate=min(rate, 400.0))
+    moving = np.sqrt(np.mean(signals.v**2, axis=0)) > arm.per_joint(*REST_SPEED)
+    agreement = _agreement(actuators, clock, signals)
+    lags = effort_lag(signals, moving)
+    names = arm.joint_names
+    work = _work(signals)
+    findings += _velocities(agreement, names) + _lags(lags, names) + _together(signals, moving, names)
+    findings += _signs(work, lags, names)
+    even = t[0] + np.arange(len(t)) * (duration / (len(t) - 1))
+    rows = actuators if np.ptp(np.diff(t)) < 1e-3 / rate else _resampled(actuators, even)
+    period = find_period(rows.q, rate)
+    report, more = _noise(report, rows, rate, period, arm)
+    findings += more
+    acceleration = np.sqrt(np.mean(signals.vd**2, axis=0))
+    joints = tuple(
+        replace(
+            joint,
+            speed=float(np.sqrt(np.mean(signals.v[:, j] ** 2))),
+            acceleration=float(acceleration[j]),
+            velocity_gain=None if agreement is None else float(agreement.gain[j]),
+            velocity_lag=None if agreement is None else float(agreement.lag[j]),
+            effort_lag=float(lags.lag[j]) if lags.determined[j] else None,
+            work=float(work[j]),
+        )
+        for j, joint in enumerate(report.joints)
+    )
+    return replace(report, joints=joints), findings
+
+
+def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
+    findings = []
+    whole = float(np.mean(repeated_rows(actuators)))
+    blocks = {
+        name: float(np.mean(repeated_block(block)))
+        for name, block in (("q", actuators.q), ("qd", actuators.qd), ("tau", actuators.tau))
+        if block is not None
+    }
+    if whole > LEAST_REPEATED:
+        shares = ", ".join(f"{name} alone {share:.1%}" for name, share in blocks.items())
+        what = f"{whole:.1%} repeat the row before ({shares})"
+        advice = "a slower topic was polled: they are left out, and true times are made; record each message once"
+        findings.append(Finding("warning", "repeated rows", "rows", what, advice, size=whole))
+    for name, share in blocks.items():
+        # What never changes is said elsewhere.
+        if whole + LEAST_EXTRA < share < 1 - 2 / len(actuators):
+            what = f"{share:.1%} of the rows repeat {name} but not the rest"
+            advice = "it comes from a slower topic than the rest, and is up to one of its intervals late"
+            findings.append(Finding("warning", "repeated channel", name, what, advice, size=share))
+    if clock.reconstructed and clock.jitter > LEAST_JITTER:
+        what = f"q and qd say that rows are off their times: true intervals deviate by {clock.jitter:.0%} (1 sigma)"
+        advice = "times are made from q and qd; record the controller's own time stamps"
+        findings.append(Finding("warning", "jitter", "t", what, advice, size=clock.jitter))
+    return findings
+
+
+def _gaps(t: NDArray[np.float64], interval: float) -> NDArray[np.int_]:
+    """Rows before a gap."""
+    return np.flatnonzero(np.diff(t) > max(GAP * interval, LEAST_GAP))
+
+
+def _longest_piece(recording: Recording, gaps: NDArray[np.int_]) -> Recording:
+    edges = np.concatenate([[0], gaps + 1, [len(recording)]])
+    longest = int(np.argmax(np.diff(edges)))
+    rows = slice(edges[longest], edges[longest + 1])
+    return replace(
+        recording,
+        q=recording.q[rows],
+        qd=None if recording.qd is None else recording.qd[rows],
+        tau=recording.measured_effort()[rows],
+        t=np.asarray(recording.t)[rows],
+        lines=None if recording.lines is None else recording.lines[rows],
+    )
+
+
+def _gap_findings(recording: Recording, gaps: NDArray[np.int_]) -> list[Finding]:
+    if not len(gaps):
+        return []
+    intervals = np.diff(np.asarray(recording.t))
+    largest = int(gaps[np.argmax(intervals[gaps])])
+    what = f"{len(gaps)} gaps, the largest {intervals[largest]:.3g} s before {recording.where(largest + 1)}"
+    advice = "nobody knows what the arm did meanwhile: split it there; signals are checked in the longest piece"
+    return [Finding("warning", "gaps", "t", what, advice, size=float(intervals[largest]))]
+
+
+def _agreement(actuators: Recording, clock: TrueTime, signals: MotionSignals) -> VelocityAgreement | None:
+    if actuators.qd is None:
+        return None
+    q, qd = (resample(clock.t, x[clock.rows], signals.t) for x in (actuators.q, actuators.qd))
+    return velocity_agreement(q, qd, signals.rate)
+
+
+def _velocities(agreement: VelocityAgreement | None, names: tuple[str, ...]) -> list[Finding]:
+    if agreement is None:
+        what = "the recording has no velocities"
+        return [Finding("note", "no velocities", "qd", what, "q is differentiated; its times must be good")]
+    findings = []
+    for j in np.flatnonzero(~agreement.agrees & np.isfinite(agreement.gain)):
+        gain, lag = float(agreement.gain[j]), float(agreement.lag[j])
+        what = f"qd{j + 1} is {gain:.3g} times dq/dt and {1e3 * lag:.1f} ms late (mismatch {agreement.mismatch[j]:.0%})"
+        if abs(gain * np.pi / 180 - 1) < 0.1:
+            what += ": degrees a second?"
+        elif gain < 0:
+            what += ": its sign is wrong"
+        findings.append(
+            Finding("warning", "velocity disagrees", names[j], what, "q is differentiated instead", (int(j),), gain)
+        )
+    return findings
+
+
+def _lags(lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
+    findings = []
+    for j in np.flatnonzero(lags.determined):
+        lag, error = 1e3 * float(lags.lag[j]), 1e3 * float(lags.standard_error[j])
+        size = f"{abs(lag):.1f} ms (standard error {error:.1f})"
+        if abs(lags.lag[j]) > LONGEST_LAG - LAG_STEP:
+            size = f"{1e3 * LONGEST_LAG:.0f} ms or more"
+        what = f"tau{j + 1} looks {size} {'late' if lag > 0 else 'early'}"
+        advice = "a delay, or friction that builds up over some way: fit hysteresis before you shift it"
+        findings.append(Finding("note", "effort lag", names[j], what, advice, (int(j),), float(lags.lag[j])))
+    return findings
+
+
+def _together(signals: MotionSignals, moving: NDArray[np.bool_], names: tuple[str, ...]) -> list[Finding]:
+    index = np.flatnonzero(moving)
+    if len(index) < 2:
+        return []
+    correlation = np.abs(np.corrcoef(signals.v[:, index].T))
+    findings = []
+    for a, b in np.argwhere(np.triu(correlation, 1) > TOGETHER):
+        i, j = int(index[a]), int(index[b])
+        what = f"move together (correlation of their speeds {correlation[a, b]:.3f})"
+        advice = "their inertia and friction cannot be told apart; move them independently"
+        size = float(correlation[a, b])
+        findings.append(Finding("warning", "move together", f"{names[i]}, {names[j]}", what, advice, (i, j), size))
+    return findings
+
+
+def _work(signals: MotionSignals) -> NDArray[np.float64]:
+    """(n,) mean power of each actuator over rms(tau) rms(v); nan where either is 0."""
+    size = np.sqrt(np.mean(signals.tau**2, axis=0) * np.mean(signals.v**2, axis=0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.mean(signals.tau * signals.v, axis=0) / size)
+
+
+def _signs(work: NDArray[np.float64], lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        errors = lags.coulomb / lags.coulomb_error
+    # Work alone does not tell: gravity and inertia may give it through the other joints.
+    wrong = (errors < -SURE) | ((work < -OPPOSITE) & (errors < DOUBTFUL))
+    findings = []
+    for j in np.flatnonzero(wrong):
+        what = (
+            f"friction pushes instead of braking: Coulomb {lags.coulomb[j]:.2g} ({errors[j]:.1f} standard errors), "
+            f"work {work[j]:.2f}"
+        )
+        advice = f"tau{j + 1} or the direction of q{j + 1} has the wrong sign: efforts are positive towards +q"
+        findings.append(Finding("refusal", "effort sign", names[j], what, advice, (int(j),), float(lags.coulomb[j])))
+    return findings
+
+
+def _resampled(actuators: Recording, times: NDArray[np.float64]) -> Recording:
+    t = np.asarray(actuators.t)
+    q, tau = (resample(t, x, times) for x in (actuators.q, actuators.measured_effort()))
+    qd = None if actuators.qd is None else resample(t, actuators.qd, times)
+    return Recording(q, tau, qd, times, "actuator")
+
+
+def _noise(
+    report: RecordingReport, rows: Recording, rate: float, period: float | None, arm: Arm
+) -> tuple[RecordingReport, list[Finding]]:
+    tau = rows.measured_effort()
+    of_tau = spectra(tau, rate, period)
+    v = np.gradient(rows.q, 1 / rate, axis=0) if rows.qd is None else rows.qd
+    cuts = zip(cut_offs(of_tau), cut_offs(spectra(v, rate, period)), strict=True)
+    joints: list[JointSignals] = [
+        replace(joint, effort_cut_off=float(a), velocity_cut_off=float(b))
+        for joint, (a, b) in zip(report.joints, cuts, strict=True)
+    ]
+    if period is None:
+        what = "the motion does not repeat, so no repeatability floor can be computed"
+        advice = "let an excitation motion run twice or more: the floor tells how good a model can be"
+        return replace(report, joints=tuple(joints)), [Finding("note", "no repetition", "motion", what, advice)]
+    floor = repeatability_floor(tau, rate, period, arm.effort_cut_off)
+    joints = [replace(joint, floor=float(value)) for joint, value in zip(joints, floor, strict=True)]
+    what = f"repeats every {period:.4f} s ({1 / period:.4f} Hz), {len(tau) / rate / period:.1f} times"
+    advice = (
+        "compare that with the frequency that was asked for; the floor is about the least error that a model can have"
+    )
+    findings = [Finding("note", "repetition", "motion", what, advice, size=period)]
+    for j, name in enumerate(arm.joint_names):
+        if band := narrow_band(of_tau, j):
+            what = (
+                f"tau{j + 1} has noise between {band.lower:.0f} and {band.upper:.0f} Hz, {band.share:.0%} of its RMS, "
+                "that does not repeat"
+            )
+            findings.append(
+                Finding("note", "narrow-band noise", name, what, "filter below it before a fit", (j,), band.share)
+            )
+    return replace(report, joints=tuple(joints), period=period, floor_cut_off=arm.effort_cut_off), findings

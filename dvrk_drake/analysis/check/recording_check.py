@@ -1,0 +1,218 @@
+"""Checks a recording before anything is identified from it: what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.check.motion_check import check_motion
+from dvrk_drake.analysis.check.pose_check import check_poses
+from dvrk_drake.analysis.check.report import Finding, JointSignals, RecordingReport, Severity
+from dvrk_drake.analysis.signals.rests import LEAST_ROWS, LONGEST_PERIOD
+from dvrk_drake.analysis.static.doubts import check_effort_unit
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.recording import REST_SPEED, Recording
+
+#: A joint that moves less has never moved [rad], [m].
+LEAST_RANGE = 0.02, 0.002
+#: A joint that covers less than this share of its limits hardly tells its parameters.
+LEAST_COVERAGE = 0.1
+#: Beyond its limits by more than this, a pose is worth a line [rad], [m].
+LIMIT_MARGIN = 0.005, 0.0005
+#: A motion's effort beyond its limit by this factor is a spike of the measurement, whatever the limit's own error.
+IMPOSSIBLE_EFFORT = 5.0
+#: Nor does it go so far beyond the stops of its linkage [rad].
+IMPOSSIBLE_EXCESS = 0.3
+#: Fewest rows in a flat top, and share of all rows that make it one: an effort that stays at its extreme is clipped.
+FLAT_ROWS, FLAT_SHARE = 5, 0.002
+#: Times that q and qd contradict by more than this factor are in another unit or at another rate.
+TIME_TOLERANCE = 0.05
+#: Rows between two positions that are compared.
+BLOCK = 20
+_ORDER: dict[Severity, int] = {"refusal": 0, "warning": 1, "note": 2}
+
+
+def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
+    """Checks poses or a motion, from CSV or LCM log, in either coordinates. Never raises for what a recording says.
+
+    Everything is looked at in both coordinates where it matters: limits are the joints', sensors, motors and friction
+    are the actuators'.
+
+    Args:
+        recording: as read.
+        arm: which was recorded.
+    """
+    source = recording.source or "recording"
+    report = RecordingReport(source, arm.name, "motion" if _is_motion(recording) else "poses", len(recording))
+    findings = [Finding("note", "reading", source, note, "read the rest with that in mind") for note in recording.notes]
+    try:
+        joints = recording.in_joint_coordinates(arm)
+        recording.check_fits(arm)
+        tau = joints.measured_effort()
+        check_effort_unit(joints, arm)
+    except RecordingError as error:
+        refusal = Finding("refusal", "unusable", source, _without_source(str(error), source), "nothing else is checked")
+        return replace(report, findings=(refusal, *findings))
+    numbers = _joint_signals(joints, arm)
+    findings += _positions(joints, arm, numbers)
+    findings += _efforts(recording.in_actuator_coordinates(arm), tau, arm, report.kind)
+    time = _time(recording, report.kind)
+    findings += time
+    report = replace(report, joints=numbers)
+    if any(finding.severity == "refusal" for finding in time):
+        pass
+    elif report.kind == "motion":
+        report, more = check_motion(report, recording, arm)
+        findings += more
+    else:
+        findings += check_poses(joints, arm)
+    return replace(report, findings=tuple(sorted(findings, key=lambda finding: _ORDER[finding.severity])))
+
+
+def _is_motion(recording: Recording) -> bool:
+    """Rows that follow each other closely, if not always forwards."""
+    t = recording.t
+    return t is not None and len(t) >= LEAST_ROWS and float(np.median(np.abs(np.diff(t)))) < LONGEST_PERIOD
+
+
+def _joint_signals(joints: Recording, arm: Arm) -> tuple[JointSignals, ...]:
+    tau = joints.measured_effort()
+    covered = np.ptp(joints.q, axis=0)
+    limits = arm.position_upper - arm.position_lower
+    effort = np.sqrt(np.mean(tau**2, axis=0))
+    peak = np.max(np.abs(tau), axis=0) / arm.effort_limits
+    return tuple(
+        JointSignals(name, float(covered[j]), float(covered[j] / limits[j]), float(effort[j]), float(peak[j]))
+        for j, name in enumerate(arm.joint_names)
+    )
+
+
+def _positions(joints: Recording, arm: Arm, numbers: tuple[JointSignals, ...]) -> list[Finding]:
+    findings = []
+    A, lower, upper = arm.limit_matrix()
+    names = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
+    margins = np.concatenate([arm.per_joint(*LIMIT_MARGIN), np.full(len(arm.coupled_limits), LIMIT_MARGIN[0])])
+    values = joints.q @ A.T
+    excess = np.maximum(lower - values, values - upper)
+    for i in np.flatnonzero(np.max(excess, axis=0) > margins):
+        row = int(np.argmax(excess[:, i]))
+        what = (
+            f"outside {lower[i]:.4g}..{upper[i]:.4g} in {np.mean(excess[:, i] > margins[i]):.1%} of the rows, "
+            f"furthest {values[row, i]:.4g} at {joints.where(row)}"
+        )
+        advice = "there it may press on a stop, and its effort is not the arm's own; check its zero and its limits"
+        moved = tuple(int(j) for j in np.flatnonzero(A[i]))
+        severity: Severity = "warning"
+        if i >= arm.num_joints and excess[row, i] > IMPOSSIBLE_EXCESS:
+            severity = "refusal"
+            advice = (
+                "no arm goes there, its links would cross: are these positions of actuators (--coordinates actuator)?"
+            )
+        findings.append(Finding(severity, "outside limits", names[i], what, advice, moved, float(excess[row, i])))
+    still = [j for j, least in enumerate(arm.per_joint(*LEAST_RANGE)) if numbers[j].range < least]
+    for j, joint in enumerate(numbers):
+        if j in still:
+            what = f"never moves: its positions cover {joint.range:.2g} {'m' if arm.prismatic[j] else 'rad'}"
+            advice = "nothing of it can be identified, and what it carries only together; record it moving"
+            findings.append(Finding("warning", "never moves", joint.name, what, advice, (j,), joint.range))
+        elif joint.coverage < LEAST_COVERAGE:
+            what = f"covers {joint.coverage:.1%} of its range"
+            advice = "its parameters will be uncertain and valid there only; let it move further"
+            findings.append(Finding("warning", "little excitation", joint.name, what, advice, (j,), joint.coverage))
+    return findings
+
+
+def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str) -> list[Finding]:
+    if not np.any(tau):
+        advice = "the motors were off or are not recorded"
+        return [Finding("refusal", "no effort", "efforts", "all of them are always 0", advice)]
+    findings = []
+    for j, name in enumerate(arm.joint_names):
+        if not np.any(tau[:, j]):
+            advice = "its motor was off or is not recorded; nothing of it can be identified"
+            findings.append(Finding("warning", "no effort", name, f"tau{j + 1} is always 0", advice, (j,)))
+            continue
+        exceeds = int(np.sum(np.abs(tau[:, j]) > arm.effort_limits[j]))
+        if exceeds:
+            most = float(np.max(np.abs(tau[:, j])) / arm.effort_limits[j])
+            what = f"effort above its limit of {arm.effort_limits[j]:.3g} in {exceeds} rows, up to {most:.0%}"
+            advice = "such peaks may be clipped or spikes of the current's measurement"
+            severity: Severity = "note"
+            if kind == "motion" and most > IMPOSSIBLE_EFFORT:
+                # A pose may press on a stop, and is doubted later; in a motion a few such rows spoil the whole fit.
+                severity = "refusal"
+                advice = (
+                    "no motor of this arm does that; mend or remove the spikes, or correct the limit in the arm's file"
+                )
+            findings.append(Finding(severity, "above effort limit", name, what, advice, (j,), most))
+        measured = actuators.measured_effort()[:, j]
+        for extreme in (np.max(measured), np.min(measured)):
+            share = _flat_share(measured, float(extreme))
+            if share > FLAT_SHARE:
+                what = f"effort stays at its extreme of {extreme:.4g} in {share:.1%} of the rows"
+                advice = "it was saturated: what the joint did there is not what tau says; record a gentler motion"
+                findings.append(Finding("warning", "saturated effort", name, what, advice, (j,), share))
+    return findings
+
+
+def _flat_share(values: NDArray[np.float64], extreme: float) -> float:
+    """Share of the rows in runs of `FLAT_ROWS` or more at an extreme."""
+    at = np.abs(values - extreme) <= 1e-6 * max(abs(extreme), float(np.ptp(values)))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]]).astype(int)))
+    lengths = np.diff(edges.reshape(-1, 2), axis=1).ravel()
+    return float(np.sum(lengths[lengths >= FLAT_ROWS]) / len(values))
+
+
+def _time(recording: Recording, kind: str) -> list[Finding]:
+    """What is wrong with t: it goes back, or q and qd need another unit of it."""
+    t, qd = recording.t, recording.qd
+    if t is None:
+        if qd is not None and np.max(np.sqrt(np.mean(qd**2, axis=0))) > REST_SPEED[0]:
+            what = "the arm moves (qd), but rows have no time t"
+            return [Finding("warning", "no times", "t", what, "taken for poses; write t [s] to use it as a motion")]
+        return []
+    back = np.flatnonzero(np.diff(t) <= 0)
+    if len(back):
+        row = int(back[0]) + 1
+        what = f"does not increase in {len(back)} rows, first at {recording.where(row)}"
+        severity: Severity = "refusal" if kind == "motion" else "warning"
+        advice = "rows must follow in time: sort them, and write one clock's times [s]"
+        return [Finding(severity, "time goes back", "t", what, advice, size=float(len(back)))]
+    factor = _time_factor(recording)
+    if factor is None or abs(factor - 1) < TIME_TOLERANCE:
+        return []
+    units = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 1 / 60: "minutes"}
+    unit = next((name for size, name in units.items() if abs(factor / size - 1) < 0.1), "")
+    guess = f"is t in {unit}?" if unit else "is the rate right, and are all of qd in rad/s (m/s)?"
+    what = f"runs {factor:.4g} times as fast as q and qd say; {guess}"
+    return [
+        Finding("refusal", "wrong time", "t", what, "write t in s, q in rad (m) and qd in rad/s (m/s)", size=factor)
+    ]
+
+
+def _time_factor(recording: Recording) -> float | None:
+    """Recorded over true time, where most joints that move agree on it within 10 %; None where they do not tell."""
+    t, q, qd = recording.t, recording.q, recording.qd
+    if t is None or qd is None or len(t) < LEAST_ROWS:
+        return None
+    # Over several rows, jitter and repeated rows cancel.
+    way = np.diff(
+        np.vstack([q[:1] * 0, np.cumsum((qd[1:] + qd[:-1]) / 2 * np.diff(t)[:, None], axis=0)])[::BLOCK], axis=0
+    )
+    dq = np.diff(q[::BLOCK], axis=0)
+    moving = np.sqrt(np.mean(qd**2, axis=0)) > REST_SPEED[1]
+    squares = np.sum(dq**2, axis=0) * np.sum(way**2, axis=0)
+    related = np.sum(dq * way, axis=0) > 0.6 * np.sqrt(squares)
+    chosen = moving & related & (squares > 0)
+    if np.sum(chosen) < 2:
+        return None
+    factors = np.sqrt(np.sum(way[:, chosen] ** 2, axis=0) / np.sum(dq[:, chosen] ** 2, axis=0))
+    factor = float(np.median(factors))
+    return factor if np.mean(np.abs(factors / factor - 1) < 0.1) > 0.5 else None
+
+
+def _without_source(message: str, source: str) -> str:
+    return message.removeprefix(source).lstrip(": ")

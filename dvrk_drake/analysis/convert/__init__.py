@@ -1,0 +1,1 @@
+"""Public recordings of other projects, into our format."""

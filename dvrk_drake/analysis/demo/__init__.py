@@ -1,0 +1,1 @@
+"""What `dvrk-drake demo` shows."""

@@ -1,0 +1,1 @@
+"""Identification of the full dynamics from motions, and how good it is."""

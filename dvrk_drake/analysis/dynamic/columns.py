@@ -1,0 +1,171 @@
+"""What explains an arm's efforts in a motion, column by column, behind the filter that the efforts are behind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.signals.motion_grid import MotionGrid
+from dvrk_drake.dynamics.actuator_effects import (
+    ActuatorEffect,
+    distinct_coordinates,
+    effect_coordinates,
+    effect_fault,
+    position_along,
+    slides,
+)
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.effect_shapes import effect_shapes
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm import Arm
+
+#: Widths of the smoothed sign, as shares of the coordinate's standard deviation of speed.
+COULOMB_WIDTHS = (0.03, 0.1, 0.4)
+#: The same width for friction that differs by direction or is more at low speeds.
+DIRECTION_WIDTH = 0.1
+ASYMMETRIC = "asymmetric friction"
+#: What an arm's file can say of a drive -> periods a turn of a sine and a cosine.
+NAMED_EFFECTS = {"spring": 0.0, "cable 1": 1.0, "cable 2": 2.0, ASYMMETRIC: 0.0}
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicColumns:
+    """tau ~ rigid phi + effects c, at r rows behind the filter, actuator by actuator.
+
+    Attributes:
+        tau: (r, n) measured efforts of the actuators.
+        rigid: (r, n, p) of the rigid bodies' parameters, links first, then one rotor an actuator.
+        tilts: (2, r, n, p) derivative of `rigid` by the x and y component of gravity [s^2/m].
+        effects: the candidate effects, in the order of the columns.
+        shapes: (r, e) of each effect along its coordinate, one column a block of actuators.
+        rows: (e, n) coordinate of each effect: its column of actuator i is shapes[i] * rows[:, i].
+    """
+
+    tau: NDArray[np.float64]
+    rigid: NDArray[np.float64]
+    tilts: NDArray[np.float64]
+    effects: tuple[ActuatorEffect, ...]
+    shapes: tuple[NDArray[np.float64], ...]
+    rows: NDArray[np.float64]
+
+    def of_actuator(self, i: int) -> NDArray[np.float64]:
+        """(r, p + e) all columns of one actuator."""
+        return np.hstack([self.rigid[:, i], self.shapes[i] * self.rows[:, i]])
+
+
+def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
+    """What every drive has, and what the arm's file says that its drives have (`motion.known_effects`).
+
+    Every actuator has an offset; every coordinate viscous, Coulomb and presliding friction.
+
+    Raises:
+        ArmError: the file names a coordinate or a kind that there is not.
+    """
+    known = arm.motion.known_effects
+    if unknown := set(known) - set(distinct_coordinates(arm)):
+        raise ArmError(
+            f"{arm.source}: motion.known_effects: unknown coordinate {', '.join(sorted(unknown))}; "
+            f"known: {', '.join(distinct_coordinates(arm))}"
+        )
+    effects, travels = [], arm.motion.presliding_travels
+    for name, x, v in _coordinates(arm, grid):
+        if name.startswith("actuator."):
+            effects.append(ActuatorEffect(name, "offset"))
+        effects.append(ActuatorEffect(name, "viscous"))
+        if v.std() > 0:
+            effects += [ActuatorEffect(name, "coulomb", _rounded(w * v.std())) for w in COULOMB_WIDTHS]
+            effects += [ActuatorEffect(name, "presliding", _rounded(d * x.std())) for d in travels]
+            effects += [effect for which in known.get(name, []) for effect in _named(arm, name, which, x, v)]
+    return effects
+
+
+def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
+    """What a motion may show beside: what an arm's file can name, friction that grows at low speeds or with load."""
+    effects = []
+    for name, x, v in _coordinates(arm, grid):
+        if v.std() == 0:
+            continue
+        kinds = ["stribeck", "load coulomb"] if name.startswith("actuator.") else ["stribeck"]
+        effects += [ActuatorEffect(name, kind, _rounded(DIRECTION_WIDTH * v.std())) for kind in kinds]
+        known = arm.motion.known_effects.get(name, [])
+        for which in NAMED_EFFECTS:
+            # Beside known torques by position, others say the same between the poses of a motion, and run apart beyond.
+            by_position = which != ASYMMETRIC
+            if which in known or (by_position and set(known) - {ASYMMETRIC}):
+                continue
+            if which == "spring" or not by_position or not slides(arm, name):
+                effects += _named(arm, name, which, x, v)
+    return effects
+
+
+def _named(
+    arm: Arm, coordinate: str, which: str, x: NDArray[np.float64], v: NDArray[np.float64]
+) -> list[ActuatorEffect]:
+    """What an arm's file calls `which`."""
+    where = f"{arm.source}: motion.known_effects.{coordinate}"
+    if which not in NAMED_EFFECTS:
+        raise ArmError(f'{where}: unknown "{which}"; known: {", ".join(NAMED_EFFECTS)}')
+    if which == ASYMMETRIC:
+        return [ActuatorEffect(coordinate, "coulomb forward", _rounded(DIRECTION_WIDTH * v.std()))]
+    if which == "spring":
+        return [ActuatorEffect(coordinate, "spring", _rounded(1.01 * np.abs(x).max()))]
+    effects = [ActuatorEffect(coordinate, kind, NAMED_EFFECTS[which]) for kind in ("cable sine", "cable cosine")]
+    if fault := effect_fault(arm, effects[0]):
+        raise ArmError(f"{where}: {fault}")
+    return effects
+
+
+def dynamic_columns(
+    grid: MotionGrid, tau: NDArray[np.float64], regressor: DynamicRegressor, effects: Sequence[ActuatorEffect]
+) -> DynamicColumns:
+    """Columns of all parameters and effects.
+
+    Args:
+        grid: the motion.
+        tau: (rows, n) recorded efforts of the actuators.
+        regressor: of the arm, mounted as expected.
+        effects: to make columns of.
+    """
+    arm, n = grid.arm, grid.arm.num_joints
+    p = len(regressor.values) - len(regressor.rotors) + n
+    rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd)[..., :p])
+    tilts = []
+    if arm.motion.base_may_tilt:
+        rest = np.zeros_like(grid.q)
+        for axis in np.eye(3)[:2]:
+            # Efforts are linear in gravity: those at rest under a gravity of one are the derivative.
+            lying = DynamicRegressor(arm.with_gravity([float(g) for g in axis]))
+            tilts.append(_filtered(grid, lying.regressor(grid.q, rest, rest)[..., :p]))
+    on_grid = np.column_stack(list(effect_shapes(regressor, effects, grid.q, grid.v)))
+    rows = np.array([effect_coordinates(arm)[effect.coordinate] for effect in effects])
+    by_delay = {d: grid.behind_filter(grid.at_rows(on_grid, i)) for i, d in enumerate(grid.settings.effort_delay)}
+    shapes = tuple(by_delay[d] for d in grid.settings.effort_delay)
+    return DynamicColumns(
+        grid.behind_filter(tau), rigid, np.array(tilts).reshape(-1, *rigid.shape), tuple(effects), shapes, rows
+    )
+
+
+def _filtered(grid: MotionGrid, Y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(r, n, p) of the actuators behind the filter, from a regressor (m, n, p) of the joints on the grid."""
+    J_inverse = grid.arm.transmission.inverse().matrix
+    out = np.zeros((len(range(*grid.inner.indices(len(grid.row_times)))), *Y.shape[1:]))
+    for i in range(Y.shape[1]):
+        of_actuator = sum(J_inverse[j, i] * Y[:, j] for j in np.flatnonzero(J_inverse[:, i]))
+        moved = np.flatnonzero(np.any(of_actuator, axis=0))
+        out[:, i, moved] = grid.behind_filter(grid.at_rows(of_actuator[:, moved], i))
+    return out
+
+
+def _coordinates(arm: Arm, grid: MotionGrid) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
+    """(name, x, v) of every coordinate of the drive."""
+    rows, a_dot = effect_coordinates(arm), arm.transmission.velocity(grid.v)
+    names = distinct_coordinates(arm)
+    return [(name, position_along(arm, name, grid.q), a_dot @ rows[name]) for name in names]
+
+
+def _rounded(x: float) -> float:
+    """To three digits: a scale is a choice, not a measurement."""
+    return float(f"{x:.3g}")

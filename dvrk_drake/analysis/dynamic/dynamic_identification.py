@@ -1,0 +1,195 @@
+"""An arm's full dynamics from one recorded motion: links that can exist, rotors, and the effects in the drive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.dynamic.choice import choose_effects, left_out_errors
+from dvrk_drake.analysis.dynamic.columns import drive_effects, dynamic_columns, optional_effects
+from dvrk_drake.analysis.dynamic.covariance import parameter_covariance
+from dvrk_drake.analysis.dynamic.estimates import DynamicEstimates
+from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
+from dvrk_drake.analysis.dynamic.statics import base_parameter_estimates
+from dvrk_drake.analysis.signals.motion_grid import MotionGrid, default_settings, motion_grid
+from dvrk_drake.analysis.signals.phase_folds import period_of, phase_folds
+from dvrk_drake.analysis.signals.repetition import repeatability_floor
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.dynamic_section import (
+    ActuatorEffectEstimate,
+    ActuatorStatistics,
+    DynamicSection,
+    RotorEstimate,
+)
+from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics, Provenance
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.recording import Recording
+
+#: An effect whose effort is below this share of the actuators' is left out of the model.
+LEAST_EFFECT = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicIdentification:
+    """A model with what a report of it needs.
+
+    Attributes:
+        model: with `dynamics`; its base parameters are those of the links there.
+        grid: the motion.
+        period: after which the motion repeats [s], or None.
+        measured, predicted: (r, n) efforts of the actuators behind the filter, ends left out [N m, N].
+        dry_friction: coordinate -> Coulomb and presliding friction together and its standard error [N m, N].
+        nominal_mass: of all links as the SDF has them [kg].
+    """
+
+    model: IdentifiedModel
+    grid: MotionGrid
+    period: float | None
+    measured: NDArray[np.float64]
+    predicted: NDArray[np.float64]
+    dry_friction: dict[str, tuple[float, float]]
+    nominal_mass: float
+
+
+def identify_dynamic(
+    recording: Recording, arm: Arm, progress: Callable[[float], object] = lambda _: None
+) -> DynamicIdentification:
+    """Identifies the dynamics of `arm` from a motion.
+
+    Efforts and all that explains them are compared behind the same low-pass. Every drive gets an offset, and viscous,
+    smoothed Coulomb and presliding friction at its actuators and at the joints that actuators share; springs, cables
+    and friction that differs by direction are there where the arm's files know of them, others are chosen by
+    cross-validation over the phases of the motion. The links' parameters are those nearest to the recording that bodies
+    can have, the SDF's where it says nothing (`consistent_parameters`). The direction of gravity is found along where
+    the arm's file says that its base may tilt. The cross-validated errors are of models that know nothing of the phases
+    they predict (`left_out_errors`).
+
+    Args:
+        recording: a motion with t and tau, in either coordinates.
+        arm: which was recorded.
+        progress: called with the finished share, 0..1.
+
+    Raises:
+        RecordingError: the recording does not fit the arm, or is no motion.
+        IdentificationError: the program for consistent parameters did not converge.
+    """
+    grid = motion_grid(recording, arm, default_settings(arm))
+    tau = recording.in_actuator_coordinates(arm).measured_effort()
+    progress(0.05)
+    period = period_of(grid)
+    problem = motion_problem(grid, tau, period)
+    progress(0.2)
+    choice = choose_effects(problem, lambda share: progress(0.2 + 0.3 * share))
+    problem, chosen = choice.problem, choice.chosen
+    fit = problem.consistent(chosen, choice.weights)
+    left_out = left_out_errors(choice, fit.x[: problem.num_rigid], lambda share: progress(0.55 + 0.45 * share))
+    left = residuals(problem, chosen, fit)
+    covariance = parameter_covariance(problem, fit, left, grid.rate, grid.settings.effort_cut_off, period)
+    estimates = DynamicEstimates(problem, fit, covariance)
+    section = _section(problem, chosen, fit, covariance, left_out, grid, tau, period)
+    section.links = estimates.links()
+    section.base_parameters, section.correlations = estimates.base_parameters()
+    model = _model(recording, arm, section, covariance)
+    progress(1.0)
+    predicted = problem.columns.tau - left
+    nominal = float(sum(link.parameters[0] for link in problem.regressor.links))
+    return DynamicIdentification(model, grid, period, problem.columns.tau, predicted, estimates.dry_friction(), nominal)
+
+
+def motion_problem(
+    grid: MotionGrid, tau: NDArray[np.float64], period: float | None, effects: Sequence[ActuatorEffect] | None = None
+) -> DynamicProblem:
+    """The least squares of a motion; tau (m, n): the actuators' measured efforts, a row of the recording each.
+
+    `effects`: the only ones, where they are known.
+    """
+    always = effects if effects is not None else drive_effects(grid.arm, grid)
+    candidates = [] if effects is not None else optional_effects(grid.arm, grid)
+    regressor = DynamicRegressor(grid.arm)
+    columns = dynamic_columns(grid, tau, regressor, [*always, *candidates])
+    fold, edge = phase_folds(grid, period)
+    # A low-passed effort has two independent values a period of the cut-off; repetitions say the same again.
+    duration = len(columns.tau) / grid.rate
+    independent = 2 * grid.settings.effort_cut_off * min(duration, period or duration)
+    return DynamicProblem(columns, regressor, fold, edge, min(independent, len(columns.tau)), len(always))
+
+
+def residuals(problem: DynamicProblem, chosen: NDArray[np.int_], fit: ConsistentFit) -> NDArray[np.float64]:
+    """(r, n) what a fit with these effects leaves of the efforts, on the rows of `problem`."""
+    columns, p = problem.columns, problem.num_rigid
+    drive = np.column_stack(
+        [columns.shapes[i][:, chosen] @ (columns.rows[chosen, i] * fit.x[p:]) for i in range(columns.tau.shape[1])]
+    )
+    return columns.tau - problem.rigid @ fit.x[:p] - drive
+
+
+def _section(
+    problem: DynamicProblem,
+    chosen: NDArray[np.int_],
+    fit: ConsistentFit,
+    covariance: NDArray[np.float64],
+    left_out: NDArray[np.float64],
+    grid: MotionGrid,
+    tau: NDArray[np.float64],
+    period: float | None,
+) -> DynamicSection:
+    arm, p = grid.arm, problem.num_rigid
+    sd = np.sqrt(np.diag(covariance))
+    rotors = [
+        RotorEstimate(name, float(fit.x[i]), float(sd[i]))
+        for i, name in enumerate(arm.joint_names, start=p - arm.num_joints)
+    ]
+    effects = []
+    for k, effect in enumerate(problem.columns.effects[c] for c in chosen):
+        value = float(fit.x[p + k])
+        if value**2 * problem.effect_precision[chosen[k]] > LEAST_EFFECT**2:
+            effects.append(
+                ActuatorEffectEstimate(effect.coordinate, effect.kind, effect.scale, value, float(sd[p + k]))
+            )
+    rows = problem.num_rows
+    size = np.sqrt(problem.efforts / rows)
+    floor = np.zeros(arm.num_joints)
+    if period is not None:
+        floor = np.nan_to_num(repeatability_floor(tau, grid.rate, period, grid.settings.effort_cut_off)) * size
+    actuators = [
+        ActuatorStatistics(name, *map(float, numbers))
+        for name, *numbers in zip(
+            arm.joint_names, size, np.sqrt(fit.errors / rows), np.sqrt(left_out / rows), floor, strict=True
+        )
+    ]
+    gravity = problem.regressor.arm.gravity + np.append(problem.tilt, 0.0)
+    gravity *= np.linalg.norm(problem.regressor.arm.gravity) / np.linalg.norm(gravity)
+    expected = [float(g) for g in arm.gravity]
+    return DynamicSection([float(g) for g in gravity], [], rotors, effects, actuators, grid.settings, expected)
+
+
+def _model(recording: Recording, arm: Arm, section: DynamicSection, covariance: NDArray[np.float64]) -> IdentifiedModel:
+    in_joints = recording.in_joint_coordinates(arm)
+    joints = []
+    for j, name in enumerate(arm.joint_names):
+        lower, upper = float(in_joints.q[:, j].min()), float(in_joints.q[:, j].max())
+        coverage = (upper - lower) / float(arm.position_upper[j] - arm.position_lower[j])
+        joints.append(JointStatistics(name=name, position_lower=lower, position_upper=upper, coverage=coverage))
+    model = IdentifiedModel(
+        arm=arm.source,
+        gravity=section.gravity,
+        joints=joints,
+        provenance=Provenance(
+            recording=recording.source,
+            sha256=recording.sha256,
+            poses=len(recording),
+            method="dynamic",
+            version=version("dvrk-drake"),
+        ),
+        dynamics=section,
+    )
+    # The model's own arm, whose gravity is derived once for all.
+    as_mounted = model.load_arm()
+    regressor = DynamicRegressor(as_mounted)
+    model.base_parameters = base_parameter_estimates(as_mounted, section, regressor, covariance)
+    return model

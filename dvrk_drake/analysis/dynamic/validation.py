@@ -1,0 +1,154 @@
+"""How well an identified arm's dynamics predict the efforts of a motion, and of what kind the error is."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.signals.low_pass import low_pass
+from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
+from dvrk_drake.analysis.signals.phase_folds import period_of
+from dvrk_drake.analysis.signals.repetition import repeatability_floor
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.recording import Recording
+
+#: Width of the smoothed sign of the friction that an error is searched for, as a share of the RMS speed.
+_FRICTION_WIDTH = 0.1
+#: Periods in the joint's travel of the position-dependent error that is searched for.
+_HARMONICS = 2
+
+
+@dataclass(frozen=True)
+class ActuatorError:
+    """One actuator's error over a motion, behind the low-pass: RMS in N m (N of one that slides).
+
+    `relative_error` = rms_error / rms_effort, None where nothing was measured. The rest of it splits rms_error^2 into
+    shares: `bias` is its mean, `friction_like` what viscous and Coulomb friction in the actuator would explain of it
+    then, `position_dependent` what two harmonics over its travel would explain of what is left, `other` the remainder.
+    `repeatability`: what differs from period to period, relative; None where the motion does not repeat.
+    """
+
+    name: str
+    rms_effort: float
+    rms_error: float
+    relative_error: float | None
+    bias: float
+    friction_like: float
+    position_dependent: float
+    other: float
+    repeatability: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicValidation:
+    """Errors of a model on one motion.
+
+    Attributes:
+        actuators: in the arm's order.
+        cut_off: of the low-pass that efforts are compared behind [Hz].
+        t: (r,) [s] of the rows that count: a second at each end is left out, where the filter swings in.
+        q, v: (r, n) of the actuators there.
+        measured, predicted: (r, n) efforts of the actuators behind the low-pass.
+    """
+
+    actuators: list[ActuatorError]
+    cut_off: float
+    t: NDArray[np.float64]
+    q: NDArray[np.float64]
+    v: NDArray[np.float64]
+    measured: NDArray[np.float64]
+    predicted: NDArray[np.float64]
+
+    @property
+    def mean_relative_error(self) -> float:
+        """Over the actuators of which something was measured."""
+        errors = [a.relative_error for a in self.actuators if a.relative_error is not None]
+        return float(np.mean(errors)) if errors else float("nan")
+
+    def as_dict(self) -> dict:
+        """What `validate --json` writes."""
+        return {
+            "coordinates": "actuator",
+            "cut_off_hz": self.cut_off,
+            "mean_relative_error": self.mean_relative_error,
+            "actuators": [asdict(actuator) for actuator in self.actuators],
+        }
+
+
+def predict_motion(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
+    """(m, n) efforts of the actuators at all rows of a motion, behind the low-pass of the model's identification.
+
+    Raises:
+        RecordingError: the recording does not fit the arm, or is no motion.
+        ModelError: the model has no dynamics.
+    """
+    dynamics = model.dynamic_model
+    grid = motion_grid(recording, model.load_arm(), dynamics.section.signals)
+    return low_pass(_efforts(model, grid), grid.rate, grid.settings.effort_cut_off)
+
+
+def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicValidation:
+    """Compares the model's efforts with those of a motion, in actuator coordinates.
+
+    The error of an actuator is |tau_f - tau_hat| / |tau_f|, both behind the zero-phase low-pass, a second left out at
+    each end: the metric of Wang et al. (RA-L 2019).
+
+    Raises:
+        RecordingError: the recording does not fit the arm, has no efforts, or is no motion.
+        ModelError: the model has no dynamics.
+    """
+    dynamics = model.dynamic_model
+    arm = model.load_arm()
+    tau = recording.in_actuator_coordinates(arm).measured_effort()
+    grid = motion_grid(recording, arm, dynamics.section.signals)
+    measured, predicted = grid.behind_filter(tau), grid.behind_filter(_efforts(model, grid))
+    a = grid.efforts_at_rows(arm.transmission.position(grid.q))[grid.inner]
+    v = grid.efforts_at_rows(arm.transmission.velocity(grid.v))[grid.inner]
+    period = period_of(grid)
+    floor: list[float | None] = [None] * arm.num_joints
+    if period is not None:
+        floors = repeatability_floor(tau, grid.rate, period, grid.settings.effort_cut_off)
+        floor = [float(x) if np.isfinite(x) else None for x in floors]
+    actuators = [
+        _actuator_error(name, measured[:, i], predicted[:, i], a[:, i], v[:, i], floor[i])
+        for i, name in enumerate(arm.joint_names)
+    ]
+    t = grid.row_times[grid.inner]
+    return DynamicValidation(actuators, grid.settings.effort_cut_off, t, a, v, measured, predicted)
+
+
+def _efforts(model: IdentifiedModel, grid: MotionGrid) -> NDArray[np.float64]:
+    return grid.efforts_at_rows(model.dynamic_model.effort(grid.q, grid.v, grid.vd))
+
+
+def _actuator_error(
+    name: str,
+    measured: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+    q: NDArray[np.float64],
+    v: NDArray[np.float64],
+    repeatability: float | None,
+) -> ActuatorError:
+    error = measured - predicted
+    effort, size = float(np.sqrt(np.mean(measured**2))), float(np.sqrt(np.mean(error**2)))
+    width = _FRICTION_WIDTH * float(np.sqrt(np.mean(v**2))) or 1.0
+    travel = (q - q.min()) / (float(np.ptp(q)) or 1.0)
+    kinds = [
+        [np.ones_like(q)],
+        [v, np.tanh(v / width)],
+        [f(np.pi * k * travel) for k in range(1, _HARMONICS + 1) for f in (np.sin, np.cos)],
+    ]
+    shares = []
+    columns: list[NDArray[np.float64]] = []
+    whole = left = float(np.sum(error**2)) or 1.0
+    for kind in kinds:
+        columns += kind
+        X = np.column_stack(columns)
+        rest = float(np.sum((error - X @ np.linalg.lstsq(X, error, rcond=None)[0]) ** 2))
+        shares.append((left - rest) / whole)
+        left = rest
+    bias, friction, position = shares
+    relative = size / effort if effort > 0 else None
+    return ActuatorError(name, effort, size, relative, bias, friction, position, left / whole, repeatability)

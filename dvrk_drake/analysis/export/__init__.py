@@ -1,0 +1,1 @@
+"""A gravity compensation in the formats of others, compared with theirs."""

@@ -1,0 +1,1 @@
+"""What an arm carries, from two recordings of the same motion."""

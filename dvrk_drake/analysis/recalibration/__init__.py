@@ -1,0 +1,1 @@
+"""Another day, the same arm: what drifts is identified anew from a short motion."""

@@ -1,0 +1,1 @@
+"""Signals of a recording: filtered, resampled, cut into rests, repetitions and folds."""

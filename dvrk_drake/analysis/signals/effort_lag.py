@@ -1,0 +1,103 @@
+"""How late efforts look behind the motion, and whether their friction opposes it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.signals.low_pass import low_pass
+from dvrk_drake.analysis.signals.motion_signals import MotionSignals
+
+#: Of the low-pass that efforts and what explains them get [Hz].
+CUT_OFF = 20.0
+#: Delays that are tried [s], and their step.
+LONGEST_LAG, LAG_STEP = 0.04, 0.0025
+#: Left out at each end, where filters swing in [s].
+ENDS = 1.0
+#: Coulomb friction is smoothed over this share of the RMS speed.
+SMOOTHING = 0.1
+#: Parts of the motion whose estimates give the standard errors.
+PARTS = 5
+#: A delay is told only if it takes the variance that is left down by this factor, and exceeds so many standard errors.
+LEAST_GAIN, LEAST_ERRORS = 1.12, 5.0
+
+
+class EffortLag(NamedTuple):
+    """How late tau is behind the motion, and its step where the speed changes its sign; (n,) each.
+
+    Attributes:
+        lag: that leaves least of tau unexplained [s], at most `LONGEST_LAG`; nan where the joint or its effort rests.
+        standard_error: of it, from `PARTS` parts of the motion [s].
+        gain: variance left without a delay over that with it [1].
+        determined: whether the lag is one: large gain, and many standard errors.
+        coulomb: Coulomb friction [N m, N]; negative where the effort has the wrong sign.
+        coulomb_error: its standard error, from `PARTS` parts of the motion.
+    """
+
+    lag: NDArray[np.float64]
+    standard_error: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    determined: NDArray[np.bool_]
+    coulomb: NDArray[np.float64]
+    coulomb_error: NDArray[np.float64]
+
+
+def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
+    """Fits each effort, delayed by up to 40 ms either way, by what its joint does; the least residual tells the delay.
+
+    Explained by: own Coulomb and viscous friction, all accelerations, sine and cosine of all positions. Friction that
+    builds up over some way after a reversal (presliding) looks like a delay, and no fit of one motion tells them apart.
+
+    Args:
+        signals: of the actuators: friction is theirs.
+        moving: (n,) which of them move.
+    """
+    rate = signals.rate
+    start = max(int(ENDS * rate), int(LONGEST_LAG * rate))
+    inner = slice(start, len(signals.t) - start)
+    tau = low_pass(signals.tau, rate, CUT_OFF)
+    angles = signals.q[:, moving]
+    shared = np.hstack([signals.vd[:, moving], np.sin(angles), np.cos(angles), np.ones((len(angles), 1))])
+    result = np.full((tau.shape[1], 5), np.nan)
+    for j in np.flatnonzero(moving & np.any(tau != 0, axis=0)):
+        v = signals.v[:, j]
+        coulomb = np.tanh(v / (SMOOTHING * np.sqrt(np.mean(v**2))))
+        columns = low_pass(np.column_stack([coulomb, v, shared]), rate, CUT_OFF)[inner]
+        Q, _ = np.linalg.qr(columns / (np.sqrt(np.mean(columns**2, axis=0)) + np.finfo(float).tiny))
+        result[j] = *_fit(tau[:, j], Q, inner, rate), *_coulomb(columns, tau[inner, j])
+    lag, error, gain, size, size_error = result.T
+    with np.errstate(invalid="ignore"):
+        determined = (gain > LEAST_GAIN) & (np.abs(lag) > LEAST_ERRORS * error)
+    return EffortLag(lag, error, gain, determined, size, size_error)
+
+
+def _coulomb(columns: NDArray[np.float64], tau: NDArray[np.float64]) -> tuple[float, float]:
+    """The first column's coefficient and its standard error."""
+    parts = zip(np.array_split(columns, PARTS), np.array_split(tau, PARTS), strict=True)
+    estimates = [np.linalg.lstsq(A, b, rcond=None)[0][0] for A, b in parts]
+    whole = np.linalg.lstsq(columns, tau, rcond=None)[0][0]
+    return float(whole), float(np.std(estimates, ddof=1) / np.sqrt(PARTS))
+
+
+def _fit(tau: NDArray[np.float64], Q: NDArray[np.float64], inner: slice, rate: float) -> tuple[float, float, float]:
+    """Lag [s], its standard error [s] and its gain, for what spans the columns of Q."""
+    step = max(round(LAG_STEP * rate), 1)
+    shifts = np.arange(-(inner.start // step), inner.start // step + 1) * step
+    shifts = shifts[np.abs(shifts) <= LONGEST_LAG * rate]
+    shifted = np.column_stack([tau[inner.start + s : inner.stop + s] for s in shifts])
+    squares = (shifted - Q @ (Q.T @ shifted)) ** 2
+    left = np.sum(squares, axis=0)
+    parts = [_least(shifts, np.sum(part, axis=0)) for part in np.array_split(squares, PARTS)]
+    error = float(np.std(parts, ddof=1)) / np.sqrt(PARTS)
+    return _least(shifts, left) / rate, error / rate, float(left[len(shifts) // 2] / np.min(left))
+
+
+def _least(at: NDArray[np.int_], values: NDArray[np.float64]) -> float:
+    """Where a sampled curve is least, between its samples by a parabola."""
+    i = int(np.clip(np.argmin(values), 1, len(values) - 2))
+    before, here, after = values[i - 1 : i + 2]
+    curvature = before - 2 * here + after
+    offset = 0.5 * (before - after) / curvature if curvature > 0 else 0.0
+    return float(at[i] + np.clip(offset, -1, 1) * (at[1] - at[0]))

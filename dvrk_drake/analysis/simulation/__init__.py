@@ -1,0 +1,1 @@
+"""One simulation: the scenario that describes it, and its run."""

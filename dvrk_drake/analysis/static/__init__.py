@@ -1,0 +1,1 @@
+"""Identification from static poses, and how good it is."""

@@ -1,0 +1,154 @@
+"""Which joint effects a static recording supports, chosen by cross-validation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.static.linear_fit import RobustFit, robust_fit
+from dvrk_drake.dynamics.actuator_effects import (
+    ActuatorEffect,
+    joint_row,
+    position_along,
+    slides,
+)
+from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
+from dvrk_drake.models.arm import Arm
+
+#: Prior standard deviation of a base parameter, as a share of what would use up some joint's effort limit by itself.
+BASE_PRIOR = 0.25
+#: Prior standard deviation of an effect, as a share of the effort that the limits of the joints allow along its
+#: coordinate. Offsets are kept small: over a narrow range a large one would take the place of gravity, and mislead
+#: outside of it.
+EFFECT_PRIOR = {"offset": 0.03, "cable sine": 0.3, "cable cosine": 0.3}
+#: Least standard deviation of a torque measurement, as a share of the effort limit.
+SIGMA_FLOOR = 2e-3
+#: An effect must lower the sum of squared left-out residuals (in sigma) by this much a coefficient: about log(poses).
+LEAST_GAIN = 4.0
+#: And by this many of its own standard errors over poses.
+LEAST_SIGNIFICANCE = 1.5
+#: A cable is considered if its joint moved by this much [rad]: less, and a sine would fit servo error, a cosine be an
+#: offset.
+LEAST_SPAN = {"cable sine": 0.25, "cable cosine": 1.5}
+
+
+class StaticProblem:
+    """The regression of one recording's torques on base parameters and any choice of effects."""
+
+    def __init__(self, arm: Arm, q: NDArray[np.float64], tau: NDArray[np.float64], usable: NDArray[np.bool_]):
+        """Of poses q (m, n) and torques tau (m, n) with `usable` (m, n) False where a measurement is doubted."""
+        self.arm, self.q, self.tau, self.usable = arm, q, tau, usable
+        self.base_model = compile_static_model(arm)
+        self._Y = self.base_model.regressor(q)
+        self.sigma_floor = SIGMA_FLOOR * arm.effort_limits
+
+    def subset(self, rows: NDArray[np.bool_]) -> StaticProblem:
+        """The problem of some of the poses."""
+        return StaticProblem(self.arm, self.q[rows], self.tau[rows], self.usable[rows])
+
+    def regressor(self, effects: Sequence[ActuatorEffect]) -> NDArray[np.float64]:
+        """X (m, n, b + e)."""
+        X = np.zeros((*self.tau.shape, self._Y.shape[2] + len(effects)))
+        X[..., : self._Y.shape[2]] = self._Y
+        for column, effect in enumerate(effects, start=self._Y.shape[2]):
+            X[..., column] = effect_column(self.arm, effect, self.q)
+        return X
+
+    def prior_precision(self, effects: Sequence[ActuatorEffect]) -> NDArray[np.float64]:
+        """(b + e,) inverse prior variances about zero."""
+        effect_sd = [EFFECT_PRIOR[effect.kind] * _effort_limit(self.arm, effect.coordinate) for effect in effects]
+        sd = np.concatenate([BASE_PRIOR * _largest_base_parameters(self.base_model), effect_sd])
+        return 1 / sd**2
+
+    def fit(
+        self, effects: Sequence[ActuatorEffect], iterations: int = 12, start: NDArray[np.float64] | None = None
+    ) -> RobustFit:
+        """Robust, shrunk fit with the given effects; `start` (n,) as in `robust_fit`."""
+        X, prior = self.regressor(effects), self.prior_precision(effects)
+        return robust_fit(X, self.tau, self.usable, prior, self.sigma_floor, iterations, start)
+
+
+def candidate_effects(problem: StaticProblem) -> list[list[ActuatorEffect]]:
+    """What may act at each joint that the poses say something of.
+
+    Coordinates of the transmission gain nothing here: they predict other recordings of the MTM a little worse.
+    """
+    arm, groups = problem.arm, []
+    for name in (f"joint.{joint}" for joint in arm.joint_names):
+        effects = [ActuatorEffect(name, "offset")]
+        span = 0.0 if slides(arm, name) else np.ptp(position_along(arm, name, problem.q))
+        effects += [ActuatorEffect(name, kind, 1.0) for kind, least in LEAST_SPAN.items() if span >= least]
+        groups.append([e for e in effects if not _is_gravity_too(problem.base_model, e)])
+    return groups
+
+
+def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
+    """Adds the effect (or all of one joint's) that lowers the leave-one-out error most, until none clearly does.
+
+    "Clearly": by more than `LEAST_GAIN` per coefficient and by more than 1.5 of the gain's own standard errors over
+    poses. Squared errors are capped at nine variances so that no single pose decides.
+    """
+    chosen: tuple[ActuatorEffect, ...] = ()
+    current = problem.fit(chosen)
+    groups = candidate_effects(problem)
+    while True:
+        loss = _loss(problem, current, current.sigma)
+        best_gain = 0.0
+        best: tuple[ActuatorEffect, ...] = ()
+        for group in groups:
+            new = [e for e in group if e not in chosen]
+            candidates: list[tuple[ActuatorEffect, ...]] = [(e,) for e in new] + ([tuple(new)] if len(new) > 1 else [])
+            for candidate in candidates:
+                trial = problem.fit((*chosen, *candidate), iterations=3, start=current.sigma)
+                gains = loss - _loss(problem, trial, current.sigma)
+                gain = gains.sum()
+                clear = gain > LEAST_SIGNIFICANCE * gains.std() * np.sqrt(len(gains)) and gain > LEAST_GAIN * len(
+                    candidate
+                )
+                if clear and gain > best_gain:
+                    best_gain, best = gain, candidate
+        if not best:
+            return tuple(effect for group in groups for effect in group if effect in chosen)
+        chosen = (*chosen, *best)
+        current = problem.fit(chosen)
+
+
+def _loss(problem: StaticProblem, fit: RobustFit, sigma: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(m,) capped squared leave-one-out error of each pose in units of sigma."""
+    return (np.minimum((fit.fit.left_out_residuals / sigma) ** 2, 9.0) * problem.usable).sum(axis=1)
+
+
+@cache
+def _largest_base_parameters(model: StaticModel) -> NDArray[np.float64]:
+    """(b,) size at which each base parameter alone would need some joint's whole effort limit somewhere in the box."""
+    arm = model.gravity.arm
+    q = np.random.default_rng(0).uniform(arm.position_lower, arm.position_upper, (3000, arm.num_joints))
+    largest = np.abs(model.regressor(q)).max(axis=0)
+    limits = np.where(largest > 1e-9, arm.effort_limits[:, None] / np.maximum(largest, 1e-9), np.inf)
+    return limits.min(axis=0)
+
+
+@cache
+def _is_gravity_too(model: StaticModel, effect: ActuatorEffect) -> bool:
+    """Whether no measurement could tell the effect from gravity, as a spring at a yaw joint that lifts weight."""
+    arm = model.gravity.arm
+    poses = arm.sample_poses(100, np.random.default_rng(0))
+    Y = model.regressor(poses).reshape(-1, len(model.gravity.base.names))
+    column = effect_column(arm, effect, poses)
+    rest = column.ravel() - Y @ np.linalg.lstsq(Y, column.ravel(), rcond=None)[0]
+    return bool(np.linalg.norm(rest) < 1e-9 * np.linalg.norm(column))
+
+
+def effect_column(arm: Arm, effect: ActuatorEffect, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(m, n) torque of an effect of position on the joints at poses q (m, n), per unit of its coefficient."""
+    x = position_along(arm, effect.coordinate, q)
+    return effect.column(x, 0 * x)[:, None] * joint_row(arm, effect.coordinate)
+
+
+def _effort_limit(arm: Arm, coordinate: str) -> float:
+    """Largest effort along the coordinate that no joint's limit is below."""
+    row = np.abs(joint_row(arm, coordinate))
+    return float(np.min(arm.effort_limits[row > 1e-9] / row[row > 1e-9]))

@@ -1,0 +1,268 @@
+"""Parameters of the static model from recorded poses and holding torques (paper, III.I, and further)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.static.doubts import Doubt, check_effort_unit, find_doubts, outlier_doubts, usable_measurements
+from dvrk_drake.analysis.static.effect_selection import StaticProblem, select_effects
+from dvrk_drake.analysis.static.linear_fit import LinearFit, rms, weighted_fit
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
+from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
+from dvrk_drake.dynamics.identified_model import (
+    BaseParameterEstimate,
+    IdentifiedModel,
+    JointStatistics,
+    Provenance,
+)
+from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.errors import IdentificationError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.recording import REST_SPEED, SAME_POSE, Recording
+
+Method = Literal["robust", "paper"]
+
+#: Fewest distinct poses that are accepted.
+LEAST_POSES = 8
+#: A joint whose measured torque stays below this share of its effort limit says nothing about its model, unless
+#: leave-one-out explains most of it: less than the second share of it is left.
+LEAST_TORQUE, CLEAR_GAIN_RATIO = 0.02, 0.5
+#: Nor does one that moved by less than this share of its range: its torque elsewhere would be a guess.
+LEAST_MOTION = 0.02
+#: Leave-one-out must lower the RMS error to this share of zero torque's, or the joint's torque is scaled down.
+LEAST_GAIN_RATIO = 0.98
+FOLDS = 10
+
+
+@dataclass(frozen=True)
+class StaticIdentification:
+    """A model with what a report of it needs: the poses used, in joint coordinates, doubts, and (m, n) residuals.
+
+    `measured` (m, n) is False where an effort is no holding torque.
+    """
+
+    model: IdentifiedModel
+    recording: Recording
+    doubts: list[Doubt]
+    residuals: NDArray[np.float64]
+    left_out_residuals: NDArray[np.float64]
+    measured: NDArray[np.bool_]
+
+
+def identify_static(
+    recording: Recording,
+    arm: Arm,
+    method: Method = "robust",
+    progress: Callable[[float], None] = lambda share: None,
+    measured: NDArray[np.bool_] | None = None,
+) -> StaticIdentification:
+    """Identifies the static model of `arm` from a recording of poses at rest.
+
+    "paper": unweighted least squares on the base parameters, eq. 9-10 of the paper.
+    "robust" (default): each joint weighted by its own spread, measurements on a stop or far off left out, effects
+    chosen by leave-one-out, every parameter shrunk toward zero by a prior derived from the effort limits, and a joint's
+    torque scaled down where leave-one-out says that the model is no better than zero torque, or where the joint hardly
+    moved. Samples of one pose are averaged first: left out one at a time they would vouch for each other.
+
+    Args:
+        recording: poses with efforts, in either coordinates.
+        arm: the arm it was recorded on.
+        method: see above.
+        progress: called with the finished share, 0..1.
+        measured: (m, n) False where an effort is no holding torque, as `slow_parts` gives it; by default all are.
+
+    Raises:
+        RecordingError: the recording does not fit the arm or has no efforts.
+        IdentificationError: too few poses, a motion instead of poses, or (method "paper") a rank too low.
+    """
+    recording.check_fits(arm)
+    recording = recording.in_joint_coordinates(arm)
+    _check_rest(recording, arm)
+    if method == "robust" and measured is None:
+        recording = average_repeated_poses(recording, arm)
+    tau = recording.measured_effort()
+    _check_poses(recording, arm)
+    gravity_model = compile_static_model(arm)
+    Y = gravity_model.regressor(recording.q)
+    stacked = Y.reshape(-1, Y.shape[2]) if measured is None else Y[measured]
+    rank = int(np.linalg.matrix_rank(stacked, tol=1e-9 * np.linalg.norm(stacked, 2)))
+    doubts = find_doubts(recording, arm, measured)
+    if measured is None:
+        measured = np.ones(tau.shape, dtype=bool)
+    usable = usable_measurements(tau.shape, doubts) & measured
+    effects: tuple[ActuatorEffect, ...] = ()
+    trust = np.ones(arm.num_joints)
+    validated = np.full_like(tau, np.nan)
+    if method == "paper":
+        if rank < Y.shape[2]:
+            raise IdentificationError(
+                f"{recording.source}: {len(recording)} poses determine only {rank} of {Y.shape[2]} base parameters; "
+                "least squares has no unique answer: record more varied poses or use --method robust"
+            )
+        fit = weighted_fit(Y, tau, measured.astype(float), np.zeros(Y.shape[2]))
+        # Unit weights: the covariance takes its scale from the residuals, as the textbook does.
+        variance = np.sum(fit.residuals[measured] ** 2) / (np.sum(measured) - Y.shape[2])
+        validated, sd = fit.left_out_residuals, np.sqrt(variance * np.diag(fit.covariance))
+    else:
+        problem = StaticProblem(arm, recording.q, tau, usable)
+        progress(0.0)
+        effects = select_effects(problem)
+        progress(1 / (FOLDS + 1))
+        robust = problem.fit(effects)
+        fit, sd = robust.fit, np.sqrt(np.diag(robust.fit.covariance))
+        doubts = doubts + outlier_doubts(recording, arm, robust.outliers, fit.residuals)
+        usable = usable & ~robust.outliers
+        trust = _trust(problem, fit.left_out_residuals, usable)
+        validated = _cross_validate(problem, progress)
+    fit = _scaled(fit, tau, trust)
+    model = IdentifiedModel(
+        arm=arm.source,
+        gravity=[float(x) for x in arm.gravity],
+        base_parameters=[
+            BaseParameterEstimate(name, *_estimate(value, error))
+            for name, value, error in zip(gravity_model.gravity.base.names, fit.theta, sd, strict=False)
+        ],
+        effects=[
+            ActuatorEffectEstimate(effect.coordinate, effect.kind, effect.scale, float(value), float(error))
+            for effect, value, error in zip(effects, fit.theta[Y.shape[2] :], sd[Y.shape[2] :], strict=True)
+        ],
+        joints=_statistics(recording, arm, fit, validated, measured, usable, trust),
+        provenance=Provenance(
+            recording=recording.source,
+            sha256=recording.sha256,
+            poses=len(recording),
+            method=method,
+            rank=rank,
+            condition_number=float(np.linalg.cond(stacked)) if rank == Y.shape[2] else float("inf"),
+            version=version("dvrk-drake"),
+        ),
+    )
+    return StaticIdentification(model, recording, doubts, fit.residuals, fit.left_out_residuals, measured)
+
+
+def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:
+    """One row a pose: rows whose joints agree within `SAME_POSE` with the first of them are its samples."""
+    same = arm.per_joint(*SAME_POSE)
+    groups: list[list[int]] = []
+    for row, q in enumerate(recording.q):
+        group = next((g for g in groups if np.all(np.abs(recording.q[g[0]] - q) < same)), None)
+        if group is None:
+            groups.append([row])
+        else:
+            group.append(row)
+    if len(groups) == len(recording):
+        return recording
+    first = [group[0] for group in groups]
+    return replace(
+        recording,
+        q=np.array([recording.q[g].mean(axis=0) for g in groups]),
+        tau=np.array([recording.measured_effort()[g].mean(axis=0) for g in groups]),
+        qd=None,
+        t=None,
+        lines=None if recording.lines is None else recording.lines[first],
+    )
+
+
+def _check_rest(recording: Recording, arm: Arm) -> None:
+    if motion := recording.motion(arm):
+        raise IdentificationError(
+            f"{recording.source}: the arm moves ({motion}); static identification needs poses at rest, below "
+            f"{REST_SPEED[0]} rad/s, or the slow parts of a motion (--slow-parts)"
+        )
+
+
+def _check_poses(recording: Recording, arm: Arm) -> None:
+    if len(recording) < LEAST_POSES:
+        raise IdentificationError(
+            f"{recording.source}: has {len(recording)} distinct poses, too few to identify from; "
+            f"at least {LEAST_POSES}, better 40 or more that cover the arm's range"
+        )
+    check_effort_unit(recording, arm)
+
+
+def _trust(problem: StaticProblem, left_out: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(n,) scale of each joint's torque that leave-one-out supports: 1 unless it is no better than zero torque."""
+    arm = problem.arm
+    least_motion = LEAST_MOTION * (arm.position_upper - arm.position_lower)
+    trust = np.ones(arm.num_joints)
+    for j in range(arm.num_joints):
+        use = usable[:, j]
+        measured, predicted = problem.tau[use, j], (problem.tau - left_out)[use, j]
+        ratio = rms(measured - predicted) / max(rms(measured), 1e-12)
+        small = rms(measured) < LEAST_TORQUE * arm.effort_limits[j]
+        if not np.any(use) or np.ptp(problem.q[use, j]) <= least_motion[j] or (small and ratio > CLEAR_GAIN_RATIO):
+            trust[j] = 0.0
+        elif ratio > LEAST_GAIN_RATIO:
+            power = np.sum(predicted**2)
+            trust[j] = float(np.clip(measured @ predicted / power, 0.0, 1.0)) if power > 0 else 1.0
+    return trust
+
+
+def _cross_validate(problem: StaticProblem, progress: Callable[[float], None]) -> NDArray[np.float64]:
+    """(m, n) residuals of ten-fold cross-validation, effects and trust chosen anew in every fold."""
+    poses = len(problem.q)
+    folds = np.random.default_rng(0).permutation(poses) % min(FOLDS, poses)
+    residuals = np.empty_like(problem.tau)
+    for fold in range(folds.max() + 1):
+        rest = problem.subset(folds != fold)
+        effects = select_effects(rest)
+        robust = rest.fit(effects)
+        trust = _trust(rest, robust.fit.left_out_residuals, rest.usable & ~robust.outliers)
+        out = problem.subset(folds == fold)
+        residuals[folds == fold] = out.tau - trust * (out.regressor(effects) @ robust.fit.theta)
+        progress((fold + 2) / (FOLDS + 1))
+    return residuals
+
+
+def _scaled(fit: LinearFit, tau: NDArray[np.float64], trust: NDArray[np.float64]) -> LinearFit:
+    """The fit's residuals with each joint's prediction scaled by its trust."""
+    return LinearFit(
+        fit.theta,
+        fit.covariance,
+        tau - trust * (tau - fit.residuals),
+        tau - trust * (tau - fit.left_out_residuals),
+    )
+
+
+def _statistics(
+    recording: Recording,
+    arm: Arm,
+    fit: LinearFit,
+    validated: NDArray[np.float64],
+    measured: NDArray[np.bool_],
+    usable: NDArray[np.bool_],
+    trust: NDArray[np.float64],
+) -> list[JointStatistics]:
+    tau = recording.measured_effort()
+    statistics = []
+    for j, name in enumerate(arm.joint_names):
+        every, use = measured[:, j], usable[:, j]
+        lower, upper = (recording.q[every, j].min(), recording.q[every, j].max()) if np.any(every) else (0.0, 0.0)
+        statistics.append(
+            JointStatistics(
+                name=name,
+                rms_zero_torque=rms(tau[every, j]),
+                rms_fit=rms(fit.residuals[every, j]),
+                rms_leave_one_out=rms(fit.left_out_residuals[every, j]),
+                rms_zero_torque_undoubted=rms(tau[use, j]),
+                rms_fit_undoubted=rms(fit.residuals[use, j]),
+                rms_leave_one_out_undoubted=rms(fit.left_out_residuals[use, j]),
+                rms_cross_validation_undoubted=rms(validated[use, j]),
+                num_doubted=int(np.sum(every & ~use)),
+                trust=float(trust[j]),
+                position_lower=float(lower),
+                position_upper=float(upper),
+                coverage=float((upper - lower) / (arm.position_upper[j] - arm.position_lower[j])),
+            )
+        )
+    return statistics
+
+
+def _estimate(value: float, standard_error: float) -> tuple[float, float, bool]:
+    return float(value), float(standard_error), bool(abs(value) > 2 * standard_error)

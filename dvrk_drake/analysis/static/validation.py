@@ -1,0 +1,123 @@
+"""How well a model predicts the torques of a recording."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.static.doubts import Doubt, check_effort_unit, find_doubts, usable_measurements
+from dvrk_drake.analysis.static.linear_fit import rms
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.recording import Recording
+
+
+@dataclass(frozen=True)
+class JointError:
+    """One joint's error over a recording: RMS in N m (N if prismatic) in the coordinates that the recording is in.
+
+    `rms_torque` is what commanding zero torque would err by; `relative_error` = rms_error / rms_torque, None where
+    nothing was measured. `_undoubted`
+    leaves out `num_doubted` measurements of poses that rest on a stop or exceed the effort limit.
+    """
+
+    name: str
+    rms_torque: float
+    rms_error: float
+    relative_error: float | None
+    rms_torque_undoubted: float
+    rms_error_undoubted: float
+    num_doubted: int
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Errors of `model` on one recording; residuals are measured minus predicted, (m, n).
+
+    `measured` (m, n) is False where an effort is no holding torque.
+    """
+
+    joints: list[JointError]
+    poses: int
+    residuals: NDArray[np.float64]
+    doubts: list[Doubt]
+    measured: NDArray[np.bool_]
+
+    def as_dict(self) -> dict:
+        """What `validate --json` writes."""
+        return {
+            "joints": [asdict(joint) for joint in self.joints],
+            "poses": self.poses,
+            "doubted": [{"where": doubt.where, "reason": doubt.reason} for doubt in self.doubts],
+        }
+
+
+def predict(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
+    """Holding torques (m, n) at the recording's poses, in the recording's own coordinates.
+
+    Raises:
+        RecordingError: the recording does not fit the model's arm.
+    """
+    arm = model.load_arm()
+    recording.check_fits(arm)
+    tau = model.holding_torque(recording.in_joint_coordinates(arm).q)
+    if recording.coordinates == "actuator":
+        # tau_joint = J' tau_actuator, so the inverse map pulls back from joints to actuators.
+        tau = arm.transmission.inverse().pull_back_effort(tau)
+    return tau
+
+
+def validate(
+    model: IdentifiedModel, recording: Recording, measured_joints: NDArray[np.bool_] | None = None
+) -> Validation:
+    """Compares a model with a recording.
+
+    Args:
+        model: the model.
+        recording: in either coordinates.
+        measured_joints: (m, n) False where an effort is no holding torque, as `slow_parts` gives it; default: all are.
+
+    Raises:
+        RecordingError: the recording does not fit the model's arm, or has no efforts.
+    """
+    arm = model.load_arm()
+    measured = recording.measured_effort()
+    residuals = measured - predict(model, recording)
+    in_joints = recording.in_joint_coordinates(arm)
+    if measured_joints is None:
+        measured_joints = np.ones(measured.shape, dtype=bool)
+    check_effort_unit(in_joints, arm)
+    doubts = find_doubts(in_joints, arm, measured_joints)
+    usable = usable_measurements(measured.shape, doubts) & measured_joints
+    if recording.coordinates == "actuator":
+        # A doubt about a joint touches every actuator that drives it.
+        usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
+    errors = _joint_errors(arm, measured, residuals, measured_joints, usable)
+    return Validation(errors, len(recording), residuals, doubts, measured_joints)
+
+
+def _joint_errors(
+    arm: Arm,
+    measured: NDArray[np.float64],
+    residuals: NDArray[np.float64],
+    measured_joints: NDArray[np.bool_],
+    usable: NDArray[np.bool_],
+) -> list[JointError]:
+    errors = []
+    for j, name in enumerate(arm.joint_names):
+        every, use = measured_joints[:, j], usable[:, j]
+        torque, error = rms(measured[every, j]), rms(residuals[every, j])
+        errors.append(
+            JointError(
+                name,
+                torque,
+                error,
+                error / torque if torque > 0 else None,
+                rms(measured[use, j]),
+                rms(residuals[use, j]),
+                int(np.sum(every & ~use)),
+            )
+        )
+    return errors

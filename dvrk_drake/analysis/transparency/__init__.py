@@ -1,0 +1,1 @@
+"""Force and torque that an operator feels at the handle."""
