@@ -4,7 +4,7 @@ VENV ?= .venv
 # Which tests test-fast runs, as pytest's -m; TESTS= runs all of them, as CI does.
 TESTS ?= not slow
 # CI leaves out the PSM's collection, which is the MTM's again with another arm.
-RECORDINGS ?= tests/test_record_udp.py tests/test_collect_udp.py tests/test_collect_psm_udp.py
+RECORDINGS ?= tests/udp/test_record_udp.py tests/udp/test_collect_udp.py tests/udp/test_collect_psm_udp.py
 BIN := $(VENV)/bin
 
 .PHONY: demo test test-fast test-udp test-recordings lint benchmark clean
@@ -19,7 +19,7 @@ test-fast: $(VENV)/.installed-test
 
 # One after the other: each runs several processes at 1 kHz, and wants the cores for itself.
 test-udp: $(VENV)/.installed-test
-	$(BIN)/python -m pytest tests/test_lcm_udp.py
+	$(BIN)/python -m pytest tests/udp/test_lcm_udp.py
 
 # Recordings over UDP, and collections of both arms from the first pose to the release: minutes.
 test-recordings: $(VENV)/.installed-test

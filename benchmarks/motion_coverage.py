@@ -24,7 +24,7 @@ from dvrk_drake.analysis.signals.phase_folds import period_of
 from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters
 from dvrk_drake.models.arm import Arm, load_arm
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 
 RATE = 1000.0

@@ -2,7 +2,7 @@
 
     python benchmarks/payload_coverage.py [--seeds 40]
 
-Every arm has links, friction, springs and cables of its own (tests/loaded_arm.py says how large).
+Every arm has links, friction, springs and cables of its own (tests/support/loaded_arm.py says how large).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from dvrk_drake.analysis.payload.payload import estimate_payload
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 from loaded_arm import two_days
 
 CASES = [

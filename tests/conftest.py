@@ -7,35 +7,26 @@ from pathlib import Path
 
 import pytest
 
-#: Files of which CI runs one Python only: what they test uses nothing of Drake that differs between its versions.
+TESTS = Path(__file__).resolve().parent
+
+#: Folders and files of which CI runs one Python only: what they test uses nothing of Drake that differs between its
+#: versions. A name stands for all that begin with it.
 ONE_PYTHON = (
-    *(
-        "test_collect",
-        "test_command_guard",
-        "test_convert",
-        "test_guard_",
-        "test_lcm_log",
-        "test_payload",
-        "test_pose_file",
-    ),
-    *(
-        "test_recalibration",
-        "test_record",
-        "test_static_identification",
-        "test_slow_parts",
-        "test_study",
-        "test_teacher",
-    ),
-    *("test_gravity_compensation", "test_kinematic_compensation", "test_reproduction", "test_transparency", "test_leg"),
-    *("test_parameter_uncertainty", "test_nearest_links", "test_measures", "test_live_line", "test_dynamic_statics"),
-    *("test_tuning", "test_whitening", "test_dynamic_identification", "test_dynamic_choice", "test_psm_identification"),
+    *("models/test_collection_file", "models/test_lcm_log", "models/test_pose_file", "models/test_recording"),
+    *("dynamics/test_gravity_compensation", "dynamics/test_kinematic_compensation", "dynamics/test_nearest_links"),
+    "systems/guard/",
+    *("analysis/check/", "analysis/convert/", "analysis/dynamic/", "analysis/payload/", "analysis/recalibration/"),
+    *("analysis/reproduction/", "analysis/signals/", "analysis/static/", "analysis/study/", "analysis/transparency/"),
+    "analysis/tuning/",
+    *("processes/test_collector", "processes/test_leg", "processes/test_live_line", "processes/test_teacher"),
+    "cli/test_collect",
 )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks the tests of these files."""
     for item in items:
-        if item.path.name.startswith(ONE_PYTHON):
+        if item.path.relative_to(TESTS).as_posix().startswith(ONE_PYTHON):
             item.add_marker("one_python")
 
 
@@ -45,7 +36,7 @@ def shared_data() -> Path:
 
     The environment variable DVRK_DRAKE_SHARED names another place of `shared`.
     """
-    default = Path(__file__).resolve().parents[2] / "shared"
+    default = TESTS.parents[1] / "shared"
     data = Path(os.environ.get("DVRK_DRAKE_SHARED", default)) / "data"
     if not data.is_dir():
         pytest.skip(f"needs recordings of real arms in {data} (DVRK_DRAKE_SHARED names the folder above)")

@@ -11,15 +11,13 @@ import lcm
 import numpy as np
 import pytest
 from own_network import end, inside, outside, run_inside, start
-from test_lcm_log import log_bytes, statuses
+from status_logs import ARM, log_bytes, statuses
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.lcm_log import LcmLogReader
 from dvrk_drake.models.recording import read_recording
 from dvrk_drake.models.status_stream import measurements
 
-ARM = load_arm("mtml")
 TOOLS = Path(lcm.__file__).parents[1] / "bin"  # the programs themselves: those on the PATH start them as children
 COLUMNS = [f"{prefix}{i + 1}" for prefix in ("q", "qd", "tau") for i in range(7)]
 

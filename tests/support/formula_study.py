@@ -1,6 +1,6 @@
 """The command line with a formula in place of the simulation, in all processes: workers that are spawned import this.
 
-python tests/formula_study.py study STUDY.yaml --output RESULTS.csv --workers 2
+python tests/support/formula_study.py study STUDY.yaml --output RESULTS.csv --workers 2
 """
 
 import sys

@@ -1,9 +1,8 @@
 """`dvrk-drake study` as a user meets it: what is refused, in one line, before anything runs."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from repository import ROOT
 
 from dvrk_drake.analysis.study.study_file import load_study
 from dvrk_drake.cli import main
@@ -108,7 +107,7 @@ def test_schedulers_that_are_none_are_refused(study, capsys, monkeypatch):
 
 
 def test_the_example_is_a_study():
-    study = load_study(Path(__file__).resolve().parents[1] / "examples" / "release_study.yaml")
+    study = load_study(ROOT / "examples" / "release_study.yaml")
     assert len(study.cases) == 60
 
 

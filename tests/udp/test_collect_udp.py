@@ -1,16 +1,16 @@
 """From poses to a compensated arm, with real processes over real UDP multicast in a network of their own.
 
-As in test_lcm_udp.py, this file starts itself again inside a network namespace.
+This file starts itself again inside a network namespace.
 """
 
 import signal
-import sys
 import time
 
 import numpy as np
 import pytest
-from own_network import end, inside, outside, run_inside, start
-from test_lcm_udp import Observer
+from arm_observer import Observer
+from collecting import collect_until, dvrk_drake, holds
+from own_network import end, inside, outside, run_inside
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -28,10 +28,6 @@ def test_in_a_network_of_its_own():
     run_inside(__file__)
 
 
-def dvrk_drake(*arguments):
-    return start(sys.executable, "-m", "dvrk_drake.cli", *map(str, arguments))
-
-
 @pytest.fixture(scope="module")
 def observer():
     """What a running arm says."""
@@ -41,32 +37,6 @@ def observer():
     yield observer
     said = end(process, signal.SIGINT)
     assert process.returncode == 0, said
-
-
-def until(condition, seconds, process):
-    """Waits; False if the arm took over instead, as it does when a machine busy with other tests is late."""
-    deadline = time.monotonic() + seconds
-    while not condition():
-        if process.poll() is not None:
-            said = process.stdout.read()
-            assert process.returncode == 2 and " took over and holds" in said, said
-            return False
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    return True
-
-
-def collect_until(condition, command):
-    """A collecting process in which the condition has come true; the same command goes on where one ended."""
-    for _ in range(6):
-        process = dvrk_drake(*command)
-        if until(condition, 60, process):
-            return process
-    raise AssertionError("the arm took over six times")
-
-
-def holds(status):
-    return status.guard_state == Status.STATE_HOLD
 
 
 def moving(status):

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.io
+from repository import ROOT
 
 from dvrk_drake.analysis.convert.convert import convert, detect_format
 from dvrk_drake.analysis.convert.team_mat import read_team_mat
@@ -16,7 +17,7 @@ from dvrk_drake.analysis.convert.wpi_csv import read_wpi_csv
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.recording import read_recording
 
-DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "public_recordings.md"
+DOCUMENT = ROOT / "docs" / "public_recordings.md"
 
 
 def team_array(num_poses: int = 5) -> np.ndarray:

@@ -27,7 +27,7 @@ variations: [{name: nominal}, {name: wrong, set: [controller.parameter_error=0.2
 measures: [{kind: held, time: 1}, {kind: drift, time: 0.5}, {kind: effort_share}]
 """
 #: The command line with a formula in place of the simulation, which workers would compile for seconds.
-FORMULA = Path(__file__).with_name("formula_study.py")
+FORMULA = Path(formula_study.__file__)
 PATIENCE = 120.0  # s, for a crowded machine
 
 

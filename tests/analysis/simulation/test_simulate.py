@@ -1,9 +1,8 @@
 """Scenarios and `dvrk-drake simulate`: one scenario, one result; and what is refused, in one line."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from repository import ROOT
 
 from dvrk_drake.analysis.simulation.scenario import Scenario, Target
 from dvrk_drake.analysis.simulation.scenario_file import load_scenario
@@ -14,7 +13,7 @@ from dvrk_drake.errors import ScenarioError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import read_recording
 
-EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "psm_reach.yaml"
+EXAMPLE = ROOT / "examples" / "psm_reach.yaml"
 PSM = load_arm("psm")
 ZERO = "[0,0,0.1,0,0,0,0]"
 

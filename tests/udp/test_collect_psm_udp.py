@@ -1,14 +1,14 @@
 """A collection of a PSM from both sides, with real processes over real UDP multicast in a network of their own.
 
-As in test_lcm_udp.py, this file starts itself again inside a network namespace.
+This file starts itself again inside a network namespace.
 """
 
 import signal
 
 import numpy as np
+from arm_observer import Observer
+from collecting import collect_until, dvrk_drake, holds
 from own_network import end, inside, outside, run_inside
-from test_collect_udp import collect_until, dvrk_drake, holds
-from test_lcm_udp import Observer
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel

@@ -2,17 +2,17 @@
 
 import re
 from collections import deque
-from pathlib import Path
 
 import numpy as np
 import pytest
+from repository import ROOT
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.guard.settings import GuardSettings
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "connecting_a_real_dvrk.md"
+DOCUMENT = ROOT / "docs" / "connecting_a_real_dvrk.md"
 ARM = load_arm("mtml")
 N = ARM.num_joints
 HELD = 0.02 * ARM.effort_limits

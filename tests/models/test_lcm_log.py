@@ -5,7 +5,8 @@ import resource
 import lcm
 import numpy as np
 import pytest
-from test_slow_parts import motion
+from rests import motion_with_rests
+from status_logs import ARM, START, N, log_bytes, statuses
 
 from dvrk_drake.analysis.convert.convert import convert
 from dvrk_drake.cli import main
@@ -13,37 +14,10 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.lcm_log import LcmEvent, LcmLogReader, event_bytes
+from dvrk_drake.models.lcm_log import LcmLogReader
 from dvrk_drake.models.recording import read_recording
 from dvrk_drake.models.recording_stream import open_recording_file
 from dvrk_drake.models.status_stream import StatusStream
-
-ARM = load_arm("mtml")
-N = ARM.num_joints
-START = 1_795_257_600_000_000
-
-
-def statuses(count=20, seed=1, **changes):
-    """Statuses 1 ms apart with random measurements inside the limits."""
-    generator = np.random.default_rng(seed)
-    result = []
-    for k, q in enumerate(ARM.sample_poses(count, generator)):
-        status = Status()
-        status.utime, status.sequence, status.session_id = START + 1000 * k, 100 + k, 77
-        status.arm_name, status.num_joints, status.guard_state = "MTML", N, Status.STATE_HOLD
-        status.position = q.tolist()
-        status.velocity, status.effort_measured = generator.uniform(-0.1, 0.1, (2, N)).tolist()
-        status.position_commanded, status.effort_commanded = status.position, status.effort_measured
-        status.joint_flags = [0] * N
-        for name, value in changes.items():
-            setattr(status, name, value)
-        result.append(status)
-    return result
-
-
-def log_bytes(messages, channel="DVRK_STATUS_MTML"):
-    data = [m if isinstance(m, bytes) else m.encode() for m in messages]
-    return b"".join(event_bytes(LcmEvent(k, START + 1000 * k, channel, d)) for k, d in enumerate(data))
 
 
 def write_log(path, *parts):
@@ -241,7 +215,7 @@ def test_commands_read_a_log_as_they_read_a_csv(tmp_path, capsys):
 def test_a_log_of_a_moving_arm_identifies_it_by_its_rests(tmp_path, capsys):
     """At 1 kHz from pose to pose, with a friction on the way that would spoil a model."""
     generator = np.random.default_rng(5)
-    recording = motion(ARM, ARM.sample_poses(16, generator, margin=0.05), generator, 1.0, 1.0, 1000.0)
+    recording = motion_with_rests(ARM, ARM.sample_poses(16, generator, margin=0.05), generator, 1.0, 1.0, 1000.0)
     messages = []
     for k, (q, qd, tau) in enumerate(zip(recording.q, recording.qd, recording.tau, strict=True)):
         (status,) = statuses(1, utime=START + 1000 * k, sequence=k)

@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import lcm
 import lcm_controller
 import numpy as np
 import pytest
+from arm_observer import NETWORK_URL, Observer
 from own_network import INSIDE, inside, outside, run_inside
 
 from dvrk_drake import cli
@@ -28,7 +28,7 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes.pace import Pace, make_realtime
 from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
 
-NETWORK_URL, OTHER_URL = (f"udpm://239.255.76.67:{port}?ttl=0" for port in (7667, 7668))
+OTHER_URL = "udpm://239.255.76.67:7668?ttl=0"
 LCM_TOOLS = Path(lcm.__file__).parent / "../bin"
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
 
@@ -36,41 +36,6 @@ POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 
 @outside
 def test_in_a_network_of_its_own():
     run_inside(__file__)
-
-
-class Observer:
-    """What an arm says, with the time of arrival, gathered by a thread."""
-
-    def __init__(self, name, url=NETWORK_URL):
-        self.heard = []
-        self.lcm = lcm.LCM(url)
-        subscription = self.lcm.subscribe(f"DVRK_STATUS_{name.upper()}", self.hear)
-        subscription.set_queue_capacity(0)  # no limit: none may be lost here
-        threading.Thread(target=self.listen, daemon=True).start()
-
-    def listen(self):
-        while True:
-            self.lcm.handle()
-
-    def hear(self, channel, data):
-        self.heard.append((time.monotonic(), Status.decode(data)))
-
-    @property
-    def last(self):
-        return self.heard[-1][1]
-
-    def until(self, condition, seconds, what, since=None):
-        """The index of the first status that meets the condition, of those from now on or since an index."""
-        end = time.monotonic() + seconds
-        seen = len(self.heard) if since is None else since
-        while time.monotonic() < end:
-            for k in range(seen, len(self.heard)):
-                if condition(self.heard[k][1]):
-                    return k
-            seen = len(self.heard)
-            time.sleep(1e-3)
-        last = self.last if self.heard else Status()
-        raise AssertionError(f"{what}: not within {seconds} s; state {last.guard_state}, refusal {last.refusal_code}")
 
 
 if INSIDE in os.environ:

@@ -1,10 +1,10 @@
 """The slow parts of a motion: what is taken for a pose, and what it can tell."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from rests import RATE, motion_with_rests
 
 from dvrk_drake.analysis.convert.convert import convert
 from dvrk_drake.analysis.signals.poses import find_poses
@@ -18,33 +18,16 @@ from dvrk_drake.models.recording import Recording, read_recording
 
 pytestmark = pytest.mark.slow
 
-RATE = 200.0
-
 
 @pytest.fixture(scope="module")
 def arm():
     return load_arm("psm")
 
 
-def motion(arm, poses, generator, travel=2.0, rest=0.4, rate=RATE):
-    """From pose to pose with a rest at each; torques are gravity's plus a viscous friction that spoils the travel."""
-    t_travel, t_rest = np.arange(0, travel, 1 / rate), np.arange(0, rest, 1 / rate)
-    s = t_travel / travel
-    blend = 10 * s**3 - 15 * s**4 + 6 * s**5
-    q = [np.tile(poses[0], (len(t_rest), 1))]
-    for a, b in itertools.pairwise(poses):
-        q += [a + blend[:, None] * (b - a), np.tile(b, (len(t_rest), 1))]
-    q = np.vstack(q)
-    qd = np.gradient(q, 1 / rate, axis=0)
-    tau = IdentifiedModel.from_arm(arm).holding_torque(q) + 0.05 * arm.effort_limits * qd
-    tau += 1e-3 * arm.effort_limits * generator.normal(size=tau.shape)
-    return Recording(q=q, qd=qd, tau=tau, t=np.arange(len(q)) / rate)
-
-
 def test_rests_of_a_motion_are_found_and_identify_the_arm(arm):
     generator = np.random.default_rng(0)
     poses = arm.sample_poses(16, generator, margin=0.1)
-    recording = motion(arm, poses, generator)
+    recording = motion_with_rests(arm, poses, generator)
     parts, measured = slow_parts(recording, arm)
     assert np.all(measured.sum(axis=1) == 1)
     # A joint that hardly moves from one pose to the next is slow all the way: then the two rests are one pass.
@@ -64,14 +47,15 @@ def test_rests_of_a_motion_are_found_and_identify_the_arm(arm):
 def test_repetitions_are_one_part(arm):
     generator = np.random.default_rng(1)
     a, b = arm.sample_poses(2, generator, margin=0.1)
-    once, thrice = (slow_parts(motion(arm, [a, b] * count + [a], generator), arm) for count in (1, 3))
+    once, thrice = (slow_parts(motion_with_rests(arm, [a, b] * count + [a], generator), arm) for count in (1, 3))
     np.testing.assert_array_equal(once.measured, thrice.measured)
     np.testing.assert_allclose(once.recording.q, thrice.recording.q, atol=1e-3)
 
 
 def test_slow_parts_at_1_khz_are_those_at_200_hz(arm):
     poses = arm.sample_poses(6, np.random.default_rng(1), margin=0.1)
-    slow, fast = (slow_parts(motion(arm, poses, np.random.default_rng(2), rate=rate), arm) for rate in (200.0, 1000.0))
+    motions = (motion_with_rests(arm, poses, np.random.default_rng(2), rate=rate) for rate in (200.0, 1000.0))
+    slow, fast = (slow_parts(motion, arm) for motion in motions)
     assert abs(len(slow.measured) - len(fast.measured)) <= 0.1 * len(slow.measured)
     assert fast.measured.sum(axis=0).min() >= 0.6 * len(poses)
 
@@ -79,7 +63,7 @@ def test_slow_parts_at_1_khz_are_those_at_200_hz(arm):
 def test_a_rest_does_not_reach_over_a_gap(arm):
     """Where samples are missing the arm may have been anywhere."""
     a, b = arm.sample_poses(2, np.random.default_rng(1), margin=0.1)
-    recording = motion(arm, [a, b], np.random.default_rng(2), rest=2.0)
+    recording = motion_with_rests(arm, [a, b], np.random.default_rng(2), rest=2.0)
     late = recording.t >= 5.0  # in the middle of the rest at b
     sag = 0.9 * arm.per_joint(*SAME_REST)
     split = replace(recording, t=recording.t + 5.0 * late, q=recording.q + sag * late[:, None])
@@ -94,7 +78,7 @@ def test_a_rest_does_not_reach_over_a_gap(arm):
 def test_rests_are_poses_of_all_joints(arm, rate, with_speeds):
     generator = np.random.default_rng(3)
     poses = arm.sample_poses(12, generator, margin=0.1)
-    recording = motion(arm, [*poses, poses[0]], generator, rest=1.0, rate=rate)
+    recording = motion_with_rests(arm, [*poses, poses[0]], generator, rest=1.0, rate=rate)
     noisy = recording.qd + arm.per_joint(0.01, 0.001) * generator.normal(size=recording.q.shape)
     rests = rest_poses(replace(recording, qd=noisy if with_speeds else None), arm)
     assert len(rests) == len(poses), "the last pose is the first again"
@@ -110,7 +94,7 @@ def test_rests_are_poses_of_all_joints(arm, rate, with_speeds):
 def test_what_does_not_rest_is_left_as_it_is(arm):
     generator = np.random.default_rng(4)
     poses = arm.sample_poses(12, generator, margin=0.1)
-    moving = motion(arm, poses, generator, rest=0.0)
+    moving = motion_with_rests(arm, poses, generator, rest=0.0)
     assert len(rest_poses(moving, arm)) == 0
     assert find_poses(moving, arm).recording is moving
     assert find_poses(moving, arm, take_slow_parts=True).measured.sum(axis=1).max() == 1
