@@ -160,7 +160,7 @@ class IdentifiedModel:
 
     def load_arm(self) -> Arm:
         """The arm that this model is of, mounted as it was when identified."""
-        return _arm_with_gravity(self.arm, tuple(self.gravity))
+        return load_arm(self.arm).with_gravity(self.gravity)
 
     @property
     def holding_effects(self) -> list[ActuatorEffectEstimate]:
@@ -214,15 +214,3 @@ def _check_format(path: str | Path) -> None:
     version = content.get("format") if isinstance(content, dict) else None
     if version and version != IdentifiedModel.format:
         raise ModelError(f'{path}: format is "{version}", this version reads "{IdentifiedModel.format}"; identify anew')
-
-
-_ARMS: dict[tuple[str, tuple[float, ...]], Arm] = {}
-
-
-def _arm_with_gravity(name: str, gravity: tuple[float, ...]) -> Arm:
-    """One Arm object per mounting, so that derivations and compilations are done once."""
-    arm = load_arm(name)
-    mounted = arm.with_gravity(gravity)
-    if np.allclose(arm.gravity, mounted.gravity, rtol=0, atol=1e-12):
-        return arm
-    return _ARMS.setdefault((name, gravity), mounted)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import sympy
@@ -18,22 +18,40 @@ from dvrk_drake.models.arm import Arm
 
 @dataclass(frozen=True, eq=False)
 class StaticModel:
-    """Compiled regressor and torque of one structure (arm and effects); the parameters stay arguments.
+    """Regressor and torque of one structure (arm and effects); the parameters stay arguments.
 
     Parameters theta are the b base parameters [kg m, kg], then one coefficient per effect, in the
-    unit of its kind.
+    unit of its kind. Each function is compiled when it is first asked for: a controller needs no regressor, and
+    identification no torque.
 
     Attributes:
         gravity: the symbolic derivation.
         effects: of kinds in `POSITION_KINDS`, in the order of theta.
-        torque_into: compiled f(q, theta, out), float64 C-contiguous (n,), (b + e,), (n,); for control loops.
     """
 
     gravity: SymbolicGravity
     effects: tuple[ActuatorEffect, ...]
-    torque_into: Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None]
-    _regressor_batch: Callable[..., NDArray[np.float64]]
-    _torque_batch: Callable[..., NDArray[np.float64]]
+
+    @cached_property
+    def torque_into(self) -> Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None]:
+        """Compiled f(q, theta, out), float64 C-contiguous (n,), (b + e,), (n,); for control loops."""
+        theta = sympy.symbols(f"theta0:{self.num_parameters}")
+        terms = codegen.share_terms(sympy.Array(list(self._symbolic_regressor * sympy.Matrix(theta))))
+        return codegen.compile_function("torque", [("q", self.gravity.q), ("theta", theta)], terms)
+
+    @cached_property
+    def _symbolic_regressor(self) -> sympy.Matrix:
+        return symbolic_regressor(self.gravity, self.effects)
+
+    @cached_property
+    def _regressor_batch(self) -> Callable[..., NDArray[np.float64]]:
+        terms = codegen.share_terms(self._symbolic_regressor)
+        regressor = codegen.compile_function("regressor", [("q", self.gravity.q)], terms)
+        return codegen.compile_batch(regressor, 1, self._symbolic_regressor.shape)
+
+    @cached_property
+    def _torque_batch(self) -> Callable[..., NDArray[np.float64]]:
+        return codegen.compile_batch(self.torque_into, 2, (self.gravity.arm.num_joints,))
 
     @property
     def num_parameters(self) -> int:
@@ -77,21 +95,8 @@ def _number(x: float) -> sympy.Expr:
 
 @cache
 def compile_static_model(arm: Arm, effects: tuple[ActuatorEffect, ...] = ()) -> StaticModel:
-    """Derives and compiles the model; takes about two seconds the first time, nothing afterwards."""
-    gravity = derive_gravity(arm)
-    Y = symbolic_regressor(gravity, effects)
-    theta = sympy.symbols(f"theta0:{Y.shape[1]}")
-    q_argument = ("q", gravity.q)
-    regressor = codegen.compile_function("regressor", [q_argument], codegen.share_terms(Y))
-    torque_terms = codegen.share_terms(sympy.Array(list(Y * sympy.Matrix(theta))))
-    torque = codegen.compile_function("torque", [q_argument, ("theta", theta)], torque_terms)
-    return StaticModel(
-        gravity,
-        effects,
-        torque,
-        codegen.compile_batch(regressor, 1, Y.shape),
-        codegen.compile_batch(torque, 2, (Y.shape[0],)),
-    )
+    """The one model of this structure: derived the first time, within two seconds; compiled where it is used."""
+    return StaticModel(derive_gravity(arm), effects)
 
 
 @cache

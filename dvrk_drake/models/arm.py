@@ -140,7 +140,15 @@ class Arm:
         Raises:
             ArmError: not three numbers of a size up to 30 m/s^2.
         """
-        return dataclasses.replace(self, gravity=_checked_gravity(gravity))
+        return _mounted(self, tuple(_checked_gravity(gravity).tolist()))
+
+
+@cache
+def _mounted(arm: Arm, gravity: tuple[float, ...]) -> Arm:
+    """One Arm object a mounting, so that what is derived and compiled of it is so once."""
+    if np.allclose(arm.gravity, gravity, rtol=0, atol=1e-12):
+        return arm
+    return dataclasses.replace(arm, gravity=np.array(gravity))
 
 
 def known_arms() -> list[str]:
