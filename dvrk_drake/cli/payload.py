@@ -30,9 +30,10 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 def _payload(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-    from dvrk_drake.analysis.payload.payload import estimate_payload
+    from dvrk_drake.analysis.payload.payload import check_links, estimate_payload
     from dvrk_drake.analysis.payload.tables import print_links, print_payload
     from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.errors import ModelError
     from dvrk_drake.models.arm import load_arm
@@ -43,6 +44,8 @@ def _payload(options: argparse.Namespace) -> None:
     if model is not None and options.gravity is not None:
         raise ModelError(f"{options.model}: states its gravity; --gravity is for --arm")
     arm = mounted(load_arm(options.arm), options.gravity) if model is None else model.load_arm()
+    links = None if options.link is None else [options.link]
+    check_links(DynamicRegressor(arm), links or [])
     if options.json is not None:
         check_output(options.json, options.reference, options.loaded)
     console = make_console()
@@ -62,7 +65,7 @@ def _payload(options: argparse.Namespace) -> None:
             reference,
             loaded,
             model.dynamic_model,
-            None if options.link is None else [options.link],
+            links,
             lambda done: progress.update(task, completed=share + (100 - share) * done),
         )
     if options.link is None:

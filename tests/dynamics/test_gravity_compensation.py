@@ -27,6 +27,9 @@ from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
 
 pytestmark = pytest.mark.slow
 
+#: Gravity [m/s^2] of an arm whose base leans by 2.3 degrees.
+LEANING = [0.01, -0.39, -9.80]
+
 
 def dvrk_controller(path, q, qd):
     """tau (7) as the dVRK computes it from the file's text: one pose, plain numbers, nothing of ours."""
@@ -196,7 +199,7 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
         compensation_from_model(spring)
     # A quartic over +-2.44 rad misses 0.05 sin(q) by a few hundredths of it, not more.
     compensation_from_model(spring, CompensationOptions(tolerance=0.05 * 0.08))
-    for change in ({"trust": 0.5}, {"gravity": [0.0, -3.0, -9.3]}):
+    for change in ({"trust": 0.5}, {"gravity": LEANING}):
         model = balanced()
         if "trust" in change:
             model.joints[4].trust = change["trust"]
@@ -215,7 +218,7 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
 
 def test_a_leaning_base_is_refused_by_default_and_held_as_well_as_the_file_can(tmp_path, capsys):
     model = balanced()
-    model.gravity = [0.01, -0.39, -9.80]
+    model.gravity = LEANING
     model.base_parameters = IdentifiedModel.from_arm(model.load_arm()).base_parameters
     given, out = tmp_path / "model.yaml", tmp_path / "gc.json"
     model.save(given)

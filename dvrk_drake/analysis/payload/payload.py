@@ -15,6 +15,7 @@ from dvrk_drake.analysis.payload.point_mass import PointMass, PointMassProblem
 from dvrk_drake.analysis.payload.whitening import Whitening
 from dvrk_drake.analysis.signals.phase_folds import phase_folds
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import Arm
@@ -141,8 +142,7 @@ def estimate_payload(
     regressor = model.regressor
     names = [link.link for link in regressor.links]
     wanted = names if links is None else list(links)
-    if unknown := [link for link in wanted if link not in names]:
-        raise ModelError(f'unknown link "{unknown[0]}"; links of {model.arm.name} that move: {", ".join(names)}')
+    check_links(regressor, wanted)
     difference = motion_difference(reference, loaded, model)
     progress(0.2)
     grid = difference.grid
@@ -159,6 +159,13 @@ def estimate_payload(
         estimates.append(_estimate(regressor.links[k], columns, difference))
         progress(0.2 + 0.8 * (count + 1) / len(wanted))
     return sorted(estimates, key=lambda payload: payload.left_out)
+
+
+def check_links(regressor: DynamicRegressor, links: Sequence[str]) -> None:
+    """Raises ModelError unless links of these names move; before a model is identified for nothing."""
+    names = [link.link for link in regressor.links]
+    if unknown := [link for link in links if link not in names]:
+        raise ModelError(f'unknown link "{unknown[0]}"; links of {regressor.arm.name} that move: {", ".join(names)}')
 
 
 def as_good(estimates: Sequence[Payload]) -> list[Payload]:

@@ -5,14 +5,16 @@ mean 21.2 %; PSM 10.3 18.3 19.8 13.4 24.0 21.1 26.6, mean 19.1 %. No phase's pre
 """
 
 import json
+from contextlib import redirect_stdout
+from io import StringIO
 
 import numpy as np
 import pytest
 
 from dvrk_drake.analysis.convert.convert import read_wpi_csv, wpi_in_joint_coordinates
-from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.cli import main
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import read_recording, write_recording
 
@@ -30,13 +32,21 @@ FILES = {"mtmr": "mtm_one.csv", "psm": "psm_one.csv"}
 
 
 @pytest.fixture(scope="module", params=FILES)
-def case(request, shared_data):
+def case(request, shared_data, tmp_path_factory):
+    """Name, arm, recording, what `dvrk-drake identify` writes of it, and the folder that all that is in."""
     path = shared_data / "trajectories" / FILES[request.param]
     if not path.is_file():
         pytest.skip(f"needs {path}")
     arm = load_arm(request.param)
     recording = wpi_in_joint_coordinates(read_wpi_csv(path), arm)
-    return request.param, arm, recording, identify_dynamic(recording, arm)
+    folder = tmp_path_factory.mktemp(request.param)
+    motion, model = folder / "motion.csv", folder / "model.yaml"
+    write_recording(recording, motion)
+    plots = ["--plots", str(folder / "plots")]
+    with redirect_stdout(StringIO()) as said:
+        assert main(["identify", str(motion), "--arm", request.param, "--output", str(model), *plots]) == 0
+    assert "cross-validated" in said.getvalue()
+    return request.param, arm, recording, IdentifiedModel.load(model), folder
 
 
 def percent(model, which):
@@ -45,41 +55,37 @@ def percent(model, which):
 
 def test_phases_predict_each_other_better_than_the_published_model_another_motion(case):
     """By models that know nothing of them: neither parameters nor effects nor how the base leans."""
-    name, _, _, result = case
-    error = percent(result.model, "rms_cross_validation")
+    name, _, _, model, _ = case
+    error = percent(model, "rms_cross_validation")
     assert np.mean(error) <= TARGET[name]
     assert np.all(error <= PUBLISHED[name])
 
 
 def test_the_floor_is_the_one_in_the_data(case):
-    name, _, _, result = case
-    np.testing.assert_allclose(percent(result.model, "rms_repeatability"), FLOOR[name], atol=0.15)
+    name, _, _, model, _ = case
+    np.testing.assert_allclose(percent(model, "rms_repeatability"), FLOOR[name], atol=0.15)
 
 
 def test_the_arm_can_exist_and_be_simulated(case):
-    _, arm, _, result = case
-    assert min(link.least_eigenvalue for link in result.model.dynamics.links) > 0
-    M = result.model.dynamic_model.mass_matrix(arm.sample_poses(300, np.random.default_rng(0)))
+    _, arm, _, model, _ = case
+    assert min(link.least_eigenvalue for link in model.dynamics.links) > 0
+    M = model.dynamic_model.mass_matrix(arm.sample_poses(300, np.random.default_rng(0)))
     assert np.min(np.linalg.eigvalsh(M)) > 0
 
 
 def test_the_fit_is_what_validation_finds(case):
-    _, _, recording, result = case
-    validation = validate_motion(result.model, recording)
+    _, _, recording, model, _ = case
+    validation = validate_motion(model, recording)
     # The tilt enters the fit to first order, and effects of no weight are left out of the model.
-    fitted = percent(result.model, "rms_fit")
+    fitted = percent(model, "rms_fit")
     np.testing.assert_allclose([100 * a.relative_error for a in validation.actuators], fitted, rtol=0.02)
 
 
-def test_the_verbs_take_a_real_motion(case, tmp_path, capsys):
-    name, arm, recording, _ = case
-    if name != "psm":
-        pytest.skip("one arm is enough for the verbs; the identification itself is tested with both")
-    path, model, errors, tau = (tmp_path / n for n in ("motion.csv", "model.yaml", "errors.json", "tau.csv"))
-    write_recording(recording, path)
-    plots = tmp_path / "plots"
-    assert main(["identify", str(path), "--arm", name, "--output", str(model), "--plots", str(plots)]) == 0
-    assert "cross-validated" in capsys.readouterr().out
+def test_the_verbs_take_a_real_motion(case, tmp_path):
+    name, arm, recording, _, folder = case
+    path, model = folder / "motion.csv", folder / "model.yaml"
+    errors, tau = tmp_path / "errors.json", tmp_path / "tau.csv"
+    assert {p.name for p in (folder / "plots").iterdir()} == {"efforts.png", "residuals.png", "error_budget.png"}
     assert main(["validate", str(model), str(path), "--json", str(errors)]) == 0
     found = json.loads(errors.read_text())
     assert found["coordinates"] == "actuator" and found["mean_relative_error"] < TARGET[name] / 100
@@ -88,15 +94,13 @@ def test_the_verbs_take_a_real_motion(case, tmp_path, capsys):
     measured = recording.in_actuator_coordinates(arm).tau
     ratio = np.linalg.norm((predicted - measured)[200:-200], axis=0) / np.linalg.norm(measured[200:-200], axis=0)
     assert np.all(ratio < 1)
-    assert {p.name for p in plots.iterdir()} == {"efforts.png", "residuals.png", "error_budget.png"}
 
 
 def test_effects_that_hold_an_arm_make_no_joint_worse(case, shared_data):
     """On poses of other years: an offset of a motion where weight acts is none at rest."""
-    name, _, _, result = case
+    name, _, _, model, _ = case
     if name != "mtmr":
         pytest.skip("poses at rest were recorded of the MTM")
-    model = result.model
     for file in ("mtmr_2017_sweep40.csv", "mtmr_2017_coupled12_may10.csv"):
         poses = read_recording(shared_data / "mtm_static" / file)
         theta = model.theta.copy()
@@ -113,11 +117,11 @@ def test_effects_that_hold_an_arm_make_no_joint_worse(case, shared_data):
 
 def test_another_day_keeps_the_rigid_body(case, shared_data):
     """A wrist's cables are not the same on another day; the weight that the first joints carry is."""
-    name, arm, _, result = case
+    name, arm, _, model, _ = case
     if name != "psm":
         pytest.skip("recorded on another day: only the PSM")
     other = wpi_in_joint_coordinates(read_wpi_csv(shared_data / "trajectories" / "psm_one_no_weight.csv"), arm)
-    validation = validate_motion(result.model, other)
+    validation = validate_motion(model, other)
     error = np.array([100 * a.relative_error for a in validation.actuators])
     assert np.all(error[:3] <= PUBLISHED["psm"][:3])
     # Friction of the wrist is what changed: it, not position or bias, is most of what a person sees there.

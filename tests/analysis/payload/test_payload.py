@@ -171,14 +171,21 @@ WEIGHTS = [
 ]
 
 
-@pytest.mark.parametrize(("file", "link", "mass", "height"), WEIGHTS)
-def test_known_weights_on_a_real_arm(shared_data, file, link, mass, height):
+@pytest.fixture(scope="module")
+def unloaded(shared_data):
+    """A real PSM without weight: its recordings' folder, the recording and the model of it."""
     folder = shared_data / "trajectories"
-    if not (folder / file).is_file():
-        pytest.skip(f"needs {folder / file}")
+    if not (folder / "psm_one_no_weight.csv").is_file():
+        pytest.skip(f"needs {folder}")
     arm = load_arm("psm")
-    reference, loaded = (read_recording(folder / f, arm, "actuator") for f in ("psm_one_no_weight.csv", file))
-    model = identify_dynamic(reference, arm).model.dynamic_model
+    reference = read_recording(folder / "psm_one_no_weight.csv", arm, "actuator")
+    return folder, reference, identify_dynamic(reference, arm).model.dynamic_model
+
+
+@pytest.mark.parametrize(("file", "link", "mass", "height"), WEIGHTS)
+def test_known_weights_on_a_real_arm(unloaded, file, link, mass, height):
+    folder, reference, model = unloaded
+    loaded = read_recording(folder / file, model.arm, "actuator")
     (payload,) = estimate_payload(reference, loaded, model, [link])
     assert abs(payload.body.mass - mass) < payload.quantile * payload.mass_error
     assert abs(payload.place_in_base[2] - height) < payload.quantile * payload.place_error[2]

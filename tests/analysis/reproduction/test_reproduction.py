@@ -180,9 +180,14 @@ def test_a_joint_is_held_if_it_never_left():
 # Simulated.
 
 
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    """A true arm, derived and compiled once."""
+    return unlike_its_drawing("mtml", tmp_path_factory.mktemp("truth"), seed=8)
+
+
 @pytest.mark.slow
-def test_what_is_known_exactly_is_held_and_what_is_not_falls(tmp_path):
-    truth = unlike_its_drawing("mtml", tmp_path, seed=4)
+def test_what_is_known_exactly_is_held_and_what_is_not_falls(truth, tmp_path):
     exact, nothing = tmp_path / "exact.yaml", tmp_path / "nothing.yaml"
     truth.model.save(exact)
     with_zeroed(truth.model, range(7)).save(nothing)
@@ -198,8 +203,7 @@ def test_what_is_known_exactly_is_held_and_what_is_not_falls(tmp_path):
 
 
 @pytest.mark.slow
-def test_true_arm_is_what_its_model_says(tmp_path):
-    truth = unlike_its_drawing("mtml", tmp_path, seed=6)
+def test_true_arm_is_what_its_model_says(truth):
     q = ARM.sample_poses(20, np.random.default_rng(7))
     effects = truth.model.holding_torque(q) - IdentifiedModel.from_arm(truth.arm).holding_torque(q)
     assert np.abs(effects[:, 3]).max() > 0.01  # cables
@@ -242,9 +246,9 @@ def test_psm_keeps_its_remote_centre_and_its_wrist_axes_apart():
     assert angle == pytest.approx(np.pi / 2, abs=1e-9)
 
 
-def exact_laboratory(folder, executor, extent):
+def exact_laboratory(truth, folder, executor, extent):
     """One whose MTM was identified without any error."""
-    truth, file = unlike_its_drawing("mtml", folder, seed=8), folder / "exact.yaml"
+    file = folder / "exact.yaml"
     truth.model.save(file)
     q = ARM.sample_poses(20, np.random.default_rng(9))
     poses = Recording(q=q, tau=truth.model.holding_torque(q), source="computed")
@@ -254,10 +258,10 @@ def exact_laboratory(folder, executor, extent):
 
 
 @pytest.mark.slow
-def test_figure_5_writes_what_it_names_and_holds_with_an_exact_model(tmp_path):
+def test_figure_5_writes_what_it_names_and_holds_with_an_exact_model(truth, tmp_path):
     extent = Extent(releases=3, paper_releases=2, led_releases=1, duration=1.0)
     with ThreadPoolExecutor(1) as executor:
-        section = reproduce_figure_5(exact_laboratory(tmp_path, executor, extent))
+        section = reproduce_figure_5(exact_laboratory(truth, tmp_path, executor, extent))
     page = write_page(tmp_path, [section], []).read_text()
     assert len(section.figures) == 2
     assert all((tmp_path / figure).read_bytes().startswith(b"\x89PNG") for figure in section.figures)
@@ -272,9 +276,9 @@ def test_figure_5_writes_what_it_names_and_holds_with_an_exact_model(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_hand_feels_less_with_each_compensation(tmp_path):
+def test_the_hand_feels_less_with_each_compensation(truth, tmp_path):
     with ThreadPoolExecutor(1) as executor:
-        section = reproduce_transparency(exact_laboratory(tmp_path, executor, Extent(path_poses=2)))
+        section = reproduce_transparency(exact_laboratory(truth, tmp_path, executor, Extent(path_poses=2)))
     force = [float(row[1]) for row in section.tables[0].rows]
     assert force[0] > force[2] > force[3] > 0  # limp, ours, ours with friction compensation
     assert (tmp_path / "transparency.png").read_bytes().startswith(b"\x89PNG")
