@@ -1,43 +1,16 @@
-"""Recordings as CSV: what is read and refused, coordinates, and writing at once or not at all."""
+"""Recordings as CSV: what is read and refused."""
 
 from __future__ import annotations
 
-import errno
 import os
-import stat
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import HEADER, Q_NAMES, ROW, SIX, TAU_NAMES, random_recording, six_joint_arm, write_text
 
-from dvrk_drake.errors import DvrkDrakeError, RecordingError
-from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.atomic_file import atomic_write
-from dvrk_drake.models.recording import Recording, read_recording, write_csv, write_recording
-
-Q_NAMES = [f"q{i}" for i in range(1, 8)]
-TAU_NAMES = [f"tau{i}" for i in range(1, 8)]
-HEADER = ",".join([*Q_NAMES, *TAU_NAMES])
-ROW = ",".join(f"0.{i}" for i in range(1, 15))
-
-# q_joint = M_MTM q_actuator for joints 2..4, as published; written out, not taken from the project.
-M_MTM = np.eye(7)
-M_MTM[1:4, 1:4] = [[1, 0, 0], [-1, 1, 0], [0.6697, -0.6697, 1]]
-
-
-def write_text(folder: Path, text: str | bytes) -> Path:
-    path = folder / "recording.csv"
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return path
-
-
-def random_recording(num_rows: int = 20, **changes: object) -> Recording:
-    q, qd, tau = np.random.default_rng(7).uniform(-0.2, 0.2, (3, num_rows, 7))
-    return replace(Recording(q=q, tau=tau, qd=qd, t=np.arange(num_rows) / 3), **changes)
-
-
-# Reading.
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.recording import read_recording
 
 
 def test_reads_columns_by_name_in_any_order_and_ignores_others(tmp_path):
@@ -94,7 +67,6 @@ def test_the_source_of_a_row_without_a_file():
     assert random_recording(source="simulated").where(2) == "simulated: row 3"
 
 
-SIX = ",".join([*Q_NAMES[:6], *TAU_NAMES[:6]])
 WANTED = r"needs (a header with )?q1\.\.q7 and tau1\.\.tau7 \(t and qd1\.\.qd7 optional\)"
 MULTI_LINE = '"a\nb"'
 ERRORS = {
@@ -145,10 +117,6 @@ def test_errors_name_file_line_and_column_in_one_line(tmp_path, case):
     assert str(caught.value).startswith(str(tmp_path))
 
 
-def six_joint_arm():
-    return replace(load_arm("psm"), joint_names=load_arm("psm").joint_names[:6])
-
-
 def test_six_joints(tmp_path):
     path = write_text(tmp_path, f"{SIX}\n" + ",".join(["0"] * 12))
     assert read_recording(path, arm=six_joint_arm()).q.shape == (1, 6)
@@ -176,248 +144,3 @@ def test_a_file_that_may_not_be_read(tmp_path):
 def test_unknown_coordinates(tmp_path):
     with pytest.raises(RecordingError, match='unknown coordinates "motor"; allowed: joint, actuator'):
         read_recording(tmp_path / "any.csv", coordinates="motor")
-
-
-# Whether it fits an arm.
-
-
-def test_poses_inside_the_limits_fit():
-    arm = load_arm("mtmr")
-    q = np.vstack([arm.position_lower - 0.14, arm.position_upper + 0.14])
-    Recording(q=q).check_fits(arm)
-
-
-def test_degrees_are_suspected():
-    arm = load_arm("mtml")
-    q = np.degrees(arm.sample_poses(20, np.random.default_rng(0)))
-    with pytest.raises(
-        RecordingError, match=r"of MTML; are these degrees, or is it another arm\? Positions must be in rad"
-    ):
-        Recording(q=q).check_fits(arm)
-
-
-def test_a_psm_counts_six_joints_and_the_jaw(tmp_path):
-    path = write_text(tmp_path, f"{SIX}\n" + ",".join(["0"] * 12))
-    with pytest.raises(RecordingError, match=r"missing column q7; .*of PSM these are yaw, pitch, .*, wrist_yaw, jaw"):
-        read_recording(path, load_arm("psm"))
-
-
-def test_a_prismatic_joint_in_millimetres_is_suspected():
-    arm = load_arm("psm")
-    q = arm.sample_poses(20, np.random.default_rng(0))
-    Recording(q=q).check_fits(arm)
-    q[:, 2] *= 1000
-    with pytest.raises(
-        RecordingError, match=r"insertion \(q3\) = .* 0\.\.0\.24 m of PSM; are these millimetres or centimetres\?"
-    ):
-        Recording(q=q).check_fits(arm)
-
-
-def test_a_prismatic_joint_is_given_millimetres_of_tolerance_where_others_have_milliradians():
-    arm = load_arm("psm")
-    q = np.zeros((1, 7))
-    q[0, 2] = 0.25
-    Recording(q=q).check_fits(arm)
-    q[0, 2] = 0.27
-    with pytest.raises(RecordingError, match=r"insertion \(q3\) = 0\.27 is outside"):
-        Recording(q=q).check_fits(arm)
-
-
-def test_motion_is_judged_by_the_joints_own_kind():
-    arm = load_arm("psm")
-    qd = np.zeros((10, 7))
-    qd[:, 2] = 0.01
-    assert Recording(q=np.zeros((10, 7)), qd=qd).motion(arm) == "joint 3 at 0.01 m/s RMS"
-    assert Recording(q=np.zeros((10, 7)), qd=qd[:, ::-1][:, [0, 1, 2, 4, 3, 5, 6]]).motion(arm) == ""
-
-
-def test_one_bad_pose_is_named_and_not_taken_for_degrees():
-    q = np.zeros((10, 7))
-    q[3, 1] = 1.5
-    recording = Recording(q=q, source="day.csv", lines=np.arange(2, 12))
-    match = r"^day\.csv:5: shoulder_pitch \(q2\) = 1\.5 is outside -0\.3142\.\.1\.134 of MTMR; is this the"
-    with pytest.raises(RecordingError, match=match):
-        recording.check_fits(load_arm("mtmr"))
-
-
-def test_a_right_arm_is_not_a_left_arm():
-    q = np.zeros((3, 7))
-    q[:, 3] = 3.4
-    Recording(q=q).check_fits(load_arm("mtmr"))
-    with pytest.raises(RecordingError, match=r"wrist_platform \(q4\) = 3\.4 .* of MTML; is this the right arm"):
-        Recording(q=q).check_fits(load_arm("mtml"))
-
-
-@pytest.mark.parametrize("coordinates", ["joint", "actuator"])
-def test_the_number_of_joints_must_be_the_arms(coordinates):
-    recording = Recording(q=np.zeros((2, 6)), source="psm.csv", coordinates=coordinates)
-    for function in (recording.check_fits, recording.in_joint_coordinates):
-        with pytest.raises(RecordingError, match=r"psm\.csv: has 6 joints, MTMR has 7"):
-            function(load_arm("mtmr"))
-
-
-# Coordinates.
-
-
-@pytest.mark.parametrize("arm", ["mtml", "mtmr"])
-def test_actuator_coordinates_become_joint_coordinates(arm):
-    actuator = random_recording(coordinates="actuator", source="a.csv")
-    joint = actuator.in_joint_coordinates(load_arm(arm))
-    np.testing.assert_allclose(joint.q, actuator.q @ M_MTM.T, atol=1e-15)
-    np.testing.assert_allclose(joint.qd, actuator.qd @ M_MTM.T, atol=1e-15)
-    np.testing.assert_allclose(joint.tau @ M_MTM, actuator.tau, atol=1e-15)
-    assert joint.coordinates == "joint"
-    assert joint.source == "a.csv"
-    np.testing.assert_array_equal(joint.t, actuator.t)
-
-
-def test_a_pose_in_actuator_coordinates_by_hand():
-    q = np.array([[0.1, 0.2, 0.5, 0.3, -0.1, 0.4, 1.0]])
-    tau = np.array([[1, 2, 3, 4, 5, 6, 7.0]])
-    joint = Recording(q=q, tau=tau, coordinates="actuator").in_joint_coordinates(load_arm("mtmr"))
-    np.testing.assert_allclose(joint.q, [[0.1, 0.2, 0.3, 0.3 - 0.6697 * 0.3, -0.1, 0.4, 1.0]], atol=1e-15)
-    np.testing.assert_allclose(joint.tau, [[1, 2 + 3, 3 + 0.6697 * 4, 4, 5, 6, 7]], atol=1e-14)
-    assert joint.qd is None
-
-
-def test_power_does_not_depend_on_the_coordinates():
-    actuator = random_recording(coordinates="actuator")
-    joint = actuator.in_joint_coordinates(load_arm("mtmr"))
-    power = np.einsum("ij,ij->i", actuator.qd, actuator.tau)
-    np.testing.assert_allclose(np.einsum("ij,ij->i", joint.qd, joint.tau), power, atol=1e-15)
-
-
-def test_joint_coordinates_stay():
-    recording = random_recording()
-    assert recording.in_joint_coordinates(load_arm("mtmr")) is recording
-
-
-# Writing.
-
-
-@pytest.mark.parametrize("absent", [(), ("t",), ("qd",), ("tau",), ("t", "qd", "tau")])
-def test_what_is_written_reads_back_exactly(tmp_path, absent):
-    recording = random_recording(**dict.fromkeys(absent))
-    recording.q[0, :4] = [5e-324, 1.7976931348623157e308, -0.0, 0.1 + 0.2]
-    write_recording(recording, tmp_path / "out.csv")
-    again = read_recording(tmp_path / "out.csv")
-    for name in ("t", "q", "qd", "tau"):
-        if name in absent:
-            assert getattr(again, name) is None
-        else:
-            assert getattr(again, name).tobytes() == np.ascontiguousarray(getattr(recording, name)).tobytes()
-    assert (tmp_path / "out.csv").read_bytes().count(b"\r") == 0
-
-
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
-    path = tmp_path / "out.csv"
-    write_csv(path, ["a"], np.ones((1, 1)))
-    before = path.read_bytes()
-
-    def rows():
-        yield [1.0]
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_csv(path, ["a"], rows())
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_write_that_fails_makes_no_file(tmp_path):
-    with pytest.raises(ZeroDivisionError), atomic_write(tmp_path / "out.csv") as stream:
-        stream.write("half")
-        stream.flush()
-        assert not (tmp_path / "out.csv").exists()
-        _ = 1 / 0
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_places_that_cannot_be_written(tmp_path):
-    for path, match in (
-        (tmp_path / "no" / "out.csv", r"no/out\.csv: cannot be written: No such file or directory"),
-        (tmp_path, "is not a regular file"),
-        (os.devnull, "/dev/null: is not a regular file, so it cannot be replaced; name a file"),
-    ):
-        with pytest.raises(DvrkDrakeError, match=match), atomic_write(path) as stream:
-            stream.write("x")
-    assert list(tmp_path.iterdir()) == []
-    assert stat.S_ISCHR(os.stat(os.devnull).st_mode)
-
-
-def test_a_full_disk_is_an_error_of_ours(tmp_path):
-    match = r"out\.csv: cannot be written: No space left"
-    with pytest.raises(DvrkDrakeError, match=match), atomic_write(tmp_path / "out.csv"):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_other_errors_of_the_caller_stay_what_they_are(tmp_path):
-    with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "out.csv"):
-        (tmp_path / "absent").read_text()
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everything")
-def test_a_read_only_file_is_not_replaced(tmp_path):
-    path = write_text(tmp_path, "old")
-    path.chmod(0o444)
-    with pytest.raises(DvrkDrakeError, match="cannot be written: it is read-only"), atomic_write(path):
-        pass
-    assert path.read_text() == "old"
-
-
-def test_links_and_permissions_survive(tmp_path):
-    path, link = write_text(tmp_path, "old"), tmp_path / "link.csv"
-    path.chmod(0o640)
-    link.symlink_to(path)
-    with atomic_write(link) as stream:
-        stream.write("new\r\n")
-    assert link.is_symlink()
-    assert path.read_bytes() == b"new\r\n"
-    assert stat.S_IMODE(path.stat().st_mode) == 0o640
-
-
-def test_a_new_file_has_the_permissions_that_the_user_wants(tmp_path):
-    old = os.umask(0o027)
-    try:
-        with atomic_write(tmp_path / "out.bin", "wb") as stream:
-            stream.write(b"\x00\xff")
-    finally:
-        os.umask(old)
-    assert (tmp_path / "out.bin").read_bytes() == b"\x00\xff"
-    assert stat.S_IMODE((tmp_path / "out.bin").stat().st_mode) == 0o640
-
-
-# Recordings of real arms.
-
-
-@pytest.mark.parametrize(
-    ("name", "num_rows"),
-    [
-        ("mtm_2015_good72", 72),
-        ("mtm_2015_apr18_all80", 80),
-        ("mtmr_2017_sweep40", 40),
-        ("mtmr_2017_coupled12_may10", 12),
-    ],
-)
-def test_real_static_recordings_fit(shared_data, name, num_rows):
-    recording = read_recording(shared_data / "mtm_static" / f"{name}.csv")
-    assert recording.measured_effort().shape == (num_rows, 7)
-    assert recording.t is None
-    recording.check_fits(load_arm("mtmr"))
-    with pytest.raises(RecordingError, match="are these degrees"):
-        replace(recording, q=np.degrees(recording.q)).check_fits(load_arm("mtmr"))
-
-
-def test_a_real_motion_fits_its_arm_only(shared_data):
-    path = shared_data / "trajectories" / "mtm_one.csv"
-    recording = read_recording(path, coordinates="actuator")
-    assert recording.q.shape == recording.qd.shape == recording.tau.shape == (5999, 7)
-    np.testing.assert_allclose(recording.t, np.arange(5999) / 200, atol=1e-9)
-    recording.check_fits(load_arm("mtmr"))
-    with pytest.raises(RecordingError, match="of MTML; is this the right arm"):
-        recording.check_fits(load_arm("mtml"))
-    joint = recording.in_joint_coordinates(load_arm("mtmr"))
-    np.testing.assert_allclose(joint.q, recording.q @ M_MTM.T, atol=1e-14)
-    power = np.einsum("ij,ij->i", recording.qd, recording.tau)
-    np.testing.assert_allclose(np.einsum("ij,ij->i", joint.qd, joint.tau), power, atol=1e-13)

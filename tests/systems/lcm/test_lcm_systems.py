@@ -2,83 +2,20 @@
 
 import numpy as np
 import pytest
-from pydrake.common.value import AbstractValue
+from lcm_arm import ARM, POSES, START, Controller, Sending, SimulatedArm, run
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.lcm import LcmSubscriberSystem
 
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.lcm_messages import is_status_of
-from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.guard.settings import GuardSettings
-from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
 from dvrk_drake.systems.lcm.serializer import TolerantSerializer
-from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
-
-ARM = load_arm("mtml")
-POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
-START = 10**15
-#: For tests of what comes after the start: it is watched for 50 ms, not for a quarter of a second.
-SOON = DvrkDriver(guard=GuardSettings(start_time=0.05))
-
-
-class SimulatedArm:
-    """A simulated arm behind LCM, and what it said."""
-
-    def __init__(self, lcm, name="mtml", driver=None, modify_plant=None):
-        self.arm = load_arm(name)
-        builder = DiagramBuilder()
-        self.station = builder.AddSystem(ArmStation(self.arm, modify_plant=modify_plant))
-        apply_driver_config(driver or DvrkDriver(), self.station, lcm, builder, start_utime=START)
-        self.statuses = []
-        lcm.Subscribe(f"DVRK_STATUS_{self.arm.name}", lambda data: self.statuses.append(Status.decode(data)))
-        self.simulator = Simulator(builder.Build())
-        self.context = self.station.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
-        self.station.set_positions(self.context, POSES[name])
-        self.simulator.Initialize()
-        self.tick = 0
-
-    def step(self):
-        self.tick += 1
-        self.simulator.AdvanceTo(1e-3 * self.tick)
-
-    def drift(self):
-        return np.abs(self.station.get_positions(self.context) - POSES[self.arm.name.lower()]).max()
-
-
-class Controller:
-    """Holds the first pose that it hears of, through the hardware station."""
-
-    def __init__(self, lcm, name="mtml", driver=None):
-        arm = load_arm(name)
-        builder = DiagramBuilder()
-        station = builder.AddSystem(ArmStation(arm, hardware=True, driver=driver, lcm=lcm))
-        controller = builder.AddSystem(GravityPidController(IdentifiedModel.from_arm(arm), mode="gravity"))
-        builder.Connect(station.GetOutputPort(f"{name}.state_estimated"), controller.GetInputPort("state_estimated"))
-        builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))
-        self.simulator = Simulator(builder.Build())
-        self.simulator.Initialize()
-        self.tick = 0
-
-    def step(self):
-        self.tick += 1
-        self.simulator.AdvanceTo(1e-3 * self.tick)
-
-
-def run(lcm, milliseconds, *processes):
-    for _ in range(milliseconds):
-        for process in processes:
-            process.step()
-            lcm.HandleSubscriptions(0)
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
@@ -184,101 +121,6 @@ def test_a_fault_is_reset_through_the_sender():
     assert arm.statuses[-1].guard_state == Status.STATE_HOLD
 
 
-@pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_a_feed_forward_velocity_pushes_no_joint_beyond_its_limit(name):
-    """Positions that stand just inside the limits, with velocities that lead outward; no stop of the plant helps."""
-    lcm = DrakeLcm("memq://")
-    arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
-    A, lower, upper = arm.arm.limit_matrix()
-    outward = np.where(np.arange(7) == 2, -1.0, 1.0)  # shoulder and elbow apart, for the coupled limit's sake
-    goal = np.where(outward > 0, arm.arm.position_upper - 1e-3, arm.arm.position_lower + 1e-3)
-    sender = Sending(lcm, arm.arm, desired_state=np.concatenate([POSES[name], np.zeros(7)]))
-    run(lcm, 60, arm, sender)
-    sender.fix("desired_state", np.concatenate([goal, np.zeros(7)]))
-    run(lcm, 1500, arm, sender)
-    sender.fix("desired_state", np.concatenate([goal, 100 * outward]))
-    margin = np.minimum(0.05, 0.05 * (upper - lower))
-    for _ in range(500):
-        run(lcm, 1, arm, sender)
-        c = A @ np.array(arm.statuses[-1].position)
-        assert np.all(np.maximum(c - upper, lower - c) < 0.5 * margin)
-    assert arm.statuses[-1].guard_state == Status.STATE_POSITION
-
-
-def test_an_effort_and_the_arms_own_gravity_compensation_stay_inside_the_limits_together():
-    lcm = DrakeLcm("memq://")
-    arm = SimulatedArm(lcm, driver=DvrkDriver(gravity_compensation=True))
-    sender = Sending(lcm, effort=np.zeros(7))
-    run(lcm, 300, arm, sender)
-    for sign in (1, -1):
-        sender.fix("effort", sign * ARM.effort_limits)
-        run(lcm, 30, arm, sender)
-        commanded = [s.effort_commanded for s in arm.statuses[-30:]]
-        assert np.all(np.abs(commanded) <= ARM.effort_limits)
-        assert np.any(np.abs(commanded) == ARM.effort_limits)
-
-
-def without_stops(plant):
-    for index in plant.GetJointIndices():
-        joint = plant.get_joint(index)
-        if joint.num_positions() == 1:
-            joint.set_position_limits([-np.inf], [np.inf])
-
-
-def pushed(name, push, seconds):
-    """Furthest way beyond any limit [guard's margins], under efforts that ramp to `push` in 0.2 s; last status."""
-    lcm = DrakeLcm("memq://")
-    arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
-    A, lower, upper = arm.arm.limit_matrix()
-    held = IdentifiedModel.from_arm(arm.arm).holding_torque(POSES[name])
-    sender = Sending(lcm, arm.arm, effort=held)
-    run(lcm, 60, arm, sender)
-    worst = -np.inf
-    for k in range(round(1e3 * seconds)):
-        sender.fix("effort", held + (push - held) * min(1.0, k / 200))
-        run(lcm, 1, arm, sender)
-        c = A @ np.array(arm.statuses[-1].position)
-        worst = max(worst, *(np.maximum(c - upper, lower - c) / np.minimum(0.05, 0.05 * (upper - lower))))
-    return worst, arm.statuses[-1]
-
-
-@pytest.mark.parametrize(("name", "row"), [("mtml", k) for k in range(8)] + [("psm", k) for k in range(7)])
-@pytest.mark.parametrize("side", [-1, 1])
-def test_all_the_effort_that_motors_have_pushes_no_joint_beyond_its_limit(name, row, side):
-    # Neither friction nor damping nor a stop of the plant helps: the soft wall does it alone.
-    arm = load_arm(name)
-    push = side * np.sign(arm.limit_matrix()[0][row]) * arm.effort_limits
-    worst, status = pushed(name, push, 0.6)
-    assert worst < 0.5  # beyond half of the wall's width is a fault
-    assert (status.guard_state, status.fault_text) == (Status.STATE_EFFORT, "")
-
-
-@pytest.mark.parametrize(("name", "joint"), [("mtml", 3), ("mtml", 5), ("mtml", 6), ("psm", 3), ("psm", 4), ("psm", 6)])
-def test_a_wrist_that_leans_on_a_soft_wall_comes_to_rest(name, joint):
-    """The light joints, on which a wall that is too stiff for a period of delay makes the motors hammer."""
-    lcm = DrakeLcm("memq://")
-    arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
-    held = IdentifiedModel.from_arm(arm.arm).holding_torque(POSES[name])
-    push = 0.6 * arm.arm.effort_limits * np.eye(7)[joint]
-    sender = Sending(lcm, arm.arm, effort=held)
-    run(lcm, 60, arm, sender)
-    for k in range(1000):
-        sender.fix("effort", held + push * min(1.0, k / 200))
-        run(lcm, 1, arm, sender)
-    last = arm.statuses[-100:]
-    assert last[-1].joint_flags[joint] & Status.FLAG_POSITION_LIMIT
-    effort = np.array([status.effort_commanded[joint] for status in last])
-    assert np.abs(np.diff(effort)).max() < 0.01 * arm.arm.effort_limits[joint]
-    assert np.abs([status.velocity[joint] for status in last]).max() < 0.1
-
-
-@pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_a_limp_arm_falls_into_the_soft_wall(name):
-    worst, status = pushed(name, np.zeros(7), 2.0)
-    assert worst < 0.5
-    assert status.guard_state == Status.STATE_EFFORT
-
-
 def test_off_lets_the_arm_fall():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm)
@@ -289,38 +131,6 @@ def test_off_lets_the_arm_fall():
     assert arm.statuses[-1].guard_state == Status.STATE_OFF
     assert not np.any(arm.statuses[-1].effort_measured)
     assert arm.drift() > 0.01
-
-
-class Sending:
-    """A DvrkCommandSender that answers each status, with fixed inputs."""
-
-    def __init__(self, lcm, arm=ARM, **inputs):
-        self.arm, self.sender = arm, DvrkCommandSender(arm)
-        self.context = self.sender.CreateDefaultContext()
-        self.lcm, self.status, self.ticks = lcm, Status(), 0
-        # Fixing it at each tick anew would copy it each time.
-        self.received = self.port("lcmt_dvrk_status").FixValue(self.context, AbstractValue.Make(self.status))
-        lcm.Subscribe(f"DVRK_STATUS_{arm.name}", self.hear)
-        for name, value in inputs.items():
-            self.fix(name, value)
-
-    def hear(self, data):
-        self.status = Status.decode(data)
-
-    def port(self, name):
-        return self.sender.GetInputPort(name)
-
-    def fix(self, name, value):
-        self.port(name).FixValue(self.context, value)
-
-    def command(self):
-        self.received.GetMutableData().set_value(self.status)
-        return self.sender.get_output_port().Eval(self.context)
-
-    def step(self):
-        self.ticks += 1
-        self.context.SetTime(1e-3 * self.ticks)
-        self.lcm.Publish(f"DVRK_COMMAND_{self.arm.name}", self.command().encode())
 
 
 def test_the_sender_asks_for_a_hold_unless_it_is_given_finite_numbers():

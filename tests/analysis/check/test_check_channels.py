@@ -1,0 +1,108 @@
+"""`check` of channels: lags, signs, noise, units of velocities and efforts are found with their size."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from check_findings import ARMS, changed, found
+from synthetic_motion import RATE, clean_motion
+
+from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.analysis.signals.low_pass import low_pass
+from dvrk_drake.models.arm import load_arm
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize(("gain", "lag"), [(1.18, 0.0), (1.0, 0.010), (1.07, 0.008), (-1.0, 0.0), (180 / np.pi, 0.0)])
+def test_velocities_that_disagree(gain, lag):
+    whole = clean_motion("mtmr")
+    late = changed(whole, "qd", 5, lambda x: gain * np.interp(whole.t - lag, whole.t, x))
+    kinds = found(late, "mtmr")
+    # Only the first four joints of an MTM share motors, so this joint is one channel.
+    assert [f.joints for f in kinds["velocity disagrees"]] == [(5,)]
+    report = check_recording(late, load_arm("mtmr"))
+    assert report.joints[5].velocity_gain == pytest.approx(gain, rel=5e-3)
+    assert report.joints[5].velocity_lag == pytest.approx(lag, abs=3e-4)
+
+
+def test_velocities_that_are_always_zero():
+    whole = clean_motion()
+    assert len(found(replace(whole, qd=0 * whole.qd))["velocity disagrees"]) == 7
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("lag", [0.010, -0.010, 0.020])
+def test_late_efforts(name, lag):
+    report = check_recording(clean_motion(name, effort_lag=lag), load_arm(name))
+    lags = [joint.effort_lag for joint in report.joints]
+    assert sum(value is not None for value in lags) >= 5
+    for value in lags:
+        if value is not None:
+            # Inertia that depends on the pose is not in the fit; a lag of 3 ms is what it may look like.
+            assert value == pytest.approx(lag, abs=0.0035)
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("joint", range(7))
+def test_wrong_sign_of_an_effort_is_refused(name, joint):
+    arm = load_arm(name)
+    motors = clean_motion(name).in_actuator_coordinates(arm)
+    refusals = found(changed(motors, "tau", joint, lambda x: -x), name)["effort sign"]
+    assert [f.joints for f in refusals] == [(joint,)]
+    assert refusals[0].severity == "refusal"
+
+
+def test_narrow_band_noise():
+    generator = np.random.default_rng(6)
+    whole = clean_motion()
+    white = generator.normal(size=len(whole))
+    band = low_pass(white, RATE, 15.0) - low_pass(white, RATE, 7.0)
+    size = 0.15 * np.sqrt(np.mean(whole.tau[:, 2] ** 2))
+    noisy = changed(whole, "tau", 2, lambda x: x + size * band / np.std(band))
+    bands = found(noisy)["narrow-band noise"]
+    assert [f.joints for f in bands] == [(2,)]
+    assert bands[0].size == pytest.approx(0.15, rel=0.15)
+
+
+def test_louder_noise_lowers_the_cut_off_to_what_moves():
+    """The motion ends at its fifth harmonic, 0.83 Hz; only friction's reversals are above."""
+    report = check_recording(clean_motion(), load_arm("psm"))
+    louder = changed(
+        clean_motion(), "tau", 0, lambda x: x + np.random.default_rng(8).normal(size=len(x)) * 0.5 * np.std(x)
+    )
+    noisy = check_recording(louder, load_arm("psm"))
+    assert noisy.joints[0].effort_cut_off < report.joints[0].effort_cut_off
+    assert 2.0 <= noisy.joints[0].effort_cut_off < 10.0
+
+
+def test_saturated_effort():
+    whole = clean_motion()
+    limit = np.quantile(whole.tau[:, 0], 0.95)
+    finding = found(changed(whole, "tau", 0, lambda x: np.minimum(x, limit)))["saturated effort"][0]
+    assert finding.joints == (0,)
+    assert finding.size == pytest.approx(0.05, abs=0.015)
+
+
+def test_efforts_in_another_unit_are_refused():
+    assert found(changed(clean_motion(), "tau", 1, lambda x: 1000 * x))["unusable"][0].severity == "refusal"
+
+
+def test_positions_in_degrees_are_refused():
+    whole = clean_motion()
+    degrees = replace(whole, q=np.where(load_arm("psm").prismatic, whole.q, np.degrees(whole.q)))
+    assert "degrees" in found(degrees)["unusable"][0].what
+
+
+def test_millimetres_are_refused():
+    assert "millimetres" in found(changed(clean_motion(), "q", 2, lambda x: 1000 * x))["unusable"][0].what
+
+
+def test_spikes_of_an_effort_are_refused_in_a_motion():
+    def spike(tau):
+        tau = tau.copy()
+        tau[[300, 700]] = 500.0
+        return tau
+
+    finding = found(changed(clean_motion(), "tau", 1, spike))["above effort limit"][0]
+    assert finding.severity == "refusal" and "2 rows" in finding.what

@@ -1,0 +1,81 @@
+"""`check` of times: repeated rows, jitter, gaps, wrong units are found with their size."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from check_findings import ARMS, found
+from synthetic_motion import RATE, clean_motion
+
+from dvrk_drake.analysis.signals.true_time import true_time
+from dvrk_drake.models.arm import load_arm
+
+pytestmark = pytest.mark.slow
+
+
+def test_repeated_rows_are_counted_and_their_times_made():
+    generator = np.random.default_rng(3)
+    whole = clean_motion()
+    rows = np.arange(len(whole))
+    repeats = generator.random(len(rows)) < 0.12
+    repeats[0] = False
+    last = np.maximum.accumulate(np.where(repeats, 0, rows))
+    polled = replace(whole, q=whole.q[last], qd=whole.qd[last], tau=whole.tau[last])
+    kinds = found(polled)
+    assert kinds["repeated rows"][0].size == pytest.approx(np.mean(repeats), abs=1e-9)
+    clock = true_time(polled.in_actuator_coordinates(load_arm("psm")))
+    np.testing.assert_array_equal(clock.rows, rows[~repeats])
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("jitter", [0.15, 0.5])
+def test_jitter_is_measured_and_taken_out(name, jitter):
+    intervals = np.random.default_rng(4).gamma(1 / jitter**2, jitter**2 / RATE, 4000)
+    true = np.concatenate([[0.0], np.cumsum(intervals)])
+    recording = clean_motion(name, at=true)
+    arm = load_arm(name)
+    kinds = found(recording, name)
+    assert kinds["jitter"][0].size == pytest.approx(jitter, rel=0.15)
+    assert "velocity disagrees" not in kinds
+    made = np.diff(true_time(recording.in_actuator_coordinates(arm)).t)
+    left = made / made.mean() - intervals / intervals.mean()
+    # 0.5 would be half of the jitter: what is left is the curvature of the way between two rows.
+    assert np.std(left) < 0.1 * jitter
+
+
+def test_a_slower_effort_topic_is_named():
+    whole = clean_motion()
+    every_other = np.arange(len(whole)) // 2 * 2
+    kinds = found(replace(whole, tau=whole.tau[every_other]))
+    assert [f.where for f in kinds["repeated channel"]] == ["tau"]
+    assert kinds["repeated channel"][0].size == pytest.approx(0.5, abs=0.01)
+    assert "repeated rows" not in kinds
+
+
+def test_gap_in_time():
+    whole = clean_motion()
+    keep = np.ones(len(whole), bool)
+    keep[1000:1100] = False
+    cut = replace(whole, q=whole.q[keep], qd=whole.qd[keep], tau=whole.tau[keep], t=whole.t[keep])
+    gap = found(cut)["gaps"][0]
+    assert gap.size == pytest.approx(101 / RATE, abs=1e-9)
+    assert "row 1001" in gap.what
+    assert set(found(cut)) == {"gaps", "repetition"}
+
+
+def test_times_that_go_back_are_refused():
+    whole = clean_motion()
+    t = whole.t.copy()
+    t[500] = t[498]
+    refusal = found(replace(whole, t=t))["time goes back"][0]
+    assert refusal.severity == "refusal"
+    assert "row 501" in refusal.what
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "milliseconds"), (1e9, "nanoseconds"), (7 / 6, "rate right")])
+def test_times_in_another_unit_are_refused(factor, unit):
+    whole = clean_motion()
+    refusal = found(replace(whole, t=whole.t * factor))["wrong time"][0]
+    assert refusal.severity == "refusal"
+    assert refusal.size == pytest.approx(factor, rel=1e-2)
+    assert unit in refusal.what

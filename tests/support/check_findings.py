@@ -1,0 +1,23 @@
+"""Findings of `check`, by kind, and recordings with one thing wrong."""
+
+from dataclasses import replace
+
+from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.models.arm import load_arm
+
+ARMS = "psm", "mtmr"
+
+
+def found(recording, name="psm"):
+    """Findings by kind."""
+    report = check_recording(recording, load_arm(name))
+    kinds = {}
+    for finding in report.findings:
+        kinds.setdefault(finding.kind, []).append(finding)
+    return kinds
+
+
+def changed(recording, block, joint, change):
+    values = getattr(recording, block).copy()
+    values[:, joint] = change(values[:, joint])
+    return replace(recording, **{block: values})

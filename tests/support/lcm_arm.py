@@ -1,0 +1,111 @@
+"""A simulated arm behind LCM in one process, and what can command it."""
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.guard.settings import GuardSettings
+from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
+
+ARM = load_arm("mtml")
+POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
+START = 10**15
+#: For tests of what comes after the start: it is watched for 50 ms, not for a quarter of a second.
+SOON = DvrkDriver(guard=GuardSettings(start_time=0.05))
+
+
+class SimulatedArm:
+    """A simulated arm behind LCM, and what it said."""
+
+    def __init__(self, lcm, name="mtml", driver=None, modify_plant=None):
+        self.arm = load_arm(name)
+        builder = DiagramBuilder()
+        self.station = builder.AddSystem(ArmStation(self.arm, modify_plant=modify_plant))
+        apply_driver_config(driver or DvrkDriver(), self.station, lcm, builder, start_utime=START)
+        self.statuses = []
+        lcm.Subscribe(f"DVRK_STATUS_{self.arm.name}", lambda data: self.statuses.append(Status.decode(data)))
+        self.simulator = Simulator(builder.Build())
+        self.context = self.station.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
+        self.station.set_positions(self.context, POSES[name])
+        self.simulator.Initialize()
+        self.tick = 0
+
+    def step(self):
+        self.tick += 1
+        self.simulator.AdvanceTo(1e-3 * self.tick)
+
+    def drift(self):
+        return np.abs(self.station.get_positions(self.context) - POSES[self.arm.name.lower()]).max()
+
+
+class Controller:
+    """Holds the first pose that it hears of, through the hardware station."""
+
+    def __init__(self, lcm, name="mtml", driver=None):
+        arm = load_arm(name)
+        builder = DiagramBuilder()
+        station = builder.AddSystem(ArmStation(arm, hardware=True, driver=driver, lcm=lcm))
+        controller = builder.AddSystem(GravityPidController(IdentifiedModel.from_arm(arm), mode="gravity"))
+        builder.Connect(station.GetOutputPort(f"{name}.state_estimated"), controller.GetInputPort("state_estimated"))
+        builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))
+        self.simulator = Simulator(builder.Build())
+        self.simulator.Initialize()
+        self.tick = 0
+
+    def step(self):
+        self.tick += 1
+        self.simulator.AdvanceTo(1e-3 * self.tick)
+
+
+def run(lcm, milliseconds, *processes):
+    for _ in range(milliseconds):
+        for process in processes:
+            process.step()
+            lcm.HandleSubscriptions(0)
+
+
+def without_stops(plant):
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        if joint.num_positions() == 1:
+            joint.set_position_limits([-np.inf], [np.inf])
+
+
+class Sending:
+    """A DvrkCommandSender that answers each status, with fixed inputs."""
+
+    def __init__(self, lcm, arm=ARM, **inputs):
+        self.arm, self.sender = arm, DvrkCommandSender(arm)
+        self.context = self.sender.CreateDefaultContext()
+        self.lcm, self.status, self.ticks = lcm, Status(), 0
+        # Fixing it at each tick anew would copy it each time.
+        self.received = self.port("lcmt_dvrk_status").FixValue(self.context, AbstractValue.Make(self.status))
+        lcm.Subscribe(f"DVRK_STATUS_{arm.name}", self.hear)
+        for name, value in inputs.items():
+            self.fix(name, value)
+
+    def hear(self, data):
+        self.status = Status.decode(data)
+
+    def port(self, name):
+        return self.sender.GetInputPort(name)
+
+    def fix(self, name, value):
+        self.port(name).FixValue(self.context, value)
+
+    def command(self):
+        self.received.GetMutableData().set_value(self.status)
+        return self.sender.get_output_port().Eval(self.context)
+
+    def step(self):
+        self.ticks += 1
+        self.context.SetTime(1e-3 * self.ticks)
+        self.lcm.Publish(f"DVRK_COMMAND_{self.arm.name}", self.command().encode())

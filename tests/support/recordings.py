@@ -1,0 +1,37 @@
+"""Recordings as text, and random ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.recording import Recording
+
+Q_NAMES = [f"q{i}" for i in range(1, 8)]
+TAU_NAMES = [f"tau{i}" for i in range(1, 8)]
+HEADER = ",".join([*Q_NAMES, *TAU_NAMES])
+ROW = ",".join(f"0.{i}" for i in range(1, 15))
+# q_joint = M_MTM q_actuator for joints 2..4, as published; written out, not taken from the project.
+M_MTM = np.eye(7)
+M_MTM[1:4, 1:4] = [[1, 0, 0], [-1, 1, 0], [0.6697, -0.6697, 1]]
+
+
+def write_text(folder: Path, text: str | bytes) -> Path:
+    path = folder / "recording.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def random_recording(num_rows: int = 20, **changes: object) -> Recording:
+    q, qd, tau = np.random.default_rng(7).uniform(-0.2, 0.2, (3, num_rows, 7))
+    return replace(Recording(q=q, tau=tau, qd=qd, t=np.arange(num_rows) / 3), **changes)
+
+
+SIX = ",".join([*Q_NAMES[:6], *TAU_NAMES[:6]])
+
+
+def six_joint_arm():
+    return replace(load_arm("psm"), joint_names=load_arm("psm").joint_names[:6])

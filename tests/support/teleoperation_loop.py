@@ -1,0 +1,66 @@
+"""Teleoperation's law with a follower that obeys, and poses of handle and tip."""
+
+import numpy as np
+
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
+from dvrk_drake.systems.teleoperation import Teleoperation
+
+MTM, PSM = load_arm("mtml"), load_arm("psm")
+#: yaw, pitch, insertion, roll, wrist pitch, wrist yaw, jaw: Wang et al. 2019.
+SPEED = np.array([1.7, 1.7, 0.35, 2.0, 2.0, 3.0, 3.0])
+PERIOD = 1e-3
+Q_M = np.array([0.1, 0.3, -0.1, 0.2, 1.0, 0.1, 0.3])
+Q_F = np.array([0.2, -0.1, 0.13, 0.4, 0.2, -0.3, 0.5])
+
+
+def pose(arm, frame, q):
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    set_arm_positions(plant, context, arm, q)
+    return plant.GetFrameByName(frame).CalcPoseInWorld(context)
+
+
+def handle(q):
+    return pose(MTM, "dh_7", q)
+
+
+def tip(q):
+    return pose(PSM, "dh_6", q)
+
+
+def angle(R):
+    return abs(R.ToAngleAxis().angle())
+
+
+class Loop:
+    """`Teleoperation` with a follower that is where it is commanded, unless told otherwise."""
+
+    def __init__(self, q_follower=Q_F, **arguments):
+        self.system = Teleoperation(MTM, PSM, **arguments)
+        self.context = self.system.CreateDefaultContext()
+        self.inputs = {"master_position": Q_M, "follower_position": q_follower, "engaged": 0.0, "jaw_angle": 0.5}
+        self.step()
+
+    def step(self, follower=None, **inputs):
+        """One update; the desired positions (7,) and velocities (7,)."""
+        self.inputs.update(inputs)
+        if follower is not None:
+            self.inputs["follower_position"] = follower
+        for name, value in self.inputs.items():
+            self.system.GetInputPort(name).FixValue(self.context, np.atleast_1d(value))
+        state = self.context.get_mutable_discrete_state()
+        state.SetFrom(self.system.EvalUniquePeriodicDiscreteUpdate(self.context))
+        desired = self.system.GetOutputPort("desired_state").Eval(self.context)
+        if follower is None and np.all(np.isfinite(desired)):
+            self.inputs["follower_position"] = desired[:7].copy()
+        return desired[:7].copy(), desired[7:].copy()
+
+    def move(self, q_master, steps=400):
+        """Moves the master to q_master, step by step, then lets the follower arrive; all desired positions."""
+        start = np.array(self.inputs["master_position"])
+        way = [self.step(master_position=start + s * (q_master - start))[0] for s in np.linspace(0, 1, steps)]
+        return np.array(way + [self.step()[0] for _ in range(steps)])
+
+    def flag(self, name):
+        return self.system.GetOutputPort(name).Eval(self.context)[0]

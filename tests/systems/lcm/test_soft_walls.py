@@ -1,0 +1,99 @@
+"""The guard's soft walls on simulated arms without stops: no command gets a joint beyond its limit."""
+
+import numpy as np
+import pytest
+from lcm_arm import ARM, POSES, SOON, Sending, SimulatedArm, run, without_stops
+from pydrake.lcm import DrakeLcm
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_a_feed_forward_velocity_pushes_no_joint_beyond_its_limit(name):
+    """Positions that stand just inside the limits, with velocities that lead outward; no stop of the plant helps."""
+    lcm = DrakeLcm("memq://")
+    arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
+    A, lower, upper = arm.arm.limit_matrix()
+    outward = np.where(np.arange(7) == 2, -1.0, 1.0)  # shoulder and elbow apart, for the coupled limit's sake
+    goal = np.where(outward > 0, arm.arm.position_upper - 1e-3, arm.arm.position_lower + 1e-3)
+    sender = Sending(lcm, arm.arm, desired_state=np.concatenate([POSES[name], np.zeros(7)]))
+    run(lcm, 60, arm, sender)
+    sender.fix("desired_state", np.concatenate([goal, np.zeros(7)]))
+    run(lcm, 1500, arm, sender)
+    sender.fix("desired_state", np.concatenate([goal, 100 * outward]))
+    margin = np.minimum(0.05, 0.05 * (upper - lower))
+    for _ in range(500):
+        run(lcm, 1, arm, sender)
+        c = A @ np.array(arm.statuses[-1].position)
+        assert np.all(np.maximum(c - upper, lower - c) < 0.5 * margin)
+    assert arm.statuses[-1].guard_state == Status.STATE_POSITION
+
+
+def test_an_effort_and_the_arms_own_gravity_compensation_stay_inside_the_limits_together():
+    lcm = DrakeLcm("memq://")
+    arm = SimulatedArm(lcm, driver=DvrkDriver(gravity_compensation=True))
+    sender = Sending(lcm, effort=np.zeros(7))
+    run(lcm, 300, arm, sender)
+    for sign in (1, -1):
+        sender.fix("effort", sign * ARM.effort_limits)
+        run(lcm, 30, arm, sender)
+        commanded = [s.effort_commanded for s in arm.statuses[-30:]]
+        assert np.all(np.abs(commanded) <= ARM.effort_limits)
+        assert np.any(np.abs(commanded) == ARM.effort_limits)
+
+
+def pushed(name, push, seconds):
+    """Furthest way beyond any limit [guard's margins], under efforts that ramp to `push` in 0.2 s; last status."""
+    lcm = DrakeLcm("memq://")
+    arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
+    A, lower, upper = arm.arm.limit_matrix()
+    held = IdentifiedModel.from_arm(arm.arm).holding_torque(POSES[name])
+    sender = Sending(lcm, arm.arm, effort=held)
+    run(lcm, 60, arm, sender)
+    worst = -np.inf
+    for k in range(round(1e3 * seconds)):
+        sender.fix("effort", held + (push - held) * min(1.0, k / 200))
+        run(lcm, 1, arm, sender)
+        c = A @ np.array(arm.statuses[-1].position)
+        worst = max(worst, *(np.maximum(c - upper, lower - c) / np.minimum(0.05, 0.05 * (upper - lower))))
+    return worst, arm.statuses[-1]
+
+
+@pytest.mark.parametrize(("name", "row"), [("mtml", k) for k in range(8)] + [("psm", k) for k in range(7)])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_all_the_effort_that_motors_have_pushes_no_joint_beyond_its_limit(name, row, side):
+    # Neither friction nor damping nor a stop of the plant helps: the soft wall does it alone.
+    arm = load_arm(name)
+    push = side * np.sign(arm.limit_matrix()[0][row]) * arm.effort_limits
+    worst, status = pushed(name, push, 0.6)
+    assert worst < 0.5  # beyond half of the wall's width is a fault
+    assert (status.guard_state, status.fault_text) == (Status.STATE_EFFORT, "")
+
+
+@pytest.mark.parametrize(("name", "joint"), [("mtml", 3), ("mtml", 5), ("mtml", 6), ("psm", 3), ("psm", 4), ("psm", 6)])
+def test_a_wrist_that_leans_on_a_soft_wall_comes_to_rest(name, joint):
+    """The light joints, on which a wall that is too stiff for a period of delay makes the motors hammer."""
+    lcm = DrakeLcm("memq://")
+    arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
+    held = IdentifiedModel.from_arm(arm.arm).holding_torque(POSES[name])
+    push = 0.6 * arm.arm.effort_limits * np.eye(7)[joint]
+    sender = Sending(lcm, arm.arm, effort=held)
+    run(lcm, 60, arm, sender)
+    for k in range(1000):
+        sender.fix("effort", held + push * min(1.0, k / 200))
+        run(lcm, 1, arm, sender)
+    last = arm.statuses[-100:]
+    assert last[-1].joint_flags[joint] & Status.FLAG_POSITION_LIMIT
+    effort = np.array([status.effort_commanded[joint] for status in last])
+    assert np.abs(np.diff(effort)).max() < 0.01 * arm.arm.effort_limits[joint]
+    assert np.abs([status.velocity[joint] for status in last]).max() < 0.1
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_a_limp_arm_falls_into_the_soft_wall(name):
+    worst, status = pushed(name, np.zeros(7), 2.0)
+    assert worst < 0.5
+    assert status.guard_state == Status.STATE_EFFORT
