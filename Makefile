@@ -15,7 +15,7 @@ demo: $(VENV)/.installed
 test: test-fast test-udp
 
 test-fast: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -n 2 --dist loadfile --ignore-glob='*_udp.py' -m '$(TESTS)'
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --ignore-glob='*_udp.py' -m '$(TESTS)'
 
 # One after the other: each runs several processes at 1 kHz, and wants the cores for itself.
 test-udp: $(VENV)/.installed-test

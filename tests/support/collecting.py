@@ -1,24 +1,18 @@
 """Processes that collect poses of an arm over UDP, for tests."""
 
-import sys
 import time
 
-from own_network import start
+from arm_processes import dvrk_drake
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-
-
-def dvrk_drake(*arguments):
-    return start(sys.executable, "-m", "dvrk_drake.cli", *map(str, arguments))
 
 
 def until(condition, seconds, process):
     """Waits; False if the arm took over instead, as it does when a machine busy with other tests is late."""
     deadline = time.monotonic() + seconds
     while not condition():
-        if process.poll() is not None:
-            said = process.stdout.read()
-            assert process.returncode == 2 and " took over and holds" in said, said
+        if not process.is_running():
+            assert process.wait(0) == 2 and " took over and holds" in process.said(), process.said()
             return False
         assert time.monotonic() < deadline
         time.sleep(0.01)

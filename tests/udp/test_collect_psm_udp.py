@@ -1,14 +1,15 @@
 """A collection of a PSM from both sides, with real processes over real UDP multicast in a network of their own.
 
-This file starts itself again inside a network namespace.
+This file starts itself again inside a network namespace. Processes are forked from one that has compiled everything.
 """
 
 import signal
 
 import numpy as np
 from arm_observer import Observer
-from collecting import collect_until, dvrk_drake, holds
-from own_network import end, inside, outside, run_inside
+from arm_processes import dvrk_drake
+from collecting import collect_until, holds
+from own_network import inside, outside, run_inside
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -39,14 +40,13 @@ def test_a_collection_of_a_psm_from_both_sides_completes(tmp_path):
             return output.exists() and output.read_bytes().count(b"\n") == 1 + POSES
 
         collecting = collect_until(finished, command)
-        said, _ = collecting.communicate(timeout=60)
-        assert collecting.returncode == 0, said
-        assert f"{POSES} of {POSES} poses" in said
+        assert collecting.wait(60) == 0, collecting.said()
+        assert f"{POSES} of {POSES} poses" in collecting.said()
         observer.until(holds, 2, "hold")
         assert observer.last.fault_code == 0
     finally:
-        print(end(process, signal.SIGINT))
-    assert process.returncode == 0
+        print(process.end(signal.SIGINT))
+    assert process.wait(0) == 0
     recording = read_recording(output, arm)
     away = np.abs(recording.q - load_poses(poses, arm))
     print("measured at, from the pose:", away.max(axis=0))

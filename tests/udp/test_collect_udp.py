@@ -1,6 +1,6 @@
 """From poses to a compensated arm, with real processes over real UDP multicast in a network of their own.
 
-This file starts itself again inside a network namespace.
+This file starts itself again inside a network namespace. Processes are forked from one that has compiled everything.
 """
 
 import signal
@@ -9,8 +9,9 @@ import time
 import numpy as np
 import pytest
 from arm_observer import Observer
-from collecting import collect_until, dvrk_drake, holds
-from own_network import end, inside, outside, run_inside
+from arm_processes import dvrk_drake
+from collecting import collect_until, holds
+from own_network import inside, outside, run_inside
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -35,8 +36,8 @@ def observer():
     process = dvrk_drake("arm", "--arm", "mtml", "--realtime")
     observer.until(lambda status: True, 90, "first status")
     yield observer
-    said = end(process, signal.SIGINT)
-    assert process.returncode == 0, said
+    said = process.end(signal.SIGINT)
+    assert process.wait(0) == 0, said
 
 
 def moving(status):
@@ -55,15 +56,14 @@ def test_collect_kill_go_on_identify_and_release(observer, tmp_path):
 
     # kill -9 on the way to the third: the arm holds, the file is whole.
     process = collect_until(lambda: rows() == 2 and moving(observer.last), command)
-    end(process, signal.SIGKILL)
+    process.end(signal.SIGKILL)
     finished = output.read_bytes()
     assert len(read_recording(output, arm)) == 2
     observer.until(holds, 2, "hold")
 
     process = collect_until(lambda: rows() == POSES, command)
-    said, _ = process.communicate(timeout=60)
-    assert process.returncode == 0, said
-    assert f"{POSES} of {POSES} poses" in said
+    assert process.wait(60) == 0, process.said()
+    assert f"{POSES} of {POSES} poses" in process.said()
     assert output.read_bytes().startswith(finished)
     recording = read_recording(output, arm)
     np.testing.assert_allclose(recording.q, load_poses(poses, arm), atol=5e-3)
@@ -79,8 +79,8 @@ def test_collect_kill_go_on_identify_and_release(observer, tmp_path):
     begun = observer.until(lambda status: status.guard_state == Status.STATE_EFFORT, 60, "run")
     time.sleep(3.0)
     released = np.array([status.position for _, status in observer.heard[begun:]])
-    said = end(process, signal.SIGINT)
-    assert process.returncode == 0, said
+    said = process.end(signal.SIGINT)
+    assert process.wait(0) == 0, said
     drift = np.abs(released - released[0]).max(axis=0)
     print("drift after release in 3 s [mrad]:", np.round(1e3 * drift, 2))
     # A model of eight poses carries it. The wrists turn freely in simulation, where 1e-5 N m too much moves them by

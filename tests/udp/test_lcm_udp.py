@@ -4,23 +4,18 @@ Run by itself, this file starts itself again inside a network namespace; the tes
 Processes are forked from one that has compiled everything; where a test starts them by their command line, it says so.
 """
 
-import multiprocessing
-import os
 import signal
 import subprocess
-import sys
-import tempfile
 import time
 from pathlib import Path
 
 import lcm
-import lcm_controller
 import numpy as np
 import pytest
 from arm_observer import NETWORK_URL, Observer
-from own_network import INSIDE, inside, outside, run_inside
+from arm_processes import POSES, CommandLine, start_arm, start_controller, start_run
+from own_network import inside, outside, run_inside
 
-from dvrk_drake import cli
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -30,83 +25,11 @@ from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
 
 OTHER_URL = "udpm://239.255.76.67:7668?ttl=0"
 LCM_TOOLS = Path(lcm.__file__).parent / "../bin"
-POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
 
 
 @outside
 def test_in_a_network_of_its_own():
     run_inside(__file__)
-
-
-if INSIDE in os.environ:
-    FORKSERVER = multiprocessing.get_context("forkserver")
-    FORKSERVER.set_forkserver_preload(["lcm_precompiled"])
-
-
-class Forked:
-    """A process of one of our programs, with what it says in a file."""
-
-    def __init__(self, main, *arguments):
-        descriptor, self.path = tempfile.mkstemp()
-        os.close(descriptor)
-        self.process = FORKSERVER.Process(target=run_forked, args=(main, arguments, self.path), daemon=True)
-        self.process.start()
-
-    def send_signal(self, number):
-        os.kill(self.process.pid, number)
-
-    def wait(self, seconds):
-        """The exit code."""
-        self.process.join(seconds)
-        assert self.process.exitcode is not None, f"runs on after {seconds} s: {self.said()}"
-        return self.process.exitcode
-
-    def said(self):
-        return Path(self.path).read_text()
-
-    def end(self, number=signal.SIGKILL):
-        """Ends it, and returns what it said."""
-        if self.process.exitcode is None:
-            self.send_signal(number)
-        self.wait(20)
-        return self.said()
-
-
-class CommandLine(Forked):
-    """`dvrk-drake run` as a user starts it."""
-
-    def __init__(self, name, *options):
-        descriptor, self.path = tempfile.mkstemp()
-        command = [sys.executable, "-m", "dvrk_drake.cli", "run", "--arm", name, *options]
-        self.process = subprocess.Popen(command, stdout=descriptor, stderr=descriptor)
-        os.close(descriptor)
-
-    def wait(self, seconds):
-        return self.process.wait(seconds)
-
-    def end(self, number=signal.SIGKILL):
-        self.send_signal(number)
-        self.wait(20)
-        return self.said()
-
-
-def run_forked(main, arguments, path):
-    with open(path, "w") as stream:
-        os.dup2(stream.fileno(), 1)
-        os.dup2(stream.fileno(), 2)
-    sys.exit(main(list(arguments)))
-
-
-def start_arm(name, *options):
-    return Forked(cli.main, "arm", "--arm", name, "--realtime", *options, "--pose", *map(str, POSES[name]))
-
-
-def start_run(name, *options):
-    return Forked(cli.main, "run", "--arm", name, *options)
-
-
-def start_controller(name, *options):
-    return Forked(lcm_controller.main, name, *options)
 
 
 @pytest.fixture(scope="module", params=["mtml", "psm"])

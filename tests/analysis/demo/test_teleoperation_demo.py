@@ -3,6 +3,7 @@
 from functools import partial
 
 import numpy as np
+import pytest
 from pydrake.systems.analysis import Simulator
 
 from dvrk_drake.analysis.demo.teleoperation import (
@@ -14,6 +15,7 @@ from dvrk_drake.analysis.demo.teleoperation import (
 from dvrk_drake.cli import main
 
 
+@pytest.mark.slow
 def test_played_hand_lets_go_and_is_followed_within_half_a_millimetre():
     shares = []
     meshcat = start_scene()

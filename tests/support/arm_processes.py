@@ -1,0 +1,92 @@
+"""Processes of our programs in a network of their own, forked from one that has compiled everything."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import lcm_controller
+
+from dvrk_drake import cli
+
+POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
+
+FORKSERVER = multiprocessing.get_context("forkserver")
+FORKSERVER.set_forkserver_preload(["lcm_precompiled"])
+
+
+class Forked:
+    """A process of one of our programs, with what it says in a file."""
+
+    def __init__(self, main, *arguments):
+        descriptor, self.path = tempfile.mkstemp()
+        os.close(descriptor)
+        self.process = FORKSERVER.Process(target=run_forked, args=(main, arguments, self.path), daemon=True)
+        self.process.start()
+
+    def send_signal(self, number):
+        os.kill(self.process.pid, number)
+
+    def wait(self, seconds):
+        """The exit code."""
+        self.process.join(seconds)
+        assert self.process.exitcode is not None, f"runs on after {seconds} s: {self.said()}"
+        return self.process.exitcode
+
+    def is_running(self):
+        return self.process.exitcode is None
+
+    def said(self):
+        return Path(self.path).read_text()
+
+    def end(self, number=signal.SIGKILL):
+        """Ends it, and returns what it said."""
+        if self.is_running():
+            self.send_signal(number)
+        self.wait(20)
+        return self.said()
+
+
+class CommandLine(Forked):
+    """`dvrk-drake run` as a user starts it."""
+
+    def __init__(self, name, *options):
+        descriptor, self.path = tempfile.mkstemp()
+        command = [sys.executable, "-m", "dvrk_drake.cli", "run", "--arm", name, *options]
+        self.process = subprocess.Popen(command, stdout=descriptor, stderr=descriptor)
+        os.close(descriptor)
+
+    def wait(self, seconds):
+        return self.process.wait(seconds)
+
+    def end(self, number=signal.SIGKILL):
+        self.send_signal(number)
+        self.wait(20)
+        return self.said()
+
+
+def run_forked(main, arguments, path):
+    with open(path, "w") as stream:
+        os.dup2(stream.fileno(), 1)
+        os.dup2(stream.fileno(), 2)
+    sys.exit(main(list(arguments)))
+
+
+def dvrk_drake(*arguments):
+    """A verb of the command line, with its options."""
+    return Forked(cli.main, *map(str, arguments))
+
+
+def start_arm(name, *options):
+    return dvrk_drake("arm", "--arm", name, "--realtime", *options, "--pose", *POSES[name])
+
+
+def start_run(name, *options):
+    return dvrk_drake("run", "--arm", name, *options)
+
+
+def start_controller(name, *options):
+    return Forked(lcm_controller.main, name, *options)
