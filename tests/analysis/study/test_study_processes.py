@@ -20,7 +20,7 @@ from dvrk_drake.analysis.study.study_file import load_study
 pytestmark = pytest.mark.slow
 
 STUDY = """
-scenario: psm
+scenario: mtml
 set: [duration=1, controller.mode=gravity, "real_arm=[all]"]
 random_poses: {count: 5, seed: 1, margin: 0.1}
 variations: [{name: nominal}, {name: wrong, set: [controller.parameter_error=0.2]}]
