@@ -67,7 +67,7 @@ def test_the_path_of_a_recording_keeps_inside_the_limits_and_has_its_speed():
 
 
 def test_the_verb_writes_its_table(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("dvrk_drake.analysis.transparency.rambling_path", lambda arm: resting(1.2))
+    monkeypatch.setattr("dvrk_drake.analysis.transparency.transparency.rambling_path", lambda arm: resting(1.2))
     model = tmp_path / "model.yaml"
     MODEL.save(model)
     arguments = ["transparency", "--arm", "mtml", "--model", f"ours={model}", "--real-arm", "friction"]
