@@ -125,7 +125,7 @@ class Hand(LeafSystem):
 
     def _solve(self, A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
         """F (6,) of A F = b, within the limits."""
-        F: NDArray[np.float64] = np.linalg.solve(A, b)
+        F = np.asarray(np.linalg.solve(A, b), float)
         torque, force = slice(0, 3), slice(3, 6)
         parts = (torque, force, self._grip.max_torque), (force, torque, self._grip.max_force)
         if any(np.linalg.norm(F[part]) > limit for part, _, limit in parts):
@@ -136,7 +136,7 @@ class Hand(LeafSystem):
         return F
 
 
-def _limited(vector: NDArray[np.float64], limit: float) -> NDArray[np.float64]:
+def _limited(vector: NDArray[np.floating], limit: float) -> NDArray[np.floating]:
     """`vector`, shortened to a length of `limit` if it is longer."""
     length = float(np.linalg.norm(vector))
     return vector if length <= limit else vector * (limit / length)
