@@ -231,7 +231,9 @@ def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
     write_recording(Recording(q=recording.q + 1.5 * np.eye(7)[5], tau=recording.tau), bad)
     assert "wrist_yaw (q6)" in fails(capsys, "validate", model, bad)
     (tmp_path / "m.yaml").write_text(model.read_text().replace("trust", "thrust"))
-    assert "not a model file" in fails(capsys, "validate", tmp_path / "m.yaml", poses)
+    assert 'm.yaml: joints[0]: key "thrust" is unknown; did you mean "trust"? allowed in joints: name' in fails(
+        capsys, "validate", tmp_path / "m.yaml", poses
+    )
     assert not out.exists()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.csv", "m.yaml"]
 
