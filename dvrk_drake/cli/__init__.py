@@ -28,7 +28,7 @@ from dvrk_drake.cli import (
     transparency,
     tune,
 )
-from dvrk_drake.cli.support import import_interruptibly
+from dvrk_drake.cli.support import folders_only_for_results, import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
 
 # Matrices are small here: more threads of BLAS only wait for each other, for minutes where the cores are busy. Said
@@ -41,7 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         import_interruptibly()
-        options.run(options)
+        with folders_only_for_results():
+            options.run(options)
     except DvrkDrakeError as error:
         print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
