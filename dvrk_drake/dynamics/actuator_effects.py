@@ -208,6 +208,11 @@ def position_along(arm: Arm, coordinate: str, q: NDArray[np.float64]) -> NDArray
     return np.asarray(arm.transmission.position(q) @ effect_coordinates(arm)[coordinate])
 
 
+def spring_over(coordinate: str, x: NDArray[np.float64]) -> ActuatorEffect:
+    """A spring at a coordinate that is straight over its positions x [rad, m] in a recording, and just beyond."""
+    return ActuatorEffect(coordinate, "spring", float(f"{1.01 * np.abs(x).max():.3g}"))
+
+
 def effect_fault(arm: Arm, effect: ActuatorEffect, kinds: Collection[str] = EFFECT_KINDS) -> str:
     """Why an arm cannot have this effect, with what it can have; "" if it can.
 

@@ -16,6 +16,7 @@ from dvrk_drake.dynamics.actuator_effects import (
     effect_fault,
     position_along,
     slides,
+    spring_over,
 )
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.effect_shapes import effect_shapes
@@ -111,7 +112,7 @@ def _named(
     if which == ASYMMETRIC:
         return [ActuatorEffect(coordinate, "coulomb forward", _rounded(DIRECTION_WIDTH * v.std()))]
     if which == "spring":
-        return [ActuatorEffect(coordinate, "spring", _rounded(1.01 * np.abs(x).max()))]
+        return [spring_over(coordinate, x)]
     effects = [ActuatorEffect(coordinate, kind, NAMED_EFFECTS[which]) for kind in ("cable sine", "cable cosine")]
     if fault := effect_fault(arm, effects[0]):
         raise ArmError(f"{where}: {fault}")

@@ -14,6 +14,7 @@ from dvrk_drake.dynamics.actuator_effects import (
     joint_row,
     position_along,
     slides,
+    spring_over,
 )
 from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
 from dvrk_drake.models.arm import Arm
@@ -23,16 +24,16 @@ BASE_PRIOR = 0.25
 #: Prior standard deviation of an effect, as a share of the effort that the limits of the joints allow along its
 #: coordinate. Offsets are kept small: over a narrow range a large one would take the place of gravity, and mislead
 #: outside of it.
-EFFECT_PRIOR = {"offset": 0.03, "cable sine": 0.3, "cable cosine": 0.3}
+EFFECT_PRIOR = {"offset": 0.03, "cable sine": 0.3, "cable cosine": 0.3, "spring": 0.3}
 #: Least standard deviation of a torque measurement, as a share of the effort limit.
 SIGMA_FLOOR = 2e-3
 #: An effect must lower the sum of squared left-out residuals (in sigma) by this much a coefficient: about log(poses).
 LEAST_GAIN = 4.0
 #: And by this many of its own standard errors over poses.
 LEAST_SIGNIFICANCE = 1.5
-#: A cable is considered if its joint moved by this much [rad]: less, and a sine would fit servo error, a cosine be an
-#: offset.
-LEAST_SPAN = {"cable sine": 0.25, "cable cosine": 1.5}
+#: A cable or spring is considered if its coordinate moved by this much [rad]: less, and a sine or spring would fit the
+#: servo's error, a cosine be an offset.
+LEAST_SPAN = {"cable sine": 0.25, "cable cosine": 1.5, "spring": 0.25}
 
 
 class StaticProblem:
@@ -59,7 +60,10 @@ class StaticProblem:
 
     def prior_precision(self, effects: Sequence[ActuatorEffect]) -> NDArray[np.float64]:
         """(b + e,) inverse prior variances about zero."""
-        effect_sd = [EFFECT_PRIOR[effect.kind] * _effort_limit(self.arm, effect.coordinate) for effect in effects]
+        effect_sd = [
+            EFFECT_PRIOR[effect.kind] * _effort_limit(self.arm, effect.coordinate) / _largest_shape(effect)
+            for effect in effects
+        ]
         sd = np.concatenate([BASE_PRIOR * _largest_base_parameters(self.base_model), effect_sd])
         return 1 / sd**2
 
@@ -72,17 +76,33 @@ class StaticProblem:
 
 
 def candidate_effects(problem: StaticProblem) -> list[list[ActuatorEffect]]:
-    """What may act at each joint that the poses say something of.
+    """What may act at each joint that the poses say something of: an offset, a cable's pull, a spring.
 
-    Coordinates of the transmission gain nothing here: they predict other recordings of the MTM a little worse.
+    A spring where the arm's file says that the joint's drive has one (`motion.known_effects`). Other coordinates of the
+    transmission gain nothing here: they predict other recordings of the MTM a little worse.
     """
     arm, groups = problem.arm, []
-    for name in (f"joint.{joint}" for joint in arm.joint_names):
-        effects = [ActuatorEffect(name, "offset")]
-        span = 0.0 if slides(arm, name) else np.ptp(position_along(arm, name, problem.q))
-        effects += [ActuatorEffect(name, kind, 1.0) for kind, least in LEAST_SPAN.items() if span >= least]
-        groups.append([e for e in effects if not _is_gravity_too(problem.base_model, e)])
+    for joint in arm.joint_names:
+        name = f"joint.{joint}"
+        effects = [ActuatorEffect(name, "offset"), *_cables(problem, name)]
+        groups += [[e for e in effects if not _is_gravity_too(problem.base_model, e)], _known_spring(problem, joint)]
     return groups
+
+
+def _known_spring(problem: StaticProblem, joint: str) -> list[ActuatorEffect]:
+    name = f"actuator.{joint}"
+    if "spring" not in problem.arm.motion.known_effects.get(name, []):
+        return []
+    x = position_along(problem.arm, name, problem.q)
+    return [spring_over(name, x)] if np.ptp(x) >= LEAST_SPAN["spring"] else []
+
+
+def _cables(problem: StaticProblem, coordinate: str) -> list[ActuatorEffect]:
+    if slides(problem.arm, coordinate):
+        return []
+    span = np.ptp(position_along(problem.arm, coordinate, problem.q))
+    kinds = ("cable sine", "cable cosine")
+    return [ActuatorEffect(coordinate, kind, 1.0) for kind in kinds if span >= LEAST_SPAN[kind]]
 
 
 def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
@@ -99,7 +119,7 @@ def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
         best_gain = 0.0
         best: tuple[ActuatorEffect, ...] = ()
         for group in groups:
-            new = [e for e in group if e not in chosen]
+            new = [e for e in group if e not in chosen and not _says_the_same(e, chosen)]
             candidates: list[tuple[ActuatorEffect, ...]] = [(e,) for e in new] + ([tuple(new)] if len(new) > 1 else [])
             for candidate in candidates:
                 trial = problem.fit((*chosen, *candidate), iterations=3, start=current.sigma)
@@ -114,6 +134,13 @@ def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
             return tuple(effect for group in groups for effect in group if effect in chosen)
         chosen = (*chosen, *best)
         current = problem.fit(chosen)
+
+
+def _says_the_same(effect: ActuatorEffect, chosen: Sequence[ActuatorEffect]) -> bool:
+    """Whether it is a spring beside a cable of the same joint, or a cable beside its spring: both fit a range."""
+    joint = effect.coordinate.partition(".")[2]
+    laws = {e.kind.partition(" ")[0] for e in chosen if e.coordinate.partition(".")[2] == joint}
+    return (effect.kind == "spring" and "cable" in laws) or (effect.kind.startswith("cable") and "spring" in laws)
 
 
 def _loss(problem: StaticProblem, fit: RobustFit, sigma: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -146,6 +173,11 @@ def effect_column(arm: Arm, effect: ActuatorEffect, q: NDArray[np.float64]) -> N
     """(m, n) torque of an effect of position on the joints at poses q (m, n), per unit of its coefficient."""
     x = position_along(arm, effect.coordinate, q)
     return effect.column(x, 0 * x)[:, None] * joint_row(arm, effect.coordinate)
+
+
+def _largest_shape(effect: ActuatorEffect) -> float:
+    """Its effort at most, per unit of its coefficient."""
+    return effect.scale if effect.kind == "spring" else 1.0
 
 
 def _effort_limit(arm: Arm, coordinate: str) -> float:
