@@ -421,7 +421,7 @@ def test_live_scene_obeys_its_sliders_and_buttons(monkeypatch):
                 plan.pop(due)()
             super().AdvanceTo(time)
 
-    monkeypatch.setattr("dvrk_drake.analysis.teleoperation_demo.Simulator", Watched)
+    monkeypatch.setattr("dvrk_drake.analysis.demo.teleoperation.Simulator", Watched)
     run_live_teleoperation(meshcat, duration=10.0)
     assert not plan
     np.testing.assert_allclose(tips[1.3], tips[0.1], atol=1e-5)  # open, then closed at rest
@@ -432,7 +432,7 @@ def test_live_scene_obeys_its_sliders_and_buttons(monkeypatch):
 
 def test_cli_writes_the_recording_and_the_errors(tmp_path, monkeypatch, capsys):
     short = partial(play_teleoperation, duration=0.6)
-    monkeypatch.setattr("dvrk_drake.analysis.teleoperation_demo.play_teleoperation", short)
+    monkeypatch.setattr("dvrk_drake.analysis.demo.teleoperation.play_teleoperation", short)
     page = tmp_path / "teleop.html"
     assert main(["teleop", "--html", str(page)]) == 0
     assert "<html" in page.read_text()
