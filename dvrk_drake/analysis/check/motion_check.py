@@ -87,7 +87,7 @@ def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
     blocks = {
         name: float(np.mean(repeated_block(block)))
         for name, block in (("q", actuators.q), ("qd", actuators.qd), ("tau", actuators.tau))
-        if block is not None
+        if block is not None and np.any(block)
     }
     if whole > LEAST_REPEATED:
         shares = ", ".join(f"{name} alone {share:.1%}" for name, share in blocks.items())
