@@ -4,17 +4,22 @@
 
 All rows simulate the same ArmStation at 1 kHz under GravityPidController ("hold"), which follows one slow cubic in all
 joints, so that friction slips and sticks. Rows: the ideal arm, the machinery of effects without any, each part alone,
-all of them. Repetitions are interleaved, so that a busy machine slows all rows alike; times are CPU time of this
-process, the least over the repetitions. `real time` is simulated time over CPU time.
+all that the arm's file states, and these with cables that stretch. No file states any of those, so here each actuator
+that can have one has one that gives STRETCH under the motor's largest effort. Repetitions are interleaved, so that a
+busy machine slows all rows alike; times are CPU time of this process, the least over the repetitions. `real time` is
+simulated time over CPU time.
 
-A third of a step is Drake's allocations. With GLIBC_TUNABLES=glibc.malloc.tcache_count=2000 in the environment glibc
-answers them from its caches, and a step takes about a tenth less.
+A third of a step is Drake's allocations. This program starts itself again with a faster allocator, as the verbs of
+`dvrk-drake` that simulate do: see `dvrk_drake.allocation`. LD_PRELOAD= or GLIBC_TUNABLES= before the command keeps what
+is there.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
+import os
 import time
 
 import numpy as np
@@ -23,22 +28,35 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
+from dvrk_drake.allocation import restart_with_faster_allocator
+from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.effects_schema import EFFECT_NAMES
+from dvrk_drake.models.effects_schema import EFFECT_NAMES, ArmEffects, Cable
 from dvrk_drake.models.plant import Closure
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 SECONDS = 0.5
+#: Of a cable under the motor's largest effort [rad], and its damping over its stiffness [s].
+STRETCH, RELAXATION = 5e-3, 1e-3
 
 
-def start(arm: Arm, parts: list[str] | None, closure: Closure) -> Simulator:
+def with_cables(arm: Arm) -> ArmEffects:
+    """The arm's effects, and a cable that stretches at each actuator that turns one joint alone."""
+    cables = {}
+    for i, name in enumerate(arm.joint_names):
+        if not arm.prismatic[i] and np.array_equal(joint_row(arm, f"actuator.{name}"), np.eye(arm.num_joints)[i]):
+            stiffness = arm.effects.saturation[name] / STRETCH
+            cables[name] = Cable(stiffness, RELAXATION * stiffness)
+    return dataclasses.replace(arm.effects, stretch=cables)
+
+
+def start(arm: Arm, effects: ArmEffects | None, closure: Closure) -> Simulator:
     low, high = arm.position_lower, arm.position_upper
     ends = np.array([0.55 * low + 0.45 * high, 0.45 * low + 0.55 * high]).T
     trajectory = PiecewisePolynomial.CubicHermite([0.0, 1.0 + SECONDS], ends, np.zeros_like(ends))
-    effects = None if parts is None else arm.effects.only(parts)
     station = ArmStation(arm, closure=closure, effects=effects)
     builder = DiagramBuilder()
     controller = GravityPidController(IdentifiedModel.from_arm(arm))
@@ -58,20 +76,25 @@ def main() -> None:
     parser.add_argument("--json", default="")
     args = parser.parse_args()
     arm = load_arm(args.arm)
-    rows: dict[str, list[str] | None] = {
+    effects, stretching = arm.effects, with_cables(arm)
+    cables = f"{len(stretching.stretch)} cables stretch"
+    rows: dict[str, ArmEffects | None] = {
         "ideal": None,
-        "none": [],
-        **{name: [name] for name in EFFECT_NAMES if getattr(arm.effects, name)},
+        "none": ArmEffects(),
+        **{name: effects.only([name]) for name in EFFECT_NAMES if getattr(effects, name)},
+        cables: stretching.only(["stretch"]),
+        "all": effects,
+        f"all, {cables}": stretching,
     }
-    rows["all"] = ["all"]
     best = dict.fromkeys(rows, np.inf)
     for _ in range(args.repetitions):
-        for row, parts in rows.items():
-            simulator = start(arm, parts, args.closure)
+        for row, of_row in rows.items():
+            simulator = start(arm, of_row, args.closure)
             began = time.process_time()
             simulator.AdvanceTo(0.1 + SECONDS)
             best[row] = min(best[row], time.process_time() - began)
-    print(f"{arm.name}, {args.closure}: {'effects':<12} us/step   ratio   real time")
+    allocator = os.environ.get("LD_PRELOAD") or os.environ.get("GLIBC_TUNABLES") or "the system's"
+    print(f"{arm.name}, {args.closure}; allocator: {allocator}\n{'effects':>24}    us/step   ratio   real time")
     for row, seconds in best.items():
         print(f"{row:>24} {1e3 * seconds / SECONDS:10.1f} {seconds / best['ideal']:7.2f} {SECONDS / seconds:9.1f} x")
     if args.json:
@@ -80,4 +103,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    restart_with_faster_allocator()
     main()

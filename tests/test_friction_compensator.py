@@ -135,6 +135,14 @@ def test_joints_that_creep_anyway_keep_all_their_friction():
     assert np.all(ratios[touches] == 0) and np.all(ratios[~touches] == 0.7)
 
 
+def test_what_springs_back_is_compensated_in_full_since_it_holds_nothing():
+    error = 0.999 * FRICTION.of_joints
+    wide = FRICTION.springs_back
+    assert np.any(wide) and not np.any(wide & FRICTION.holds)
+    without, ratios = safe_ratios(FRICTION, 0.7, error), safe_ratios(FRICTION, 0.7, error, hysteresis_ratio=0.8)
+    assert np.all(ratios[wide] == 0.8) and np.all(ratios[~wide] == without[~wide])
+
+
 def test_without_friction_to_spare_nothing_is_compensated():
     assert np.all(safe_ratios(FRICTION, 0.9, FRICTION.of_joints) == 0)
     assert np.all(safe_ratios(FRICTION, 0.9, 0.999 * FRICTION.of_joints) < 0.5)
@@ -177,6 +185,7 @@ def test_it_restarts_relaxed():
     [
         ({"ratio": 0.95}, "ratio must be between 0 and 0.9"),
         ({"ratio": np.nan}, "ratio must be"),
+        ({"hysteresis_ratio": 0.91}, "hysteresis ratio must be between 0 and 0.9"),
         ({"widening": 0.9}, "widening must be 1..10"),
         ({"holding_error": [0.1]}, "must be 7 numbers from 0"),
     ],

@@ -93,6 +93,15 @@ def test_law_is_equation_11():
         np.testing.assert_allclose(bench.step(q, v), expected, rtol=1e-12, atol=1e-12)
 
 
+def test_damped_mode_brakes_and_pulls_nowhere():
+    bench = Bench(gains=GAINS, effort_limits=UNLIMITED, mode="damped")
+    bench.initialize(POSES[0])
+    v = np.linspace(-1, 1, N)
+    for q in POSES:  # however far from where it began
+        np.testing.assert_allclose(bench.step(q, v), MODEL.holding_torque(q) - np.multiply(GAINS.kd, v), atol=1e-12)
+    np.testing.assert_allclose(bench.step(q, np.full(N, np.nan)), MODEL.holding_torque(q), atol=1e-12)
+
+
 @pytest.mark.parametrize("j", range(N))
 def test_velocity_alone_is_damped_on_its_own_joint_and_no_other(j):
     # The paper's node fed positions into the damping of joints 5-7: large positions must leave it untouched.

@@ -102,12 +102,24 @@ def test_force_at_rest_in_the_wanted_pose_is_none():
     np.testing.assert_allclose(tau, 0, atol=1e-9)
 
 
-def test_force_and_torque_are_limited_and_keep_their_direction():
-    far = moved(ArmFrame(ARM, "dh_7").pose(Q), [0, 0, 1.5], [3.0, 4.0, 0.0])
-    limited, free = evaluate(Hand(ARM), Q, np.zeros(7), far)[1], evaluate(Hand(ARM, grip=WEAK), Q, np.zeros(7), far)[1]
+def test_force_and_torque_are_limited_and_keep_their_direction_as_the_step_vanishes():
+    way = np.array([0, 0, 1.5, 3.0, 4.0, 0.0])
+    far = moved(ArmFrame(ARM, "dh_7").pose(Q), way[:3], way[3:])
+    limited = evaluate(Hand(ARM, time_step=1e-9), Q, np.zeros(7), far)[1]
     for part, limit in ((slice(0, 3), 0.6), (slice(3, 6), 20.0)):
-        assert np.linalg.norm(free[part]) > limit
-        np.testing.assert_allclose(limited[part], limit * free[part] / np.linalg.norm(free[part]))
+        np.testing.assert_allclose(limited[part], limit * way[part] / np.linalg.norm(way[part]), rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("time_step", [1e-3, 1e-2])
+def test_force_and_torque_stay_in_their_limits(time_step):
+    generator = np.random.default_rng(0)
+    hand = Hand(ARM, time_step=time_step)
+    for _ in range(20):
+        q = ARM.sample_poses(1, generator)[0]
+        far = moved(ArmFrame(ARM, "dh_7").pose(q), generator.normal(size=3), generator.normal(size=3))
+        F = evaluate(hand, q, generator.normal(size=7), far)[1]
+        assert np.linalg.norm(F[:3]) <= 0.6 * (1 + 1e-12)
+        assert np.linalg.norm(F[3:]) <= 20.0 * (1 + 1e-12)
 
 
 def test_hand_lets_go_without_a_wanted_pose_and_on_nonsense():

@@ -1,6 +1,7 @@
 """The paper redone: published numbers against the paper's data, ours against known truths, refusals."""
 
 import csv
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -15,7 +16,7 @@ from dvrk_drake.analysis.reproduction.laboratory import Extent, Identified, Labo
 from dvrk_drake.analysis.reproduction.paper_parameters import paper_model, paper_torque, with_zeroed
 from dvrk_drake.analysis.reproduction.psm import mechanism_errors
 from dvrk_drake.analysis.reproduction.recordings import PaperRecordings
-from dvrk_drake.analysis.reproduction.releases import SAMPLE_PERIOD, Drifts, Release, release, release_all
+from dvrk_drake.analysis.reproduction.releases import BAND, SAMPLE_PERIOD, Drifts, Release, release, release_all
 from dvrk_drake.analysis.reproduction.report import ResultTable, Section, share, write_page
 from dvrk_drake.analysis.reproduction.run import NAMES, reproduce
 from dvrk_drake.analysis.reproduction.step_response import (
@@ -25,7 +26,7 @@ from dvrk_drake.analysis.reproduction.step_response import (
     slowest_swing,
     swings,
 )
-from dvrk_drake.analysis.reproduction.true_arms import unlike_its_drawing
+from dvrk_drake.analysis.reproduction.true_arms import KnownTruth, unlike_its_drawing
 from dvrk_drake.cli import main
 from dvrk_drake.cli import reproduce as verb
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -242,6 +243,21 @@ def test_psm_keeps_its_remote_centre_and_its_wrist_axes_apart():
     assert angle == pytest.approx(np.pi / 2, abs=1e-9)
 
 
+def test_a_led_arm_stays_if_its_wide_hysteresis_is_compensated(tmp_path):
+    arm = load_arm("mtml")
+    truth, exact = KnownTruth(arm, IdentifiedModel.from_arm(arm), False, ""), tmp_path / "exact.yaml"
+    truth.model.save(exact)
+    start = ARM.sample_poses(1, np.random.default_rng(10), margin=0.2)[0]
+    case = Release("mtml", arm, ("friction",), str(exact), start, led=True, duration=1.5, seed=10)
+    with ThreadPoolExecutor(1) as executor:
+        gone, kept = (
+            Drifts(arm, positions[None]).largest[0]
+            for positions in release_all([case, dataclasses.replace(case, hysteresis_ratio=0.9)], executor)
+        )
+    assert np.all(gone[1:3] > 0.04) and np.all(kept < BAND[0])
+
+
+@pytest.mark.slow
 def exact_laboratory(folder, executor, extent):
     """One whose MTM was identified without any error."""
     truth, file = unlike_its_drawing("mtml", folder, seed=8), folder / "exact.yaml"

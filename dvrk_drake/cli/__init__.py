@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import NoReturn
 
+from dvrk_drake.allocation import restart_with_faster_allocator
 from dvrk_drake.cli import (
     check,
     collect,
@@ -36,10 +37,15 @@ from dvrk_drake.errors import DvrkDrakeError
 # before numpy is imported, which the verbs do.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+_OF_RECORDINGS = (check, identify, recalibrate, payload, export)
+_SIMULATED = (simulate, study, tune, transparency, reproduce, demo)
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one verb; returns the exit code: 0, or 2 for bad input."""
     options = _parser().parse_args(arguments)
+    if arguments is None and options.run.__module__ in [module.__name__ for module in _SIMULATED]:
+        restart_with_faster_allocator()
     try:
         import_interruptibly()
         with folders_only_for_results():
@@ -70,8 +76,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("dvrk-drake"))
     verbs = parser.add_subparsers(required=True, metavar="VERB")
-    of_recordings = (check, identify, recalibrate, payload, export)
-    simulated = (simulate, study, tune, transparency, reproduce, demo)
-    for module in (model, *of_recordings, *simulated, lcm, record, collect):
+    for module in (model, *_OF_RECORDINGS, *_SIMULATED, lcm, record, collect):
         module.add_verbs(verbs)
     return parser

@@ -62,8 +62,10 @@ def _arm(options: argparse.Namespace) -> None:
 def _add_run(verbs: argparse._SubParsersAction) -> None:
     verb = verbs.add_parser("run", help="compensate or hold an arm over LCM")
     add_control(verb)
-    verb.add_argument("--mode", choices=("gravity", "hold"), default="gravity", help="default: gravity")
-    verb.add_argument("--gains", metavar="GAINS.yaml", help="from tune, for mode hold; default: the arm's own")
+    verb.add_argument("--mode", choices=("gravity", "damped", "hold"), default="gravity", help="default: gravity")
+    verb.add_argument(
+        "--gains", metavar="GAINS.yaml", help="from tune, for modes hold and damped; default: the arm's own"
+    )
     verb.add_argument(
         "--reset", action="store_true", help="say which fault the arm has, if any, and clear it before it is controlled"
     )
@@ -73,6 +75,13 @@ def _add_run(verbs: argparse._SubParsersAction) -> None:
         default=0.0,
         metavar="R",
         help="in mode gravity, the share of the friction to take off the hand, 0..0.9; less where the arm could creep",
+    )
+    verb.add_argument(
+        "--hysteresis-ratio",
+        type=float,
+        default=0.0,
+        metavar="R",
+        help="in mode gravity, the share of wide hysteresis to compensate, 0..0.9: the arm stays where it was led",
     )
     verb.add_argument(
         "--friction", metavar="MODEL.yaml", help="from identify of a motion: whose friction; default: that of --model"
@@ -124,19 +133,19 @@ def _gains(options: argparse.Namespace) -> Gains | None:
     from dvrk_drake.errors import ControllerError
     from dvrk_drake.models.gains_file import load_gains
 
-    if options.mode != "hold":
-        raise ControllerError("--gains is for --mode hold: in mode gravity the arm is not regulated")
+    if options.mode == "gravity":
+        raise ControllerError("--gains is for --mode hold or damped: in mode gravity the arm is not regulated")
     return load_gains(options.gains)
 
 
 def _friction_compensator(options: argparse.Namespace) -> FrictionCompensator | None:
-    """What --friction-ratio asks for, with a warning that names the joints where it cannot be had in full.
+    """What --friction-ratio and --hysteresis-ratio ask for, with a warning where it cannot be had in full.
 
     Raises:
         ControllerError: it asks for what is not safe.
         ModelError: the model has no friction.
     """
-    if options.friction_ratio == 0:
+    if options.friction_ratio == options.hysteresis_ratio == 0:
         return None
     from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -145,15 +154,25 @@ def _friction_compensator(options: argparse.Namespace) -> FrictionCompensator | 
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
 
     if options.mode != "gravity":
-        raise ControllerError("--friction-ratio is for --mode gravity: an arm that is held shall not be easy to move")
+        raise ControllerError(
+            "--friction-ratio and --hysteresis-ratio are for --mode gravity: an arm that is held or braked shall not "
+            "be easy to move"
+        )
     if options.model is None:
         raise ControllerError(
-            "--friction-ratio needs --model: without friction an arm creeps if its weight is not known well"
+            "--friction-ratio and --hysteresis-ratio need --model: without friction an arm creeps if its weight is "
+            "not known well"
         )
     arm, model = load_arm(options.arm), IdentifiedModel.load(options.model)
     friction = Friction.of_model(arm, IdentifiedModel.load(options.friction or options.model))
-    compensator = FrictionCompensator(friction, ratio=options.friction_ratio, holding_error=holding_error(model))
-    less = {e.coordinate: r for e, r in zip(friction.effects, compensator.ratios, strict=True)}
+    compensator = FrictionCompensator(
+        friction,
+        ratio=options.friction_ratio,
+        hysteresis_ratio=options.hysteresis_ratio,
+        holding_error=holding_error(model),
+    )
+    of_effects = zip(friction.effects, compensator.ratios, friction.springs_back, strict=True)
+    less = {e.coordinate: r for e, r, springs_back in of_effects if not springs_back}
     if said := ", ".join(f"{name} {r:.2f}" for name, r in less.items() if r < 0.99 * options.friction_ratio):
         _warn(f"friction is compensated less where what remains must hold the arm against the model's error: {said}")
     return compensator

@@ -19,6 +19,8 @@ from dvrk_drake.models.arm import Arm
 #: Travel within which friction must hold the arm [rad, m]: an element that is stretched further before it slips lets
 #: the arm move that far. The smoothed sign of an identification stands for friction that holds at once.
 HOLDING_TRAVEL = 0.015
+#: How many times as wrong as on average over its own recording a model is anywhere: rarely more on simulated arms.
+WRONG_AT_MOST = 2.0
 
 
 @dataclass(frozen=True)
@@ -103,12 +105,19 @@ class Friction:
         )
 
     @property
+    def springs_back(self) -> NDArray[np.bool_]:
+        """(k,) whether it is hysteresis so wide that a released arm goes back by more than `HOLDING_TRAVEL`."""
+        return np.array([e.kind == "presliding" and e.scale > HOLDING_TRAVEL for e in self.effects], bool)
+
+    @property
     def of_joints(self) -> NDArray[np.float64]:
         """(n,) friction that holds each joint at rest if it alone moves [N m, N]."""
         return np.abs(self.rows[self.holds]).T @ self.coefficients[self.holds]
 
 
-def safe_ratios(friction: Friction, ratio: float, holding_error: ArrayLike) -> NDArray[np.float64]:
+def safe_ratios(
+    friction: Friction, ratio: float, holding_error: ArrayLike, hysteresis_ratio: float = 0.0
+) -> NDArray[np.float64]:
     """The share of each effect that may be compensated: at most `ratio`, and never so much that the arm creeps.
 
     What remains of the friction that holds the arm at rest must hold whatever the gravity compensation may be wrong by:
@@ -121,17 +130,20 @@ def safe_ratios(friction: Friction, ratio: float, holding_error: ArrayLike) -> N
         friction: of the arm.
         ratio: wanted, 0..1.
         holding_error: (n,) by which the gravity compensation may be wrong [N m, N].
+        hysteresis_ratio: at least this of what `springs_back`, 0..1. That holds no arm where it was let go, so nothing
+            has to remain of it.
 
     Returns:
-        (k,) one ratio for each effect; effects of one coordinate have the same.
+        (k,) one ratio for each effect; effects of one coordinate have the same, or `hysteresis_ratio`.
 
     Raises:
         ControllerError: a ratio outside 0..1, or an error that is none.
     """
     error = np.asarray(holding_error, float)
     arm = friction.arm
-    if not 0 <= ratio <= 1:
-        raise ControllerError(f"friction ratio must be between 0 and 1; got {ratio:g}")
+    for name, share in (("friction ratio", ratio), ("hysteresis ratio", hysteresis_ratio)):
+        if not 0 <= share <= 1:
+            raise ControllerError(f"{name} must be between 0 and 1; got {share:g}")
     if error.shape != (arm.num_joints,) or not np.all((error >= 0) & np.isfinite(error)):
         raise ControllerError(f"holding_error must be {arm.num_joints} numbers from 0; got {error.tolist()}")
     names = list(dict.fromkeys(effect.coordinate for effect in friction.effects))
@@ -144,7 +156,7 @@ def safe_ratios(friction: Friction, ratio: float, holding_error: ArrayLike) -> N
         joints = block_of == block
         along = np.any(rows[:, joints] != 0, axis=1)
         ratios[along] = _largest(rows[np.ix_(along, joints)], holding[along], error[joints], ratio)
-    return ratios[index]
+    return np.where(friction.springs_back, np.maximum(ratios[index], hysteresis_ratio), ratios[index])
 
 
 def _largest(
@@ -168,9 +180,8 @@ def _largest(
 
 
 def holding_error(model: IdentifiedModel) -> NDArray[np.float64]:
-    """(n,) by which the model's gravity torque may be wrong [N m, N]: how well it predicts poses that it was not told.
+    """(n,) by which the model's gravity torque may be wrong [N m, N]: `WRONG_AT_MOST` times that at left-out poses.
 
-    Measured efforts of poses have friction in them, so this is rather too much. Zero for a model that was not
-    identified from poses.
+    Zero for a model that was not identified from poses.
     """
-    return np.array([joint.rms_leave_one_out_undoubted for joint in model.joints])
+    return WRONG_AT_MOST * np.array([joint.rms_leave_one_out_undoubted for joint in model.joints])

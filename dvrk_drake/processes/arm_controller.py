@@ -44,10 +44,10 @@ class ArmController:
         Args:
             arm: named in the messages.
             model: of that arm, mounted as it is.
-            mode: "gravity" or "hold".
+            mode: of the controller.
             period: in which statuses come [s].
             friction: takes friction off the hand in mode "gravity"; becomes part of this controller.
-            gains: to hold with; the arm's own by default.
+            gains: to hold or to brake with; the arm's own by default.
         """
         builder = DiagramBuilder()
         self.arm, self._mode = arm, mode
@@ -116,6 +116,6 @@ class ArmController:
         """Whether efforts act from now on: then the ramp begins, and the pose to hold is latched anew."""
         self._acting = acting
         self._ramp.GetInputPort("enabled").FixValue(self._ramp_context, np.array([float(acting)]))
-        # From "gravity" to "hold" the pose is latched anew and the integrator is empty.
+        # At the change to "hold" the pose is latched anew and the integrator is empty.
         controller_context = self._controller.GetMyMutableContextFromRoot(self._context)
         self._controller.SetMode(controller_context, self._mode if acting else "gravity")

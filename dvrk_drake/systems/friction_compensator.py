@@ -52,6 +52,7 @@ class FrictionCompensator(LeafSystem):
         friction: Friction,
         *,
         ratio: float = 0.5,
+        hysteresis_ratio: float = 0.0,
         holding_error: ArrayLike | None = None,
         widening: float = 1.5,
         period: float = 1e-3,
@@ -62,6 +63,8 @@ class FrictionCompensator(LeafSystem):
             friction: as identified.
             ratio: share of it that is compensated, 0..0.9; above, an error of a tenth in the friction would be enough
                 to move the arm.
+            hysteresis_ratio: at least this share, 0..0.9, of the wide hysteresis that moves an arm back where it was
+                led from when it is let go, see `safe_ratios`.
             holding_error: (n,) by which the gravity compensation may be wrong [N m, N]; lowers the ratio where needed.
             widening: the compensation's scales over the identified ones, from 1.
             period: of the update [s].
@@ -70,13 +73,14 @@ class FrictionCompensator(LeafSystem):
             ControllerError: a number that is none of these.
         """
         super().__init__()
-        if not 0 <= ratio <= 0.9:
-            raise ControllerError(f"friction ratio must be between 0 and 0.9; got {ratio:g}")
+        for name, share in (("friction ratio", ratio), ("hysteresis ratio", hysteresis_ratio)):
+            if not 0 <= share <= 0.9:
+                raise ControllerError(f"{name} must be between 0 and 0.9; got {share:g}")
         if not (1 <= widening <= 10 and 0 < period < 1):
             raise ControllerError(f"widening must be 1..10 and period 0..1 s; got {widening:g}, {period:g}")
         n = friction.arm.num_joints
         error = np.zeros(n) if holding_error is None else holding_error
-        self._ratios = safe_ratios(friction, ratio, error)
+        self._ratios = safe_ratios(friction, ratio, error, hysteresis_ratio)
         self._limits = friction.arm.effort_limits
         kinds = [EFFECT_KINDS[effect.kind] for effect in friction.effects]
         self._constants = (

@@ -14,8 +14,8 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.systems.gravity_pid_step import compile_step, entry_point
 
-#: "hold" regulates a pose, "gravity" only carries the arm's weight and leaves it free to move.
-Mode = Literal["hold", "gravity"]
+#: "hold" regulates a pose, "gravity" only carries the arm's weight and leaves it free to move, "damped" also brakes it.
+Mode = Literal["hold", "gravity", "damped"]
 
 _MODES: tuple[Mode, ...] = get_args(Mode)
 
@@ -25,7 +25,8 @@ class GravityPidController(LeafSystem):
 
     The law is tau = G(q) + Kp e + Kd de + integral(Ki e dt), the paper's equation 11, with e = q_d - q and
     de = v_d - v for every joint: no position ever enters the damping term. G(q) is the model's static torque
-    (gravity and joint effects, scaled by each joint's trust). Gains are diagonal.
+    (gravity and joint effects, scaled by each joint's trust). Gains are diagonal. In "gravity" mode tau = G(q), in
+    "damped" mode tau = G(q) - Kd v: whatever G is wrong by, the arm creeps and does not run away.
 
     .. pydrake_system::
 
@@ -41,9 +42,8 @@ class GravityPidController(LeafSystem):
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
     - `state_estimated` (2n): q, then v. Not connected: ControllerError at initialization.
-    - `desired_state` (2n): q_d, then v_d. Not read in "gravity" mode. Unconnected, "hold" mode holds the
-      latched pose: the one at initialization, or at the last change from "gravity" to "hold", or when a fault
-      ended; so it never jumps.
+    - `desired_state` (2n): q_d, then v_d. Read in "hold" mode only. Unconnected, that mode holds the latched
+      pose: the one at initialization, or at the last change to "hold", or when a fault ended; so it never jumps.
     - `effort` (n): the command, inside the effort limits.
     - `gravity_effort` (n): G(q) alone, before the limits.
     - `fault` (1): 1 while `state_estimated` (or a `desired_state` that is read) is not finite or beyond 1e6, else 0.
@@ -85,7 +85,7 @@ class GravityPidController(LeafSystem):
             model: what G(q) is; its parameters are copied.
             period: of the update [s].
             gains: n numbers each; the arm's own by default.
-            mode: "hold" or "gravity", at first; see `SetMode`.
+            mode: "hold", "gravity" or "damped", at first; see `SetMode`.
             effort_limits: (n,) largest magnitude of each joint's effort; the arm's own by default.
 
         Raises:
@@ -150,7 +150,7 @@ class GravityPidController(LeafSystem):
         """Changes the mode from the next update on.
 
         Raises:
-            ControllerError: neither "hold" nor "gravity".
+            ControllerError: none of `Mode`.
         """
         mode_index = 3 * len(self._joint_names)
         context.get_mutable_discrete_state(_MEMORY).get_mutable_value()[mode_index] = self._mode_number(mode)

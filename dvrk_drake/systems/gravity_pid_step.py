@@ -30,7 +30,7 @@ def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
             constants[2 * n + 1 :],
         )
         kp, kd, ki = memory[:n], memory[n : 2 * n], memory[2 * n : 3 * n]
-        hold = memory[3 * n] == 0.0
+        hold, damped = memory[3 * n] == 0.0, memory[3 * n] == 2.0
         rest = memory[3 * n + 1 :]
         integral, latched_q, last_q, gravity = (
             rest[:n],
@@ -65,7 +65,8 @@ def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
             memory[LATCHED] = 0.0
             for i in range(n):
                 integral[i] = 0.0
-                effort[i] = min(max(gravity[i], -limit[i]), limit[i])
+                braking = kd[i] * state[n + i] if damped and not fault else 0.0
+                effort[i] = min(max(gravity[i] - braking, -limit[i]), limit[i])
             return
 
         if memory[LATCHED] == 0.0:

@@ -61,7 +61,9 @@ class Hand(LeafSystem):
     Spring and damper are taken at the end of the coming step, to first order (linearly implicit Euler):
     (1 + h (D + h K) J M^-1 J') F = K (e - h V) - D V, with h the station's time step, e the way to the desired pose
     (rotation vector, then translation), V the frame's velocity and M the arm's mass matrix. So a stiff hand does not
-    shake a light wrist, whatever its gains: as h goes to zero it is F = K e - D V. Force and torque are then limited.
+    shake a light wrist, whatever its gains: as h goes to zero it is F = K e - D V. Where torque or force is beyond its
+    limit, both are limited, and then each is solved again with the other as it is: a wrist that slips in the hand turns
+    further in the step, which the force must know. So the hand gives no more energy than was put into it.
 
     With a state or pose that is not finite the hand lets go.
     """
@@ -119,11 +121,22 @@ class Hand(LeafSystem):
         V, h = J @ v, self._time_step
         mobility = J @ np.linalg.solve(self._frame.mass_matrix(q), J.T)
         A = np.eye(6) + (h * (self._D + h * self._K))[:, None] * mobility
-        F = np.linalg.solve(A, self._K * (e - h * V) - self._D * V)
-        return np.concatenate([_limited(F[:3], self._grip.max_torque), _limited(F[3:], self._grip.max_force)]), J
+        return self._solve(A, self._K * (e - h * V) - self._D * V), J
+
+    def _solve(self, A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+        """F (6,) of A F = b, within the limits."""
+        F = np.asarray(np.linalg.solve(A, b), float)
+        torque, force = slice(0, 3), slice(3, 6)
+        parts = (torque, force, self._grip.max_torque), (force, torque, self._grip.max_force)
+        if any(np.linalg.norm(F[part]) > limit for part, _, limit in parts):
+            for part, _, limit in parts:
+                F[part] = _limited(F[part], limit)
+            for part, other, limit in parts:
+                F[part] = _limited(np.linalg.solve(A[part, part], b[part] - A[part, other] @ F[other]), limit)
+        return F
 
 
-def _limited(vector: NDArray[np.float64], limit: float) -> NDArray[np.float64]:
+def _limited(vector: NDArray[np.floating], limit: float) -> NDArray[np.floating]:
     """`vector`, shortened to a length of `limit` if it is longer."""
     length = float(np.linalg.norm(vector))
     return vector if length <= limit else vector * (limit / length)

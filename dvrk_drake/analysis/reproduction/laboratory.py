@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -111,15 +112,16 @@ class Laboratory:
         parts: Sequence[str] = ("all",),
         damped: bool = False,
         led: bool = False,
+        hysteresis_ratio: float = 0.0,
         longest: float = DURATION,
     ) -> Drifts:
         """Of the arm `name`, at `poses` (m, n), under the model in a file, for at most `longest` [s]; `parts`,
-        `damped` and `led`: see `Release`."""
+        `damped`, `led` and `hysteresis_ratio`: see `Release`."""
         duration = min(self.extent.duration, longest)
-        cases = [
-            Release(name, truth.arm, tuple(parts), str(model), pose, damped, led, duration, self.seed + i)
-            for i, pose in enumerate(poses)
-        ]
+        every = Release(
+            name, truth.arm, tuple(parts), str(model), poses[0], damped, led, hysteresis_ratio, duration, self.seed
+        )
+        cases = [dataclasses.replace(every, start=pose, seed=self.seed + i) for i, pose in enumerate(poses)]
         positions = release_all(cases, self.executor, lambda share: self.progress(what, share))
         return Drifts(truth.arm, positions)
 

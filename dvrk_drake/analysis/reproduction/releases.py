@@ -14,12 +14,13 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
+from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.nearby_pose import beside
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
+from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
 
 #: Between two samples [s].
@@ -42,7 +43,8 @@ class Release:
         model: file of the controller's model.
         start: (n,) pose at which it rests when it is let go [rad, m], its friction unloaded.
         led: the arm first comes there from `APPROACH` beside it, held until it rests, so that its friction is loaded.
-        damped: whether the controller brakes with the damping gains of the arm beside carrying its weight.
+        damped: whether the controller brakes beside carrying the weight, in mode "damped".
+        hysteresis_ratio: share that the controller compensates of the hysteresis that moves a led arm back.
         duration: [s].
         seed: of the effects' noise.
     """
@@ -54,6 +56,7 @@ class Release:
     start: NDArray[np.float64]
     damped: bool = False
     led: bool = False
+    hysteresis_ratio: float = 0.0
     duration: float = DURATION
     seed: int = 0
 
@@ -66,8 +69,11 @@ def release(case: Release) -> NDArray[np.float64]:
     station = ArmStation(arm, plant_arm=case.true_arm, effects=effects, seed=case.seed)
     builder = DiagramBuilder()
     way = _way(case, arm)
-    controller = GravityPidController(_model(case.model), gains=_gains(case, arm), mode=_mode(case))
-    add_closed_loop(builder, station, controller, TrajectorySource(way, output_derivative_order=1))
+    controller = GravityPidController(_model(case.model), mode="hold" if case.led else _mode(case))
+    friction = None
+    if case.hysteresis_ratio:
+        friction = FrictionCompensator(Friction.of_arm(arm), ratio=0.0, hysteresis_ratio=case.hysteresis_ratio)
+    add_closed_loop(builder, station, controller, TrajectorySource(way, output_derivative_order=1), friction)
     log = LogVectorOutput(station.GetOutputPort(f"{name}.state_true"), builder, SAMPLE_PERIOD)
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
@@ -76,19 +82,15 @@ def release(case: Release) -> NDArray[np.float64]:
     if case.led:
         before = LEADING + RESTING
         simulator.AdvanceTo(before)
-        controller.SetMode(controller.GetMyMutableContextFromRoot(context), "gravity")
+        controller.SetMode(controller.GetMyMutableContextFromRoot(context), _mode(case))
     simulator.AdvanceTo(before + case.duration)
     positions: NDArray[np.float64] = log.FindLog(context).data()[: arm.num_joints].T
     return positions[round(before / SAMPLE_PERIOD) :].copy()
 
 
 def _mode(case: Release) -> Mode:
-    return "hold" if case.damped or case.led else "gravity"
-
-
-def _gains(case: Release, arm: Arm) -> Gains:
-    none = [0.0] * arm.num_joints
-    return Gains(none, arm.gains.kd, none) if case.damped else arm.gains
+    """From the release on."""
+    return "damped" if case.damped else "gravity"
 
 
 def _way(case: Release, arm: Arm) -> PiecewisePolynomial:

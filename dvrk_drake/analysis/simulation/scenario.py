@@ -29,14 +29,15 @@ LONGEST, LEAST_SAMPLE_PERIOD = 3600.0, 1e-3
 
 @dataclass
 class ControllerScenario:
-    """`mode` is "hold" or "gravity"; `model` the file of an identified model, or empty for what the SDF states.
+    """`mode` is "hold", "gravity" or "damped"; `model` the file of an identified model, or empty for
+    what the SDF states.
 
     `gains` replaces the arm's own (kp, kd, ki: one number a joint; in a file also the name of a file of gains).
-    `friction_ratio` is the share of the friction that the arm's files state which is compensated, 0..0.9; in mode
-    "gravity" only. `parameter_error` makes the model wrong:
-    each of its base parameters is multiplied by a factor of its own from 1 - `parameter_error`..1 + `parameter_error`,
-    drawn by the scenario's seed. `knows` names those of "cables" and "springs" of the arm's own effects that the model
-    has beside the SDF; not for a model from a file.
+    `friction_ratio` is the share of the friction that the arm's files state which is compensated, 0..0.9, and
+    `hysteresis_ratio` that of the part that springs back; in mode "gravity" only. `parameter_error` makes the model
+    wrong: each of its base parameters is multiplied by a factor of its own from 1 - `parameter_error`..1 +
+    `parameter_error`, drawn by the scenario's seed. `knows` names those of "cables" and "springs" of the arm's own
+    effects that the model has beside the SDF; not for a model from a file.
     """
 
     mode: str = "hold"
@@ -44,6 +45,7 @@ class ControllerScenario:
     knows: list[str] = field(default_factory=list)
     gains: Gains | None = None
     friction_ratio: float = 0.0
+    hysteresis_ratio: float = 0.0
     parameter_error: float = 0.0
 
 
@@ -186,9 +188,11 @@ class Scenario:
             _check_choice("controller.knows", part, ("cables", "springs"))
         if self.controller.knows and self.controller.model:
             raise ScenarioError("controller.knows is of a model from the arm's files; controller.model names another")
-        _check_number("controller.friction_ratio", self.controller.friction_ratio, 0.0, 0.9)
-        if self.controller.friction_ratio and self.controller.mode != "gravity":
-            raise ScenarioError(f'controller.friction_ratio needs mode "gravity"; it is "{self.controller.mode}"')
+        for name in ("friction_ratio", "hysteresis_ratio"):
+            ratio = getattr(self.controller, name)
+            _check_number(f"controller.{name}", ratio, 0.0, 0.9)
+            if ratio and self.controller.mode != "gravity":
+                raise ScenarioError(f'controller.{name} needs mode "gravity"; it is "{self.controller.mode}"')
         if self.targets and self.controller.mode != "hold":
             raise ScenarioError(f'targets need controller.mode "hold"; it is "{self.controller.mode}"')
         for i, effect in enumerate(self.effects):

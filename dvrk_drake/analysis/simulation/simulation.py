@@ -15,7 +15,7 @@ from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.analysis.simulation.scenario import Scenario
-from dvrk_drake.dynamics.friction_compensation import Friction
+from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
 from dvrk_drake.models.plant import Closure
 from dvrk_drake.models.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
@@ -36,7 +36,7 @@ class Simulation:
         state_true: (m, 2n) q, then v as they are.
         hand: (m, 6) torque [N m], then force [N] of the hand on the arm at the frame that it holds, in the base; zeros
             without one.
-        desired: (m, n) where the arm was wanted; None in "gravity" mode.
+        desired: (m, n) where the arm was wanted; None but in "hold" mode.
     """
 
     recording: Recording
@@ -130,10 +130,16 @@ def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration
 
 
 def _friction(scenario: Scenario) -> FrictionCompensator | None:
-    ratio = scenario.controller.friction_ratio
-    if not ratio:
+    wanted = scenario.controller
+    if not (wanted.friction_ratio or wanted.hysteresis_ratio):
         return None
-    return FrictionCompensator(Friction.of_arm(scenario.mounted_arm), ratio=ratio, period=scenario.time_step)
+    return FrictionCompensator(
+        Friction.of_arm(scenario.mounted_arm),
+        ratio=wanted.friction_ratio,
+        hysteresis_ratio=wanted.hysteresis_ratio,
+        holding_error=holding_error(scenario.model),
+        period=scenario.time_step,
+    )
 
 
 def _add_hand(builder: DiagramBuilder, station: ArmStation, scenario: Scenario) -> Hand | None:

@@ -15,6 +15,7 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dvrk_drake.allocation import allocator_environment
 from dvrk_drake.analysis.study.study import Progress, run_study
 from dvrk_drake.analysis.study.study_file import Study, versions
 from dvrk_drake.analysis.study.table import Row
@@ -52,9 +53,10 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
     They are spawned, not forked: a script that uses this needs `if __name__ == "__main__":`. They also end when this
     process is killed.
     """
-    # Read by each worker when it starts: more threads of BLAS in it would only wait for those of the others.
+    # All this is read by a worker when it starts. More threads of BLAS in it would only wait for those of the others.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
+    os.environ.update(allocator_environment())
     others = set(multiprocessing.active_children())
     executor = _SpawningExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent)
     try:

@@ -191,8 +191,8 @@ class Kind(NamedTuple):
 
 
 #: The kinds of measures: of true positions at the recorded times, and of measured efforts, over the joints that count.
-#: The wanted pose is where the controller leads the arm; in mode "gravity" it is the pose at the release (the start, or
-#: when the hand lets go), and nothing before counts.
+#: The wanted pose is where the controller leads the arm; in other modes than "hold" it is the pose at the release (the
+#: start, or when the hand lets go), and nothing before counts.
 #:
 #: settling_time: from the last target's time until all joints stay within `band` of the end's wanted pose; infinite if
 #: they do not.
