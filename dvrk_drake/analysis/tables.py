@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -20,6 +24,8 @@ from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity, derive_gravity
 from dvrk_drake.models.arm import Arm, load_arm
 
 TABLE_WIDTH = 112
+#: A space in a heading, but none of a unit in brackets or at a bar.
+_BETWEEN_WORDS = re.compile(r"(?<!\|) (?![^\[]*\]|\|)")
 
 NEXT_STEPS = """
 Open {folder}/arm.html in a browser: the arm is held, released, and driven home.
@@ -34,10 +40,41 @@ With a real arm:
      hand on the stop button. Switch the controller's own gravity compensation off first, or it is compensated twice."""
 
 
+class TableConsole(Console):
+    """Prints a table as wide as the terminal, or as its numbers need.
+
+    In a narrow one headings are stacked and names folded; digits are never lost.
+    """
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """As rich's Console does."""
+        width = self.width
+        for table in (thing for thing in objects if isinstance(thing, Table)):
+            if self._least_width(table) > width:
+                for column in table.columns:
+                    column.header = _BETWEEN_WORDS.sub("\n", str(column.header))
+            self.width = max(self.width, self._least_width(table))
+        try:
+            super().print(*objects, **options)
+        finally:
+            self.width = width
+
+    def _least_width(self, table: Table) -> int:
+        """With the numbers on one line each. Rich's own measure breaks them between words."""
+        free = self.options.update(max_width=10 * TABLE_WIDTH)
+        least = 2 * (len(table.columns) - 1)
+        for column in table.columns:
+            sizes = [Measurement.get(self, free, cell) for cell in (column.header, *column.cells)]
+            least += max(size.maximum if column.no_wrap else size.minimum for size in sizes)
+        return least
+
+
 def make_console() -> Console:
-    """A console on stdout at least as wide as the tables: a narrow terminal wraps them rather than losing digits."""
-    console = Console(highlight=False)
-    return console if console.width >= TABLE_WIDTH else Console(highlight=False, width=TABLE_WIDTH)
+    """A console on stdout, as wide as the terminal; where it is none, as wide as the tables."""
+    console = TableConsole(highlight=False)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = TABLE_WIDTH
+    return console
 
 
 def print_model(console: Console, model: IdentifiedModel) -> None:

@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from typing import NoReturn
 
 from dvrk_drake.allocation import restart_with_faster_allocator
 from dvrk_drake.cli import (
@@ -29,7 +30,7 @@ from dvrk_drake.cli import (
     transparency,
     tune,
 )
-from dvrk_drake.cli.support import import_interruptibly
+from dvrk_drake.cli.support import folders_only_for_results, import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
 
 # Matrices are small here: more threads of BLAS only wait for each other, for minutes where the cores are busy. Said
@@ -47,7 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         restart_with_faster_allocator()
     try:
         import_interruptibly()
-        options.run(options)
+        with folders_only_for_results():
+            options.run(options)
     except DvrkDrakeError as error:
         print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -61,8 +63,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, as everything else here does; usage is what --help is for."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message}; see {self.prog} --help\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="dvrk-drake", description="Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."
     )
     parser.add_argument("--version", action="version", version=version("dvrk-drake"))

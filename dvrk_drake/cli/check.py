@@ -12,7 +12,8 @@ from dvrk_drake.errors import RecordingError
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
     """Adds the verb and its options."""
     verb = verbs.add_parser(
-        "check", help="say what is wrong with a recording before anything is identified from it; exit code 2: unusable"
+        "check",
+        help="say what is wrong with a recording before anything is identified from it; exit code 2: unusable",
     )
     add_recording(verb)
     verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, psm, or a YAML file")
@@ -22,8 +23,8 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.check.identifiable import check_for_identification
     from dvrk_drake.analysis.check.plots import plot_report
-    from dvrk_drake.analysis.check.recording_check import check_recording
     from dvrk_drake.analysis.check.tables import print_report
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.models.arm import load_arm
@@ -35,7 +36,7 @@ def _check(options: argparse.Namespace) -> None:
         check_output(options.json, options.recording)
     plots = None if options.plots is None else made_folder(options.plots)
     recording = read_recording(options.recording, arm, options.coordinates)
-    report = check_recording(recording, arm)
+    report = check_for_identification(recording, arm)
     print_report(make_console(), report)
     if options.json is not None:
         with atomic_write(options.json) as stream:
@@ -43,5 +44,8 @@ def _check(options: argparse.Namespace) -> None:
             stream.write("\n")
     if plots is not None:
         plot_report(plots, report, recording, arm)
-    if count := len(report.refusals):
-        raise RecordingError(f"{options.recording}: refused for {count} reason{'s' * (count > 1)}: see above")
+    if report.refusals:
+        first, *others = report.refusals
+        reasons = f"refused for {len(others) + 1} reasons, the first: " if others else "refused: "
+        where = "" if first.where == report.source else f"{first.where}: "
+        raise RecordingError(f"{options.recording}: {reasons}{where}{first.what}; {first.advice}")

@@ -22,20 +22,22 @@ if TYPE_CHECKING:
 _UNEXPLAINED = 0.5
 
 
-def refuse_unusable(console: Console, recording: Recording, arm: Arm, warn: bool = False) -> None:
-    """Prints what `check` refuses in a recording, and its warnings if wanted.
+def refuse_unusable(
+    console: Console, recording: Recording, arm: Arm, warn: bool = False, apart_from: tuple[str, ...] = ()
+) -> None:
+    """Prints what `check` refuses in a recording, and its warnings if wanted, `apart_from` kinds of findings.
 
     Raises:
         RecordingError: it refuses anything.
     """
     from dvrk_drake.analysis.check.recording_check import check_recording
 
-    report = check_recording(recording, arm)
-    for finding in report.findings:
+    findings = [f for f in check_recording(recording, arm).findings if f.kind not in apart_from]
+    for finding in findings:
         if finding.severity == "refusal" or (warn and finding.severity == "warning"):
             console.print(str(finding), style="yellow", markup=False, soft_wrap=True)
-    if report.refusals:
-        first = report.refusals[0]
+    if refusals := [finding for finding in findings if finding.severity == "refusal"]:
+        first = refusals[0]
         raise RecordingError(f"{recording.source or 'recording'}: refused: {first.where}: {first.what}; {first.advice}")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 
 from dvrk_drake.cli.dynamics import identify_motion, refuse_unusable, validate_in_motion
 from dvrk_drake.cli.support import (
@@ -153,6 +154,8 @@ def _validate(options: argparse.Namespace) -> None:
 
 
 def _predict(options: argparse.Namespace) -> None:
+    import numpy as np
+
     from dvrk_drake.analysis.dynamic.validation import predict_motion
     from dvrk_drake.analysis.signals.poses import find_poses
     from dvrk_drake.analysis.static.validation import predict
@@ -165,8 +168,11 @@ def _predict(options: argparse.Namespace) -> None:
     arm = model.load_arm()
     recording = read_recording(options.recording, arm, options.coordinates)
     print_notes(options.recording, recording.notes)
-    if model.dynamics is not None and find_poses(recording, arm).moves:
-        refuse_unusable(make_console(), recording, arm, warn=True)
+    # Positions and velocities suffice, but what judges a motion wants efforts.
+    measured = recording if recording.tau is not None else replace(recording, tau=np.zeros_like(recording.q))
+    if model.dynamics is not None and find_poses(measured, arm).moves:
+        of_efforts = () if recording.tau is not None else ("no effort",)
+        refuse_unusable(make_console(), measured, arm, warn=True, apart_from=of_efforts)
         tau = predict_motion(model, recording)
         if recording.coordinates == "joint":
             tau = arm.transmission.pull_back_effort(tau)

@@ -12,7 +12,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,7 +33,9 @@ def import_interruptibly() -> None:
 
     Nothing is half-written at that time. Where signals are not ours (a thread, a test) they are left alone.
     """
-    if threading.current_thread() is not threading.main_thread() or "dvrk_drake.analysis.demo.demo" in sys.modules:
+    # Together these import what the others do.
+    modules = ("dvrk_drake.analysis.demo.demo", "dvrk_drake.analysis.tables")
+    if threading.current_thread() is not threading.main_thread() or sys.modules.keys() >= set(modules):
         return
 
     def leave(*_: object) -> None:
@@ -41,7 +44,8 @@ def import_interruptibly() -> None:
 
     before = signal.signal(signal.SIGINT, leave)
     try:
-        importlib.import_module("dvrk_drake.analysis.demo.demo")
+        for module in modules:
+            importlib.import_module(module)
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -70,13 +74,33 @@ def check_output(path: str, *inputs: str) -> None:
             raise DvrkDrakeError(f"{path}: is an input; name another file to write")
 
 
+#: Folders that were made, each before the one that it is in.
+_made: list[Path] = []
+
+
 def made_folder(path: str) -> Path:
     """The folder at `path`, made if it was not there."""
+    folder = Path(path).absolute()
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        Path(path).mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DvrkDrakeError(f"{path}: cannot be made a folder: {error.strerror}") from error
+    _made[:0] = missing
     return Path(path)
+
+
+@contextmanager
+def folders_only_for_results() -> Iterator[None]:
+    """Where the block is left by an error or by Ctrl-C, the folders that it made and that are empty are gone again."""
+    _made.clear()
+    try:
+        yield
+    except BaseException:
+        for folder in _made:
+            with suppress(OSError):  # what is not empty stays
+                folder.rmdir()
+        raise
 
 
 def until_stopped(meshcat: Meshcat, meanwhile: Callable[[], object] = lambda: None) -> None:

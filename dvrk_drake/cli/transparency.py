@@ -15,9 +15,12 @@ if TYPE_CHECKING:
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
     """Adds the verb and its options."""
     verb = verbs.add_parser("transparency", help="force and torque that a hand feels of a simulated arm it leads")
-    verb.add_argument("--arm", required=True, help="mtml, mtmr, or the path of an arm's YAML file")
+    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
     verb.add_argument("--path", metavar="RECORDING", help="the motion to follow; default: through random poses")
-    verb.add_argument("--speed", type=float, default=1.0, metavar="S", help="S times as fast as recorded; default: 1")
+    verb.add_argument(
+        "--coordinates", choices=("joint", "actuator"), default="joint", help="what its q are of; default: joint"
+    )
+    verb.add_argument("--speed", type=float, metavar="S", help="S times as fast as recorded; default: 1")
     verb.add_argument(
         "--model",
         action="append",
@@ -35,7 +38,11 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
         metavar="PART",
         help="parts of the real arm that the simulation has, as in a scenario; default: all",
     )
-    verb.add_argument("--frame", default="dh_7", help="the SDF's frame of the handle; default: dh_7")
+    verb.add_argument(
+        "--frame",
+        default="",
+        help="the SDF's frame of the handle; default: dh_7 of an MTM, dh_6 of a PSM",
+    )
     verb.add_argument("--output", metavar="DIR", help="write the table and a plot into this folder")
     verb.set_defaults(run=_transparency)
 
@@ -44,6 +51,7 @@ def _transparency(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.analysis.transparency.report import plot_transparency, print_transparency, write_transparency
     from dvrk_drake.analysis.transparency.transparency import feel, rambling_path, recorded_path
+    from dvrk_drake.errors import ScenarioError
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.recording import read_recording
 
@@ -52,7 +60,10 @@ def _transparency(options: argparse.Namespace) -> None:
     effects = arm.effects.only(options.real_arm)
     path = rambling_path(arm)
     if options.path is not None:
-        path = recorded_path(arm, read_recording(options.path, arm), options.speed)
+        recording = read_recording(options.path, arm, options.coordinates)
+        path = recorded_path(arm, recording, 1.0 if options.speed is None else options.speed)
+    elif options.speed is not None:
+        raise ScenarioError("--speed is that of a recorded motion; name one with --path")
     compensations = _compensations(options, arm)
     folder = None if options.output is None else made_folder(options.output)
     felt = []

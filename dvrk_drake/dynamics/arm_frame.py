@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
-from pydrake.multibody.tree import JacobianWrtVariable
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FrameIndex, JacobianWrtVariable
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
+
+
+def handle_frame(arm: Arm) -> str:
+    """Name of the frame that a hand takes an arm at: the last of its DH frames, dh_7 of an MTM, dh_6 of a PSM.
+
+    Raises:
+        ArmError: the SDF has no frame dh_0, dh_1, ...
+    """
+    numbered = [name for name in _frame_names(make_arm_plant(arm)) if re.fullmatch(r"dh_\d+", name)]
+    if not numbered:
+        raise ArmError(f"{arm.name}: its SDF has no frames dh_0, dh_1, ...; name the handle's frame")
+    return max(numbered, key=lambda name: int(name.removeprefix("dh_")))
 
 
 class ArmFrame:
@@ -27,7 +42,8 @@ class ArmFrame:
         self._arm = arm
         self._plant = make_arm_plant(arm)
         if not self._plant.HasFrameNamed(frame_name):
-            raise ArmError(f"{arm.name}: its SDF has no frame {frame_name}")
+            known = ", ".join(_frame_names(self._plant))
+            raise ArmError(f'{arm.name}: its SDF has no frame "{frame_name}"; it has {known}')
         self._frame = self._plant.GetFrameByName(frame_name)
         self._context = self._plant.CreateDefaultContext()
         # G maps rates of the independent joints to those of the plant's.
@@ -55,3 +71,9 @@ class ArmFrame:
 
     def _set(self, q: ArrayLike) -> None:
         set_arm_positions(self._plant, self._context, self._arm, q)
+
+
+def _frame_names(plant: MultibodyPlant) -> list[str]:
+    """Of the frames that the SDF names beside its links."""
+    frames = (plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames()))
+    return [frame.name() for frame in frames if frame.name().startswith("dh_")]

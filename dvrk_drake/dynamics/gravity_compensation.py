@@ -135,6 +135,7 @@ def compensation_from_model(
     arm = model.load_arm()
     if arm.joint_names != MTM_JOINTS:
         raise ModelError(f"{arm.name}: the controller's gravity-compensation file is one of an MTM; joints differ")
+    check_tolerance(options.tolerance)
     poses = arm.sample_poses(20000, np.random.default_rng(0))
     gravity, effects = _gravity_parameters(model, poses[:4000]), _effect_parameters(model, arm)
     _refuse_errors(model, gravity, effects, poses[:4000], options.tolerance)
@@ -265,6 +266,12 @@ def _refuse_errors(
         f"{off} N m. Of that: {', '.join(reason for reason, size in reasons.items() if size > least)}. "
         f"To accept it: --gc-tolerance {round_up(error.max()):g}"
     )
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Raises ModelError unless it is a number from 0: no error exceeds a NaN."""
+    if not 0 <= tolerance < np.inf:
+        raise ModelError(f"--gc-tolerance is {tolerance:g}; allowed: a number of N m from 0")
 
 
 def round_up(x: float) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
+from pydrake.common.yaml import yaml_dump_typed, yaml_load
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, effect_fault
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
@@ -19,6 +19,7 @@ from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 
 @dataclass
@@ -117,11 +118,10 @@ class IdentifiedModel:
         if not Path(path).is_file():
             raise ModelError(f"{path}: no such file")
         try:
-            model = yaml_load_typed(schema=cls, filename=str(path))
-        except Exception as error:
-            # yaml_load_typed raises many types, from YAML's to AssertionError.
+            model = load_typed_yaml(cls, path, ModelError, "a model file")
+        except ModelError:
             _check_format(path)
-            raise ModelError(f"{path}: not a model file: {error}") from error
+            raise
         try:
             model.check()
         except (ModelError, ArmError) as error:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.plant import MultibodyPlant
 
-from dvrk_drake.dynamics.gravity_compensation import round_up
+from dvrk_drake.dynamics.gravity_compensation import check_tolerance, round_up
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.dynamics.model_links import model_bodies
@@ -97,6 +97,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
     plant = make_arm_plant(arm)
     if arm.joint_names[:3] != ARM_JOINTS or not plant.HasBodyNamed("back_crank_link"):
         raise ModelError(f"{arm.name}: the controller's kinematic compensation file is one of a PSM; joints differ")
+    check_tolerance(tolerance)
     alpha, A, theta, D = _chain(plant)
     q = arm.sample_poses(600, np.random.default_rng(0))
     straight = np.where(np.arange(arm.num_joints) < 3, q, 0.0)

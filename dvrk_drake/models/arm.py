@@ -174,7 +174,7 @@ def _load_arm(name: str) -> Arm:
             raise ArmError(f'unknown arm "{name}"; known arms: {", ".join(known_arms())}')
     if not path.is_file():
         raise ArmError(f"{path}: no such arm file")
-    description = load_typed_yaml(ArmDescription, path, ArmError)
+    description = load_typed_yaml(ArmDescription, path, ArmError, "an arm's file")
     mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)
     instrument = Instrument()
     if description.instrument:
@@ -183,11 +183,12 @@ def _load_arm(name: str) -> Arm:
 
 
 def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part:
+    what = f"an arm's {kind}"
     if name.endswith((".yaml", ".yml")):
         path = (arm_path.parent / name).resolve()
         if not path.is_file():
             raise ArmError(f"{arm_path}: {kind} {path}: no such file")
-        part = load_typed_yaml(schema, path, ArmError)
+        part = load_typed_yaml(schema, path, ArmError, what)
         if part.sdf and not part.sdf.startswith(PACKAGE_URL):
             part.sdf = str(path.parent / part.sdf)
         return part
@@ -196,7 +197,7 @@ def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
         raise ArmError(f'{arm_path}: unknown {kind} "{name}"; known {kind}s: {known}, or the path of a YAML file')
-    return load_typed_yaml(schema, path, ArmError)
+    return load_typed_yaml(schema, path, ArmError, what)
 
 
 def _build_arm(

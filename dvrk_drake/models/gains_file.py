@@ -21,7 +21,7 @@ def load_gains(path: str | Path) -> Gains:
     """
     if not Path(path).is_file():
         raise ControllerError(f"{path}: no such file of gains")
-    gains = load_typed_yaml(Gains, path, ControllerError, what="a file of gains", allowed="kp, kd, ki")
+    gains = load_typed_yaml(Gains, path, ControllerError, "a file of gains")
     for name, values in dataclasses.asdict(gains).items():
         if not values:
             raise ControllerError(f"{path}: {name} is missing; a file of gains has kp, kd and ki, one number a joint")

@@ -36,7 +36,7 @@ def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
     """
     if not Path(path).is_file():
         raise CollectionError(f"{path}: no such file of poses; --teach or --random makes one")
-    content = load_typed_yaml(PoseFile, path, CollectionError, what="a file of poses", allowed="format, arm, poses")
+    content = load_typed_yaml(PoseFile, path, CollectionError, "a file of poses")
     if content.format != PoseFile.format:
         raise CollectionError(f'{path}: format is "{content.format}", this version reads "{PoseFile.format}"')
     if content.arm.lower() != arm.name.lower():

@@ -5,6 +5,7 @@ What was written survives a killed process; the last moments before a power fail
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Protocol
 
@@ -44,7 +45,7 @@ def check_stream_output(path: str | Path) -> None:
     """Refuses a path that a recording cannot be made at.
 
     Raises:
-        RecordingError: it exists, its folder does not, or it ends in neither .csv nor .log.
+        RecordingError: it exists, its folder does not or is not to be written in, or it ends in neither .csv nor .log.
     """
     path = Path(path)
     if path.suffix not in (".csv", ".log"):
@@ -53,6 +54,11 @@ def check_stream_output(path: str | Path) -> None:
         raise RecordingError(f"{path}: exists already, and a recording is not overwritten; name another file")
     if not path.parent.is_dir():
         raise RecordingError(f"{path}: cannot be written: its folder does not exist")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> RecordingFile:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from pathlib import Path
 
 import lcm
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.common.yaml import yaml_load_typed
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -19,11 +17,11 @@ from pydrake.systems.framework import DiagramBuilder
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, describe_state, status_channel
+from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.processes.lcm_network import handle_message, listen
 from dvrk_drake.processes.pace import Pace
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
@@ -37,20 +35,12 @@ def load_driver(path: str | Path) -> DvrkDriver:
     Raises:
         StationError: it cannot be read, or holds something that is not allowed.
     """
+    driver = load_typed_yaml(DvrkDriver, path, StationError, "a driver's configuration")
     try:
-        driver = yaml_load_typed(schema=DvrkDriver, filename=str(path), defaults=DvrkDriver())
         driver.check()
-        return driver
-    except OSError as error:
-        raise StationError(f"{path}: cannot be read: {error.strerror}") from error
     except StationError as error:
         raise StationError(f"{path}: {error}") from error
-    except Exception as error:
-        # yaml_load_typed raises many types, from YAML's to KeyError; not each text says more than the value.
-        allowed, guard = (", ".join(field.name for field in fields(schema)) for schema in (DvrkDriver, GuardSettings))
-        raise StationError(
-            f"{path}: not a driver's configuration: {error}; allowed: {allowed}, the last one with {guard}"
-        ) from error
+    return driver
 
 
 def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.float64]:

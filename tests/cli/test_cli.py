@@ -202,6 +202,23 @@ def test_interrupt_while_importing_is_one_line_and_130():
     assert process.stderr == "dvrk-drake: interrupted\n"
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "dvrk-drake: error: the following arguments are required: VERB; see dvrk-drake --help"),
+        (["modl"], "dvrk-drake: error: argument VERB: invalid choice: 'modl' (choose from"),
+        (["model", "psm", "--gravity", "1", "2"], "dvrk-drake model: error: argument --gravity: expected 3 arguments;"),
+        (["identify", "a.csv", "--arm", "psm"], "are required: --output; see dvrk-drake identify --help"),
+    ],
+)
+def test_bad_options_are_refused_in_one_line(arguments, message, capsys):
+    with pytest.raises(SystemExit) as refusal:
+        main(arguments)
+    error = capsys.readouterr().err
+    assert refusal.value.code == 2
+    assert message in error and error.count("\n") == 1
+
+
 def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
     poses, model = folder / "poses.csv", folder / "model.yaml"
     out = tmp_path / "never.yaml"
@@ -231,7 +248,9 @@ def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
     write_recording(Recording(q=recording.q + 1.5 * np.eye(7)[5], tau=recording.tau), bad)
     assert "wrist_yaw (q6)" in fails(capsys, "validate", model, bad)
     (tmp_path / "m.yaml").write_text(model.read_text().replace("trust", "thrust"))
-    assert "not a model file" in fails(capsys, "validate", tmp_path / "m.yaml", poses)
+    assert 'm.yaml: joints[0]: key "thrust" is unknown; did you mean "trust"? allowed in joints: name' in fails(
+        capsys, "validate", tmp_path / "m.yaml", poses
+    )
     assert not out.exists()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.csv", "m.yaml"]
 

@@ -216,6 +216,15 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
         compensation_from_model(balanced(), CompensationOptions(friction_ratio=(2.0,) * 7))
 
 
+@pytest.mark.parametrize("tolerance", ["nan", "inf", "-1"])
+@pytest.mark.parametrize(("arm", "option"), [("mtml", "--dvrk-gc"), ("psm", "--dvrk-kinematic-gc")])
+def test_a_tolerance_that_is_no_number_accepts_nothing(arm, option, tolerance, tmp_path, capsys):
+    path = tmp_path / "gc.json"
+    assert main(["export", arm, option, str(path), f"--gc-tolerance={tolerance}"]) == 2
+    assert f"--gc-tolerance is {tolerance}; allowed: a number of N m from 0" in capsys.readouterr().err
+    assert not path.exists()
+
+
 def test_a_leaning_base_is_refused_by_default_and_held_as_well_as_the_file_can(tmp_path, capsys):
     model = balanced()
     model.gravity = LEANING

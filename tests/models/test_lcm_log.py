@@ -16,7 +16,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.lcm_log import LcmLogReader
 from dvrk_drake.models.recording import read_recording
-from dvrk_drake.models.recording_stream import open_recording_file
+from dvrk_drake.models.recording_stream import check_stream_output, open_recording_file
 from dvrk_drake.models.status_stream import StatusStream
 
 
@@ -255,6 +255,8 @@ def test_a_growing_file_is_whole_after_every_message(tmp_path, suffix):
         file.write(data, message.utime + 500, stream.take(data))
         assert_same_numbers(read_recording(path, ARM), [m for m in messages[: k + 1] if m.guard_state])
     file.close()
+    with pytest.raises(RecordingError, match=r"nowhere\.csv: cannot be written: "):
+        check_stream_output("/proc/self/nowhere.csv")  # a folder in which nobody can write
     with pytest.raises(RecordingError, match="exists already, and a recording is not overwritten"):
         open_recording_file(path, ARM, stream)
 

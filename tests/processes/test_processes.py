@@ -119,8 +119,9 @@ def test_driver_file(tmp_path):
         with pytest.raises(StationError, match=r"driver\.yaml: "):
             load_driver(path)
     for text, message in (
-        ("guard: 3", "3; allowed: lcm_url, status_period, .*, guard, the last one with expiry, "),
-        ("control_modes: effort", "control_modes must be a list of position, effort"),
+        ("guard: 3", "guard is 3; allowed: a table with the keys expiry, "),
+        ("gard: {}", 'key "gard" is unknown; did you mean "guard"\\? allowed in .*: lcm_url, '),
+        ("control_modes: effort", r"control_modes is \"effort\"; allowed: a list of texts, e\.g\. \[effort\]"),
     ):
         path.write_text(text)
         with pytest.raises(StationError, match=rf"driver\.yaml: .*{message}"):

@@ -143,7 +143,7 @@ def test_hand_brings_the_handle_where_it_wants_it_however_firm_it_is(firmer):
 
 
 def test_what_is_refused():
-    with pytest.raises(ArmError, match="MTML: its SDF has no frame thumb"):
+    with pytest.raises(ArmError, match='MTML: its SDF has no frame "thumb"; it has dh_0'):
         Hand(ARM, "thumb")
     with pytest.raises(StationError, match="a hand's stiffness must be a positive number; got nan"):
         Hand(ARM, grip=Grip(stiffness=np.nan))

@@ -28,8 +28,8 @@ GAP, LEAST_GAP = 5.0, LONGEST_PERIOD
 #: A clock that is off by more than this share of an interval is worth a line.
 LEAST_JITTER = 0.05
 #: A sign is wrong if Coulomb friction is so many standard errors below 0; or if the motor's work is below minus this
-#: share, and Coulomb friction not so many above 0.
-SURE, OPPOSITE, DOUBTFUL = 5.0, 0.05, 2.0
+#: share, and Coulomb friction below 0 as far as it can be told.
+SURE, OPPOSITE = 5.0, 0.05
 #: Joints whose speeds correlate more can hardly be told apart.
 TOGETHER = 0.95
 #: Shorter motions are too short to judge lags, signs and noise [s].
@@ -87,7 +87,7 @@ def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
     blocks = {
         name: float(np.mean(repeated_block(block)))
         for name, block in (("q", actuators.q), ("qd", actuators.qd), ("tau", actuators.tau))
-        if block is not None
+        if block is not None and np.any(block)
     }
     if whole > LEAST_REPEATED:
         shares = ", ".join(f"{name} alone {share:.1%}" for name, share in blocks.items())
@@ -200,7 +200,7 @@ def _signs(work: NDArray[np.float64], lags: EffortLag, names: tuple[str, ...]) -
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = lags.coulomb / lags.coulomb_error
     # Work alone does not tell: gravity and inertia may give it through the other joints.
-    wrong = (errors < -SURE) | ((work < -OPPOSITE) & (errors < DOUBTFUL))
+    wrong = (errors < -SURE) | ((work < -OPPOSITE) & (errors < 0))
     findings = []
     for j in np.flatnonzero(wrong):
         what = (

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.report import Finding
-from dvrk_drake.analysis.static.doubts import find_doubts
+from dvrk_drake.analysis.static.doubts import find_doubts, usable_measurements
 from dvrk_drake.analysis.static.static_identification import LEAST_POSES, average_repeated_poses
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
@@ -13,14 +14,16 @@ from dvrk_drake.models.recording import Recording
 
 #: Poses at which the SDF's gravity is compared.
 MOST_COMPARED = 500
-#: A sign is doubted if the joint covers a quarter of its limits, gravity is above this share of the effort, and their
-#: correlation below minus the other [1].
-GRAVITY_SHARE, OPPOSITE = 0.5, 0.7
+#: A sign is told by gravity alone where the model file's is so large [N m], [N] (cables hold less), and this share of
+#: the effort; it is wrong where the effort goes against it by so many standard errors, correlating by less than minus
+#: this.
+LEAST_GRAVITY, GRAVITY_SHARE, SURE, OPPOSITE = (0.1, 1.0), 0.5, 5.0, 0.7
 
 
-def check_poses(joints: Recording, arm: Arm) -> list[Finding]:
-    """What must be said of poses in joint coordinates, with efforts."""
+def check_poses(recording: Recording, arm: Arm) -> list[Finding]:
+    """What must be said of poses in either coordinates, with efforts."""
     findings = []
+    joints = recording.in_joint_coordinates(arm)
     distinct = len(average_repeated_poses(joints, arm))
     if distinct < LEAST_POSES:
         advice = f"identify needs {LEAST_POSES}; 40 or more, spread over the limits, are good"
@@ -32,26 +35,45 @@ def check_poses(joints: Recording, arm: Arm) -> list[Finding]:
         what = f"{rows} poses press on a stop or exceed an effort limit, first {doubts[0].where}: {doubts[0].reason}"
         advice = "identify leaves the efforts of those joints out and lists them"
         findings.append(Finding("note", "doubted poses", "rows", what, advice, size=float(rows)))
-    return findings + _wrong_sign(joints, arm)
+    return findings + _wrong_sign(recording, joints, usable_measurements(joints.q.shape, doubts), arm)
 
 
-def _wrong_sign(joints: Recording, arm: Arm) -> list[Finding]:
+def _wrong_sign(recording: Recording, joints: Recording, usable: NDArray[np.bool_], arm: Arm) -> list[Finding]:
+    """In the recording's own coordinates, where a sign is one effort's; `usable` (m, n): no stop carries it."""
     rows = np.linspace(0, len(joints) - 1, min(len(joints), MOST_COMPARED)).astype(int)
+    gravity, tau = _gravity(joints.q[rows], arm), recording.measured_effort()[rows]
+    if recording.coordinates == "actuator":
+        gravity = arm.transmission.inverse().pull_back_effort(gravity)
+    findings = []
+    for j, least in enumerate(arm.per_joint(*LEAST_GRAVITY)):
+        use = usable[rows, j]
+        if np.sum(use) >= LEAST_POSES and np.sqrt(np.mean(gravity[use, j] ** 2)) >= least:
+            correlation = _sure_correlation(gravity[use, j], tau[use, j])
+            if correlation < -OPPOSITE:
+                what = f"efforts are opposite to the gravity torque of the model file (correlation {correlation:.2f})"
+                advice = f"tau{j + 1} must be positive towards +q{j + 1}, and --gravity must be that of the mounting"
+                findings.append(Finding("refusal", "effort sign", arm.joint_names[j], what, advice, (j,), correlation))
+    return findings
+
+
+def _gravity(q: NDArray[np.float64], arm: Arm) -> NDArray[np.float64]:
+    """(m, n) torque of the joints that holds the poses q (m, n), as the SDF says."""
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
-    gravity = np.empty((len(rows), arm.num_joints))
-    for i, row in enumerate(rows):
-        set_arm_positions(plant, context, arm, joints.q[row])
-        gravity[i] = holding_torque(plant, context, arm)
-    tau = joints.measured_effort()[rows]
-    sizes = np.sqrt(np.sum(gravity**2, axis=0)), np.sqrt(np.sum(tau**2, axis=0))
-    cosine = np.sum(gravity * tau, axis=0) / np.maximum(sizes[0] * sizes[1], np.finfo(float).tiny)
-    covers = np.ptp(joints.q, axis=0) > 0.25 * (arm.position_upper - arm.position_lower)
-    findings = []
-    for j in np.flatnonzero(covers & (sizes[0] > GRAVITY_SHARE * sizes[1]) & (cosine < -OPPOSITE)):
-        what = f"efforts are opposite to the gravity torque of the model file (correlation {cosine[j]:.2f})"
-        advice = "efforts must be positive towards +q, and --gravity must be that of the mounting"
-        findings.append(
-            Finding("refusal", "effort sign", arm.joint_names[j], what, advice, (int(j),), float(cosine[j]))
-        )
-    return findings
+    tau = np.empty_like(q)
+    for row, pose in enumerate(q):
+        set_arm_positions(plant, context, arm, pose)
+        tau[row] = holding_torque(plant, context, arm)
+    return tau
+
+
+def _sure_correlation(gravity: NDArray[np.float64], tau: NDArray[np.float64]) -> float:
+    """Of the efforts (m,) with gravity's (m,); 0 where gravity is a small part of them, or an offset may explain it."""
+    sizes = float(np.linalg.norm(gravity)), float(np.linalg.norm(tau))
+    if sizes[0] < GRAVITY_SHARE * sizes[1] or sizes[1] == 0:
+        return 0.0
+    slope = float(gravity @ tau) / sizes[0] ** 2
+    error = float(np.linalg.norm(tau - slope * gravity)) / sizes[0] / np.sqrt(len(tau) - 1)
+    beside_offset = float((gravity - np.mean(gravity)) @ (tau - np.mean(tau)))
+    sure = abs(slope) > SURE * error and slope * beside_offset > 0
+    return float(gravity @ tau) / (sizes[0] * sizes[1]) if sure else 0.0

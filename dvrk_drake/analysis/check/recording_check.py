@@ -68,7 +68,7 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
         report, more = check_motion(report, recording, arm)
         findings += more
     else:
-        findings += check_poses(joints, arm)
+        findings += check_poses(recording, arm)
     return replace(report, findings=tuple(sorted(findings, key=lambda finding: _ORDER[finding.severity])))
 
 

@@ -102,9 +102,9 @@ def print_comparison(console: Console, file_name: str, model_name: str, comparis
         )
     console.print(table)
     console.print(
-        "at clip: share of poses at which the file's torque is its limit, a constant. runaway: where it is, before\n"
-        "the clip, outside the model's range by more than half of it. opposed: where file and model push opposite\n"
-        "ways, both by more than a tenth of the model's largest. RMS: file less model, in and out of the sweep that\n"
+        "at clip: share of poses at which the file's torque is its limit, a constant. runaway: where it is, before "
+        "the clip, outside the model's range by more than half of it. opposed: where file and model push opposite "
+        "ways, both by more than a tenth of the model's largest. RMS: file less model, in and out of the sweep that "
         f"the file says its data are from ({_sweep(comparison)})."
     )
     wrong = (comparison.clipped | comparison.runaway | comparison.opposed)[:, : len(MTM_JOINTS) - 1].any(axis=1)

@@ -81,13 +81,8 @@ def identify_static(
         RecordingError: the recording does not fit the arm or has no efforts.
         IdentificationError: too few poses, a motion instead of poses, or (method "paper") a rank too low.
     """
-    recording.check_fits(arm)
-    recording = recording.in_joint_coordinates(arm)
-    _check_rest(recording, arm)
-    if method == "robust" and measured is None:
-        recording = average_repeated_poses(recording, arm)
+    recording = usable_poses(recording, arm, averaged=method == "robust" and measured is None)
     tau = recording.measured_effort()
-    _check_poses(recording, arm)
     gravity_model = compile_static_model(arm)
     Y = gravity_model.regressor(recording.q)
     stacked = Y.reshape(-1, Y.shape[2]) if measured is None else Y[measured]
@@ -146,6 +141,23 @@ def identify_static(
     return StaticIdentification(model, recording, doubts, fit.residuals, fit.left_out_residuals, measured)
 
 
+def usable_poses(recording: Recording, arm: Arm, averaged: bool = True) -> Recording:
+    """The poses in joint coordinates, `averaged` to one row a pose, where a static model can be had from them.
+
+    Raises:
+        RecordingError: the recording does not fit the arm or has no efforts.
+        IdentificationError: too few poses, or a motion instead of poses.
+    """
+    recording.check_fits(arm)
+    recording = recording.in_joint_coordinates(arm)
+    _check_rest(recording, arm)
+    if averaged:
+        recording = average_repeated_poses(recording, arm)
+    recording.measured_effort()
+    _check_poses(recording, arm)
+    return recording
+
+
 def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:
     """One row a pose: rows whose joints agree within `SAME_POSE` with the first of them are its samples."""
     same = arm.per_joint(*SAME_POSE)
@@ -180,8 +192,8 @@ def _check_rest(recording: Recording, arm: Arm) -> None:
 def _check_poses(recording: Recording, arm: Arm) -> None:
     if len(recording) < LEAST_POSES:
         raise IdentificationError(
-            f"{recording.source}: has {len(recording)} distinct poses, too few to identify from; "
-            f"at least {LEAST_POSES}, better 40 or more that cover the arm's range"
+            f"{recording.source}: has {len(recording)} distinct pose{'s' * (len(recording) != 1)}, too few to identify "
+            f"from; at least {LEAST_POSES}, better 40 or more that cover the arm's range"
         )
     check_effort_unit(recording, arm)
 

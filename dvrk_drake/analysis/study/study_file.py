@@ -19,7 +19,7 @@ from pydrake.common.yaml import yaml_dump_typed
 
 from dvrk_drake.analysis.simulation.scenario import Scenario, check_pose
 from dvrk_drake.analysis.simulation.scenario_file import load_scenario
-from dvrk_drake.analysis.study.measures import KINDS, Measure
+from dvrk_drake.analysis.study.measures import Measure
 from dvrk_drake.errors import DvrkDrakeError, StudyError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.sdf_model import compose_sdf
@@ -190,7 +190,7 @@ def load_study(path: str | Path, settings: Sequence[str] = ()) -> Study:
     """
     if not Path(path).is_file():
         raise StudyError(f"{path}: no such study file")
-    study = load_typed_yaml(Study, path, StudyError, allowed=_known_keys())
+    study = load_typed_yaml(Study, path, StudyError, "a study")
     study.set = [*study.set, *settings]
     try:
         study.check()
@@ -211,10 +211,3 @@ def _seed_of_run(seed: int, pose: int) -> int:
 def _check_names(what: str, names: list[str]) -> None:
     if len({*names}) < len(names) or not all(name.isprintable() and name for name in names):
         raise StudyError(f"{what} must have different names, of one line; got {names}")
-
-
-def _known_keys() -> str:
-    groups = {"random_poses": RandomPoses, "variations": Variation, "measures": Measure}
-    texts = [f"in {key}: {', '.join(f.name for f in dataclasses.fields(schema))}" for key, schema in groups.items()]
-    kinds = f"kinds of measures: {', '.join(KINDS)}"
-    return f"{', '.join(f.name for f in dataclasses.fields(Study))}; {'; '.join(texts)}; {kinds}"

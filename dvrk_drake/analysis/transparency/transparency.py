@@ -11,7 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 
-from dvrk_drake.dynamics.arm_frame import ArmFrame
+from dvrk_drake.dynamics.arm_frame import ArmFrame, handle_frame
 from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ScenarioError
@@ -29,6 +29,8 @@ from dvrk_drake.systems.pose_trajectory_source import PoseTrajectorySource
 SAMPLE_PERIOD = 5e-3
 #: Until the hand has taken hold of the arm; what it feels before does not count [s].
 TAKES_HOLD = 1.0
+#: A motion that leaves the limits further is not this arm's [rad, m].
+LEAVES = 0.1
 
 
 @dataclass(frozen=True)
@@ -97,19 +99,25 @@ def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> Piecewi
 
     Raises:
         ScenarioError: no times, no positive speed, or a motion that leaves the limits by more than 0.1 rad or m.
+        RecordingError: another number of joints.
     """
+    recording = recording.in_joint_coordinates(arm)
     if recording.t is None:
         raise ScenarioError(f"{recording.source}: has no times; a path needs column t")
     if not 0 < speed <= 10:
         raise ScenarioError(f"speed is {speed:g}; allowed: above 0, up to 10")
-    outside = np.max(np.maximum(arm.position_lower - recording.q, recording.q - arm.position_upper), axis=0)
-    if np.any(outside > 0.1):
+    A, lower, upper = arm.limit_matrix()
+    outside = np.max(np.maximum(lower - recording.q @ A.T, recording.q @ A.T - upper), axis=0)
+    if np.any(outside > LEAVES):
         j = int(np.argmax(outside))
+        name = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)][j]
         raise ScenarioError(
-            f"{recording.source}: {arm.joint_names[j]} leaves the limits of {arm.name} by {outside[j]:.2g} rad or m; "
-            "is it a motion of this arm's joints?"
+            f"{recording.source}: {name} leaves the limits of {arm.name} by {outside[j]:.2g} rad or m; is it a motion "
+            f"of this arm's joints, not of another arm's or of actuators?"
         )
     t, keep = np.unique(recording.t, return_index=True)
+    if len(t) < 3:
+        raise ScenarioError(f"{recording.source}: has {len(t)} different times; a path needs 3 or more")
     q = np.clip(recording.q[keep], arm.position_lower, arm.position_upper)
     return PiecewisePolynomial.CubicShapePreserving((t - t[0]) / speed, q.T, zero_end_point_derivatives=True)
 
@@ -121,7 +129,7 @@ def feel(
     *,
     effects: ArmEffects | None = None,
     grip: Grip | None = None,
-    frame_name: str = "dh_7",
+    frame_name: str = "",
     seed: int = 0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Felt:
@@ -133,11 +141,11 @@ def feel(
         compensation: what the motors do.
         effects: of the real arm that the simulation has, e.g. `arm.effects`; none by default.
         grip: of the hand.
-        frame_name: of the handle.
+        frame_name: of the handle; by default `handle_frame`.
         seed: of the effects' noise.
         progress: called with the finished share, 0..1.
     """
-    name, frame = arm.name.lower(), ArmFrame(arm, frame_name)
+    name, frame = arm.name.lower(), ArmFrame(arm, frame_name := frame_name or handle_frame(arm))
     knots = np.arange(path.start_time(), path.end_time(), 0.02)
     poses = [frame.pose(path.value(t).ravel()) for t in knots]
     builder = DiagramBuilder()

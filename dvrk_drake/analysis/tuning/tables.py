@@ -42,8 +42,8 @@ def print_procedure(console: Console, arm: Arm, joints: tuple[JointProcedure, ..
         )
     console.print(table)
     console.print(
-        "pushed by: how far the joint is moved away and let go; sticks within: dry friction over the ultimate Kp;\n"
-        "growth: of a swing over the one before; >: swings died away up to this Kp, beyond it the motor only\n"
+        "pushed by: how far the joint is moved away and let go; sticks within: dry friction over the ultimate Kp; "
+        "growth: of a swing over the one before; >: swings died away up to this Kp, beyond it the motor only "
         "switches; left: of the step.\n"
     )
 
@@ -64,7 +64,7 @@ def print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
         )
     console.print(table)
     console.print(
-        "inertia in the joint box: least, all other joints free, and largest, all others held [kg m^2; kg]; margins\n"
+        "inertia in the joint box: least, all other joints free, and largest, all others held [kg m^2; kg]; margins "
         "of phase [deg] and gain: there. Limited by other joints: slower than alone, so that all are stable at once.\n",
         markup=False,
     )
@@ -74,9 +74,9 @@ def print_comparison(console: Console, comparison: Comparison) -> None:
     """One table a joint and one over poses."""
     arm, poses = comparison.arm, len(comparison.poses)
     console.print(
-        f"All joints of {arm.name} step at once, from {poses} poses. Settling time [s]: afterwards the joint stays\n"
-        f"inside its band, 2 % of the step or a count of its encoder; the slowest pose; n/{poses}: from n poses it\n"
-        f"has not settled in {DURATION - REST:g} s. Overshoot, what is left, unrest (peak to peak of effort at rest,\n"
+        f"All joints of {arm.name} step at once, from {poses} poses. Settling time [s]: afterwards the joint stays "
+        f"inside its band, 2 % of the step or a count of its encoder; the slowest pose; n/{poses}: from n poses it "
+        f"has not settled in {DURATION - REST:g} s. Overshoot, what is left, unrest (peak to peak of effort at rest, "
         "over its limit): the worst pose, arm as modelled. G, M: true gravity torque, true inertia over the model's.\n",
         markup=False,
     )

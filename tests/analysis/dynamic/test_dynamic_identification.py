@@ -169,6 +169,24 @@ def test_verbs_check_a_motion_first_and_refuse_it(case, tmp_path, capsys):
     assert main(["validate", paths["model.yaml"], paths["good.csv"]]) == 0
 
 
+def test_a_motion_without_efforts_is_predicted_but_not_compared(case, tmp_path, capsys):
+    """Efforts follow from positions alone: the same with and without those that were measured."""
+    _, _, recording, result = case
+    paths = {name: str(tmp_path / name) for name in ("with.csv", "without.csv", "model.yaml")}
+    write_recording(recording, paths["with.csv"])
+    write_recording(dataclasses.replace(recording, tau=None), paths["without.csv"])
+    result.model.save(paths["model.yaml"])
+    predicted = []
+    for name in ("with.csv", "without.csv"):
+        output = str(tmp_path / f"of_{name}")
+        assert main(["predict", paths["model.yaml"], paths[name], "--output", output]) == 0
+        predicted.append(np.loadtxt(output, delimiter=",", skiprows=1))
+        assert "always 0" not in capsys.readouterr().out
+    np.testing.assert_array_equal(*predicted)
+    assert main(["validate", paths["model.yaml"], paths["without.csv"]]) == 2
+    assert "has no efforts; needs columns tau1..tau7" in capsys.readouterr().err
+
+
 def test_in_actuator_coordinates_it_is_the_same_model(case):
     arm, _, recording, result = case
     mirrored = recording.in_actuator_coordinates(arm)

@@ -8,6 +8,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.analysis.transparency.transparency import Compensation, feel, rambling_path, recorded_path
 from dvrk_drake.cli import main
+from dvrk_drake.dynamics.arm_frame import handle_frame
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ScenarioError
 from dvrk_drake.models.arm import load_arm
@@ -51,6 +52,7 @@ def test_each_compensation_takes_more_off_the_hand():
 def test_the_path_of_a_recording_keeps_inside_the_limits_and_has_its_speed():
     t = np.linspace(3.0, 5.0, 50)
     middle, half = (ARM.position_upper + ARM.position_lower) / 2, (ARM.position_upper - ARM.position_lower) / 2
+    middle[1:3], half[1:3] = 0.1, 0.0  # within what the parallelogram allows
     q = middle + (half + 0.05) * np.sin(t)[:, None]
     path = recorded_path(ARM, Recording(q=q, t=t, tau=np.zeros_like(q)), speed=0.5)
     assert path.start_time() == 0 and path.end_time() == pytest.approx(4.0)
@@ -64,6 +66,23 @@ def test_the_path_of_a_recording_keeps_inside_the_limits_and_has_its_speed():
         recorded_path(ARM, Recording(q=q, t=t, tau=np.zeros_like(q)), speed=0)
     with pytest.raises(ScenarioError, match="no times"):
         recorded_path(ARM, Recording(q=q, tau=np.zeros_like(q)))
+    with pytest.raises(ScenarioError, match="has 2 different times"):
+        recorded_path(ARM, Recording(q=q[:2], t=t[:2]))
+    with pytest.raises(ScenarioError, match="parallelogram leaves the limits of MTML"):
+        recorded_path(ARM, Recording(q=q + 0.6 * np.array([0, 1, 1, 0, 0, 0, 0]), t=t))
+    moved = Recording(q=q, t=t).in_actuator_coordinates(ARM)
+    np.testing.assert_allclose(recorded_path(ARM, moved, 0.5).value(2.0), path.value(2.0), atol=1e-12)
+
+
+def test_a_psm_is_led_at_its_instrument():
+    psm = load_arm("psm")
+    assert (handle_frame(ARM), handle_frame(psm)) == ("dh_7", "dh_6")
+    pose = np.clip(0.1, psm.position_lower, psm.position_upper)
+    path = PiecewisePolynomial.ZeroOrderHold([0.0, 1.1], np.array([pose, pose]).T)
+    assert (
+        feel(psm, path, Compensation("SDF", IdentifiedModel.from_arm(psm))).rms_force < 1e-4
+    )  # the loops' pins give a little
+    assert feel(psm, path, Compensation("nothing")).rms_force > 0.5
 
 
 def test_the_verb_writes_its_table(tmp_path, capsys, monkeypatch):
@@ -86,7 +105,8 @@ def test_the_verb_writes_its_table(tmp_path, capsys, monkeypatch):
         (["--friction-ratio", "1"], "between 0 and 0.9"),
         (["--model", "nothing.yaml"], "must be NAME=MODEL.yaml"),
         (["--real-arm", "wings"], "unknown effect wings; allowed: all, friction"),
-        (["--frame", "dh_9"], "dh_9"),
+        (["--frame", "dh_9"], 'MTML: its SDF has no frame "dh_9"; it has dh_0, dh_1'),
+        (["--speed", "2"], "--speed is that of a recorded motion; name one with --path"),
         (["--path", "nowhere.csv"], "nowhere.csv"),
     ],
 )

@@ -309,9 +309,13 @@ def test_gains_of_a_file_are_what_an_arm_is_held_with(tmp_path):
     ("text", "said"),
     [
         ("kp: [1]\nkd: [1]\n", "ki is missing"),
-        ("kp: [1]\nkd: [1]\nkI: [1]\n", "kI"),
-        ("kp: fast\n", "not a file of gains"),
-        ("- 1\n", "not a file of gains"),
+        (
+            "kp: [1]\nkd: [1]\nkI: [1]\n",
+            'key "kI" is unknown; did you mean "ki"\\? allowed in a file of gains: kp, kd, ki',
+        ),
+        ("kp: fast\n", 'kp is "fast"; allowed: a list of numbers'),
+        ("kp: [1, fast]\n", r'kp\[1\] is "fast"; allowed: a number'),
+        ("- 1\n", "must be keys and values, not .*; allowed in a file of gains: kp, kd, ki"),
     ],
 )
 def test_what_is_no_file_of_gains_is_refused(tmp_path, text, said):

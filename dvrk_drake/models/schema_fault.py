@@ -1,0 +1,122 @@
+"""What does not fit a schema in a file's content, said such that it can be mended: key, value, what is allowed."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+from collections.abc import Iterator
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+_ONE = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+_MANY = {bool: "true or false", int: "whole numbers", float: "numbers", str: "texts"}
+#: A value is quoted up to so many letters.
+_LONGEST = 60
+
+
+def schema_fault(schema: type, content: Any, what: str) -> str:
+    """The first thing in `content` that does not fit, or "".
+
+    Args:
+        schema: a dataclass of dataclasses, lists, tables with texts as keys, bool, int, float, str, and None with them.
+        content: as yaml_load gives it.
+        what: it should be, e.g. "a file of gains".
+    """
+    if not isinstance(content, dict):
+        given = "is empty" if content is None else f"must be keys and values, not {_quoted(content)}"
+        return f"{given}; allowed in {what}: {_keys(schema)}"
+    return next(_faults(schema, content, "", what), "")
+
+
+def _faults(schema: Any, value: Any, key: str, what: str) -> Iterator[str]:
+    """Lazily; `key` is where the value stands, `what` what the keys of a table are of."""
+    origin, arguments = get_origin(schema), get_args(schema)
+    if origin in (Union, types.UnionType):
+        if value is not None:
+            (inner,) = (argument for argument in arguments if argument is not types.NoneType)
+            yield from _faults(inner, value, key, what)
+    elif dataclasses.is_dataclass(schema):
+        if not isinstance(value, dict):
+            yield _wrong(schema, value, key)
+            return
+        hints = get_type_hints(schema)
+        for name, entry in value.items():
+            if name not in hints:
+                yield f"{f'{key}: ' if key else ''}key {_quoted(name)} is unknown; {_meant(name, hints)}" + (
+                    f"allowed in {what}: {_keys(schema)}"
+                )
+            else:
+                inside = f"{key}.{name}" if key else name
+                yield from _faults(hints[name], entry, inside, inside)
+    elif origin is list:
+        if not isinstance(value, list):
+            yield _wrong(schema, value, key)
+            return
+        for i, entry in enumerate(value):
+            yield from _faults(arguments[0], entry, f"{key}[{i}]", key)
+    elif origin is dict:
+        if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
+            yield _wrong(schema, value, key)
+            return
+        for name, entry in value.items():
+            yield from _faults(arguments[1], entry, f"{key}.{name}", key)
+    elif not _fits(schema, value):
+        yield _wrong(schema, value, key)
+
+
+def _fits(schema: type, value: Any) -> bool:
+    """As yaml_load_typed converts."""
+    if isinstance(value, schema) and not (schema is int and isinstance(value, bool)):
+        return True
+    if schema is bool:
+        return value in ("true", "false")
+    if schema not in (int, float) or isinstance(value, bool) or not isinstance(value, int | float | str):
+        return False
+    if schema is int and isinstance(value, float):
+        return value.is_integer()
+    try:
+        schema(value)
+    except ValueError:
+        return False
+    return True
+
+
+def _wrong(schema: Any, value: Any, key: str) -> str:
+    allowed = _described(schema, _ONE)
+    if get_origin(schema) is list and not isinstance(value, dict | None):
+        (inner,) = get_args(schema)
+        if inner in _ONE and _fits(inner, value):
+            allowed += f", e.g. [{value}]"
+    return f"{key} is {_quoted(value)}; allowed: {allowed}"
+
+
+def _described(schema: Any, number: dict[type, str]) -> str:
+    """What is allowed: "a number", or of many "numbers"."""
+    one, arguments = number is _ONE, get_args(schema)
+    if get_origin(schema) in (Union, types.UnionType):
+        return _described(arguments[0], number)
+    if get_origin(schema) is list:
+        return f"{'a list' if one else 'lists'} of {_described(arguments[0], _MANY)}"
+    if get_origin(schema) is dict:
+        return f"{'a table' if one else 'tables'} of names with {_described(arguments[1], _MANY)}"
+    if dataclasses.is_dataclass(schema):
+        return f"{'a table' if one else 'tables'} with the keys {_keys(schema)}"
+    return number[schema]
+
+
+def _keys(schema: Any) -> str:
+    return ", ".join(get_type_hints(schema))
+
+
+def _meant(name: Any, known: dict[str, Any]) -> str:
+    of_lower_case = {key.lower(): key for key in known}
+    near = difflib.get_close_matches(str(name).lower(), of_lower_case, 1)
+    return f'did you mean "{of_lower_case[near[0]]}"? ' if near else ""
+
+
+def _quoted(value: Any) -> str:
+    if value is None:
+        return "empty"
+    text = str(value)
+    text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+    return f'"{text}"' if isinstance(value, str) else text

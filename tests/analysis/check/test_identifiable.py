@@ -1,0 +1,138 @@
+"""`check` ends with 2 for what `identify` refuses, says what is needed, and lets pass what it takes."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from dvrk_drake.analysis.check.identifiable import check_for_identification
+from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.cli import main
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
+from dvrk_drake.models.recording import Recording, read_recording, write_recording
+
+ARM = load_arm("mtmr")
+
+
+def with_sign(recording, joint):
+    """The same with one effort of the wrong sign."""
+    return replace(recording, tau=recording.measured_effort() * np.where(np.arange(7) == joint, -1, 1))
+
+
+def with_efforts(q, arm=ARM, **columns):
+    """Poses (m, 7) with the torque that the SDF says holds them."""
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    tau = np.empty_like(q)
+    for row, pose in enumerate(q):
+        set_arm_positions(plant, context, arm, pose)
+        tau[row] = holding_torque(plant, context, arm)
+    return Recording(q=q, tau=tau + 1e-4 * np.random.default_rng(1).normal(size=q.shape), **columns)
+
+
+def poses(count):
+    return with_efforts(ARM.sample_poses(count, np.random.default_rng(0), 0.1))
+
+
+def motion(seconds, rate, speed=1.0):
+    """All joints swing; `speed` 0: they stand."""
+    t = np.arange(round(seconds * rate)) / rate
+    phase = speed * t[:, None] + np.arange(7)
+    return with_efforts(0.1 + 0.1 * np.sin(phase), qd=0.1 * speed * np.cos(phase), t=t)
+
+
+REFUSED = {
+    "one row": (lambda: poses(1), "has 1 distinct pose, too few to identify from; at least 8"),
+    "few poses": (lambda: poses(7), "has 7 distinct poses, too few to identify from; at least 8"),
+    "still": (lambda: motion(6, 100, 0.0), "has 1 distinct pose, too few"),
+    "short": (lambda: motion(3, 100), "3.0 s at 100 Hz; a dynamic model needs a motion of at least 5 s at 50 Hz"),
+    "slow": (lambda: motion(10, 30), "10.0 s at 30 Hz; a dynamic model needs"),
+    "few rows": (lambda: motion(0.5, 100), "static identification needs poses at rest"),
+    "no times": (lambda: replace(motion(6, 100), t=None), "static identification needs poses at rest"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_check_refuses_what_identify_refuses(name, tmp_path, capsys):
+    make, message = REFUSED[name]
+    path, model = str(tmp_path / "r.csv"), tmp_path / "model.yaml"
+    write_recording(make(), path)
+    lines = []
+    for arguments in (["check", path], ["identify", path, "--output", str(model)]):
+        assert main([*arguments, "--arm", "mtmr"]) == 2
+        lines.append(capsys.readouterr().err.splitlines()[-1])
+    assert all(message in line for line in lines), lines
+    assert lines[0].startswith(f"dvrk-drake: error: {path}: refused: ")
+    assert not model.exists()
+
+
+def test_what_identify_takes_passes(tmp_path, capsys):
+    path = str(tmp_path / "r.csv")
+    for recording in (poses(8), motion(6, 100)):
+        write_recording(recording, path)
+        assert main(["check", path, "--arm", "mtmr"]) == 0, capsys.readouterr().out
+        assert not check_for_identification(read_recording(path, ARM), ARM).refusals
+
+
+def test_few_poses_may_still_validate_a_model():
+    assert [finding.kind for finding in check_recording(poses(3), ARM).findings if finding.kind == "few poses"]
+    assert not check_recording(poses(3), ARM).refusals
+
+
+def test_rests_of_a_motion_are_judged_as_poses():
+    """What is identified from a motion with rests are they: a joint's wrong sign shows there."""
+    pose = ARM.sample_poses(12, np.random.default_rng(2), 0.1)
+    pose = np.vstack([pose, pose[:1]])  # where it began, as gravity's work wants it
+    ways = [np.linspace(a, b, 100, endpoint=False) for a, b in pairwise(pose)]
+    q = np.vstack([np.vstack([np.repeat(a[:1], 60, 0), a]) for a in ways] + [np.repeat(pose[-1:], 60, 0)])
+    recording = with_efforts(q, t=np.arange(len(q)) / 100)
+    friction = 0.05 * ARM.effort_limits * np.tanh(np.gradient(q, 0.01, axis=0) / 0.05)
+    recording = replace(recording, tau=recording.measured_effort() + friction)
+    assert not check_for_identification(recording, ARM).refusals
+    (refusal,) = check_for_identification(with_sign(recording, 2), ARM).refusals
+    assert (refusal.kind, refusal.joints) == ("effort sign", (2,))
+
+
+@pytest.mark.parametrize("coordinates", ["joint", "actuator"])
+@pytest.mark.parametrize(("name", "joint"), [("mtmr", 1), ("mtmr", 2), ("psm", 0), ("psm", 1)])
+def test_one_wrong_sign_is_refused_and_its_joint_named(name, joint, coordinates):
+    """With Coulomb friction of either sign, which no pose is free of."""
+    arm, generator = load_arm(name), np.random.default_rng(5)
+    recording = with_efforts(arm.sample_poses(20, generator, 0.1), arm)
+    friction = 0.03 * arm.effort_limits * generator.choice([-1, 1], recording.q.shape)
+    recording = replace(recording, tau=recording.measured_effort() + friction)
+    if coordinates == "actuator":
+        recording = recording.in_actuator_coordinates(arm)
+    assert not check_for_identification(recording, arm).refusals
+    (refusal,) = check_for_identification(with_sign(recording, joint), arm).refusals
+    assert (refusal.kind, refusal.where, refusal.joints) == ("effort sign", arm.joint_names[joint], (joint,))
+
+
+def test_a_spring_or_a_small_gravity_is_no_wrong_sign():
+    """Efforts against gravity that something else explains: an offset, or what cables hold of a light wrist."""
+    recording = poses(20)
+    tau = recording.measured_effort().copy()
+    tau[:, 1] -= 3 * np.mean(tau[:, 1])
+    tau[:, 5] *= -1
+    assert not check_for_identification(replace(recording, tau=tau), ARM).refusals
+
+
+@pytest.mark.parametrize("name", ["mtm_2015_good72", "mtm_2015_apr18_all80", "mtmr_2017_sweep40"])
+def test_a_wrong_sign_in_real_poses_is_refused(name, shared_data):
+    recording = read_recording(shared_data / "mtm_static" / f"{name}.csv", ARM)
+    for joint in (1, 2):
+        (refusal,) = check_for_identification(with_sign(recording, joint), ARM).refusals
+        assert refusal.joints == (joint,)
+
+
+def test_real_recordings_pass(shared_data):
+    checked = 0
+    for path in [*(shared_data / "mtm_static").glob("mtm*.csv"), *(shared_data / "trajectories").glob("*_one*.csv")]:
+        arm = load_arm("psm" if path.name.startswith("psm") else "mtmr")
+        recording = read_recording(path, arm, "actuator" if path.parent.name == "trajectories" else "joint")
+        if recording.tau is not None:
+            assert not check_for_identification(recording, arm).refusals, path.name
+            checked += 1
+    assert checked == 9

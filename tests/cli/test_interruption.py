@@ -1,0 +1,58 @@
+"""Ctrl-C while a verb works: one line, exit code 130, and no folder or file that was made for nothing."""
+
+import importlib
+
+import pytest
+
+from dvrk_drake.cli import main
+from dvrk_drake.errors import DvrkDrakeError
+
+STUDY = "scenario: psm\nset: [duration=1]\nmeasures: [{kind: drift, time: 1}]\n"
+#: Verb with its options, and the function that does its work.
+VERBS = {
+    "simulate": (["psm", "--output", "o.csv", "--plots", "new/p"], "simulation.simulation.simulate"),
+    "transparency": (["--arm", "mtml", "--output", "new/p"], "transparency.transparency.feel"),
+    "study": (["study.yaml", "--output", "o.csv", "--plots", "new/p"], "study.executors.run_study_locally"),
+    "tune": (["--arm", "mtml", "--output", "o.yaml", "--plots", "new/p"], "tuning.tuning.tune_arm"),
+    "reproduce": (["fig7", "--output", "new/p"], "reproduction.run.reproduce"),
+}
+
+
+@pytest.fixture
+def interrupted(monkeypatch, tmp_path):
+    """Runs a verb in an empty folder whose work ends with `error`; returns the exit code."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(verb, error, before=lambda: None):
+        (tmp_path / "study.yaml").write_text(STUDY)
+        arguments, path = VERBS[verb]
+        module, _, function = f"dvrk_drake.analysis.{path}".rpartition(".")
+
+        def work(*_, **__):
+            before()
+            raise error
+
+        monkeypatch.setattr(importlib.import_module(module), function, work)
+        return main([verb, *arguments])
+
+    return run
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_nothing_is_left(verb, interrupted, tmp_path, capsys):
+    assert interrupted(verb, KeyboardInterrupt(), lambda: (tmp_path / "new/p").is_dir() or pytest.fail("made later"))
+    assert capsys.readouterr().err == "dvrk-drake: interrupted\n"
+    assert interrupted(verb, KeyboardInterrupt()) == 130
+    assert [p.name for p in tmp_path.iterdir()] == ["study.yaml"]
+    assert interrupted(verb, DvrkDrakeError("no")) == 2
+    assert [p.name for p in tmp_path.iterdir()] == ["study.yaml"]
+
+
+def test_what_was_there_or_holds_a_result_stays(interrupted, tmp_path):
+    (tmp_path / "new").mkdir()
+    assert interrupted("reproduce", KeyboardInterrupt()) == 130
+    assert [p.name for p in tmp_path.iterdir() if p.is_dir()] == ["new"]
+    assert not list((tmp_path / "new").iterdir())
+    (tmp_path / "new").rmdir()
+    assert interrupted("reproduce", KeyboardInterrupt(), lambda: (tmp_path / "new/p/table.csv").write_text("1")) == 130
+    assert (tmp_path / "new/p/table.csv").read_text() == "1"

@@ -1,0 +1,129 @@
+"""Files of settings: what does not fit is named with its key, its value and what is allowed, however deep it stands."""
+
+from dataclasses import dataclass, field
+
+import pytest
+from pydrake.common.yaml import yaml_load_typed
+
+from dvrk_drake.errors import ArmError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.schema_fault import schema_fault
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
+from dvrk_drake.models.typed_yaml import load_typed_yaml
+
+
+def own_psm(folder):
+    """The PSM as three files of one's own in `folder`."""
+    for kind, name in (("arm", "psm"), ("mechanism", "psm"), ("instrument", "large_needle_driver")):
+        text = (MODELS_FOLDER / f"{kind}s" / f"{name}.yaml").read_text()
+        text = text.replace("mechanism: psm", "mechanism: mechanism.yaml")
+        (folder / f"{kind}.yaml").write_text(
+            text.replace("instrument: large_needle_driver", "instrument: instrument.yaml")
+        )
+    return folder / "arm.yaml"
+
+
+def test_the_files_themselves_are_read(tmp_path):
+    assert PACKAGE_URL in load_arm(str(own_psm(tmp_path))).sdf[0]
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "message"),
+    [
+        ("arm", ("name:", "nam:"), 'key "nam" is unknown; did you mean "name"? allowed in an arm\'s file: name, mech'),
+        ("arm", ("name: PSM", "name: PSM\neffort_limit: abc"), 'key "effort_limit" is unknown; '),
+        ("arm", ("name: PSM", "name: [PSM]"), "name is ['PSM']; allowed: a text"),
+        ("arm", ("name: PSM", "name: PSM\ngravity: 9.81"), "gravity is 9.81; allowed: a list of numbers, e.g. [9.81]"),
+        ("arm", ("yaw: [", "yaw: [low, "), 'position_limits.yaw[0] is "low"; allowed: a number'),
+        ("arm", ("name: PSM", "name: PSM\ncoupled_limits: []"), "coupled_limits is []; allowed: a table of names with"),
+        (
+            "mechanism",
+            ("joints:", "jonts:"),
+            'key "jonts" is unknown; did you mean "joints"? allowed in an arm\'s mech',
+        ),
+        (
+            "mechanism",
+            ("\n  kp:", "\n  Kp:"),
+            'gains: key "Kp" is unknown; did you mean "kp"? allowed in gains: kp, kd, ki',
+        ),
+        ("mechanism", ("{frame_a:", "{frame_c:"), 'loop_closures[0]: key "frame_c" is unknown; did you mean "frame_'),
+        (
+            "mechanism",
+            ("\n  delay:", "\n  dealy:"),
+            'effects: key "dealy" is unknown; did you mean "delay"? allowed in effects',
+        ),
+        ("instrument", ("joints:", "joint:"), 'instrument.yaml: key "joint" is unknown; did you mean'),
+        (
+            "arm",
+            ("position_limits:", "position_limits: 3\nmirrored_links:"),
+            "position_limits is 3; allowed: a table of",
+        ),
+        ("instrument", ("sdf:", "sdf: [\n"), "instrument.yaml:"),
+    ],
+)
+def test_a_slip_is_named_with_its_file_and_what_is_allowed(file, change, message, tmp_path):
+    arm, path = own_psm(tmp_path), tmp_path / f"{file}.yaml"
+    text = path.read_text()
+    assert change[0] in text
+    path.write_text(text.replace(*change, 1))
+    with pytest.raises(ArmError) as refusal:
+        load_arm(str(arm))
+    assert str(refusal.value).startswith(f"{path}:")
+    assert message in str(refusal.value)
+
+
+@dataclass
+class Inner:
+    number: float = 0.0
+
+
+@dataclass
+class Outer:
+    count: int = 0
+    size: float = 0.0
+    good: bool = False
+    name: str = ""
+    sizes: list[float] = field(default_factory=list)
+    inner: Inner = field(default_factory=Inner)
+    perhaps: Inner | None = None
+    table: dict[str, list[int]] = field(default_factory=dict)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("count: 3", "count: 3.0", "count: 3.5", "count: '3'", "count: three", "count: true", "count:"),
+        *("size: 3", "size: 1e-3", "size: .nan", "size: x", "size: false", "size: [1]", "size: {a: 1}"),
+        *("good: true", "good: 'true'", "good: 1", "good: maybe", "name: x", "name: 3", "name: true", "name:"),
+        *("sizes: []", "sizes: [1, 2.5]", "sizes: [a]", "sizes: 3", "inner: {}", "inner: {number: 2}", "inner: 3"),
+        *("perhaps:", "perhaps: {number: 1}", "perhaps: {numbr: 1}", "perhaps: 3", "other: 3", "size: 2026-01-01"),
+        *("table: {a: [1]}", "table: {a: [b]}", "table: [1]", "table:", "inner: {number: x}", "inner:"),
+    ],
+)
+def test_refused_is_what_drake_refuses(line):
+    """The texts are ours, what is allowed is Drake's to say."""
+    from pydrake.common.yaml import yaml_load
+
+    try:
+        yaml_load_typed(schema=Outer, data=line)
+        fits = True
+    except Exception:
+        fits = False
+    assert (schema_fault(Outer, yaml_load(data=line), "a test") == "") == fits
+
+
+def test_what_drake_takes_letter_by_letter_is_refused():
+    assert yaml_load_typed(schema=Outer, data="sizes: '12'").sizes == [1.0, 2.0]
+    assert schema_fault(Outer, {"sizes": "12"}, "a test") == 'sizes is "12"; allowed: a list of numbers, e.g. [12]'
+
+
+def test_files_that_are_no_text_or_not_there_are_refused(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_bytes(b"name: \xff")
+    for where, message in (
+        (path, "not a text file in UTF-8"),
+        (tmp_path, "cannot be read"),
+        (tmp_path / "x", "cannot"),
+    ):
+        with pytest.raises(ArmError, match=f"{where}: {message}"):
+            load_typed_yaml(Outer, where, ArmError, "a test")
