@@ -40,7 +40,7 @@ def reproduce(
     extent: Extent | None = None,
     seed: int = 0,
 ) -> Path:
-    """Writes figures, tables and index.md.
+    """Writes figures, tables and index.md, which has what is finished at any time.
 
     Args:
         names: of `NAMES`.
@@ -66,5 +66,9 @@ def reproduce(
         left_out.append("Fig. 4 needs the recording of the paper's poses; name its folder with --data.")
     with local_executor() as executor:
         laboratory = Laboratory(folder, recordings, executor, progress, extent or Extent(), seed)
-        sections = [_MAKERS[name](laboratory) for name in wanted]
-    return write_page(folder, sections, left_out)
+        sections: list[Section] = []
+        for name in wanted:
+            sections.append(_MAKERS[name](laboratory))
+            unfinished = [f"{later} was not finished." for later in wanted[len(sections) :]]
+            page = write_page(folder, sections, [*left_out, *unfinished])
+    return page

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from paper_regressor import paper_regressor
 
-from dvrk_drake.analysis.reproduction import published
+from dvrk_drake.analysis.reproduction import published, run
 from dvrk_drake.analysis.reproduction.dh_table import published_row, recomputed_table, reproduce_table_1
 from dvrk_drake.analysis.reproduction.drift_figures import reproduce_figure_5
 from dvrk_drake.analysis.reproduction.felt import reproduce_transparency
@@ -153,6 +153,17 @@ def test_table_1_alone_is_a_page(no_recordings, tmp_path):
     page = write_page(tmp_path, [reproduce_table_1()], [])
     assert "L3 = 0.3645 | 0.3645" in page.read_text()
     assert (tmp_path / "table1.csv").stat().st_size > 0
+
+
+def test_what_is_finished_is_written_though_the_rest_fails(no_recordings, monkeypatch, tmp_path):
+    def fails(laboratory):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(run._MAKERS, "fig7", fails)
+    with pytest.raises(KeyboardInterrupt):
+        run.reproduce(["table1", "fig7"], tmp_path, PaperRecordings(None))
+    page = (tmp_path / "index.md").read_text()
+    assert "L3 = 0.3645 | 0.3645" in page and "fig7 was not finished" in page
 
 
 def test_shares_have_wilsons_interval():
