@@ -1,0 +1,40 @@
+"""How much faster a study is on more workers, and that its results are the same bytes.
+
+    python benchmarks/study_speed_up.py [STUDY.yaml] [--workers 1 2] [--set duration=11]
+
+Times include starting the workers, in each of which Drake is imported and the arm's equations are compiled.
+"""
+
+import argparse
+import os
+import tempfile
+import time
+from pathlib import Path
+
+from dvrk_drake.analysis.study.executors import run_study_locally
+from dvrk_drake.analysis.study.study_file import load_study
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "release_study.yaml"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("study", nargs="?", default=str(EXAMPLE))
+    parser.add_argument("--workers", nargs="+", type=int, default=[1, os.cpu_count() or 1])
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    options = parser.parse_args()
+    study = load_study(options.study, options.set)
+    first = None
+    for workers in options.workers:
+        with tempfile.TemporaryDirectory() as folder:
+            results = Path(folder, "results.csv")
+            start = time.perf_counter()
+            rows = run_study_locally(study, results, workers, lambda done, of: None)
+            took, content = time.perf_counter() - start, results.read_bytes()
+        first = first or (took, content)
+        same = "the same bytes" if content == first[1] else "OTHER BYTES"
+        print(f"{workers} workers: {len(rows)} runs in {took:.1f} s, {first[0] / took:.2f} times as fast, {same}")
+
+
+if __name__ == "__main__":
+    main()
