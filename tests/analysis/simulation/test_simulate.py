@@ -87,7 +87,8 @@ def test_gains_of_the_scenario_are_used():
     assert abs(moved[1]) < 1e-3
 
 
-def test_a_recording_of_it_is_read_by_the_other_verbs(tmp_path, capsys):
+def test_a_recording_of_it_is_read_by_the_other_verbs(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")  # headings on one line
     model, recording, errors = (str(tmp_path / name) for name in ("model.yaml", "held.csv", "errors.json"))
     IdentifiedModel.from_arm(PSM).save(model)
     start = "start=[0.5,0.4,0.1,0.3,0.2,-0.3,0.4]"

@@ -167,7 +167,7 @@ def test_too_few_poses_and_too_low_a_rank_are_refused(arm):
     same = dataclasses.replace(same, q=np.tile(same.q[:1], (10, 1)), tau=np.tile(same.tau[:1], (10, 1)))
     with pytest.raises(IdentificationError, match=r"determine only \d of 12 base parameters"):
         identify_static(same, arm, "paper")
-    with pytest.raises(IdentificationError, match="has 1 distinct poses, too few"):
+    with pytest.raises(IdentificationError, match="has 1 distinct pose, too few"):
         identify_static(same, arm)
 
 
@@ -241,8 +241,8 @@ def test_model_file_round_trip_and_refusals(arm, tmp_path):
             'model 1", this version reads "dvrk_drake identified model 2"; identify anew',
         ),
         (text.replace("trust: 1.0", "trust: 2.0"), "trust between 0 and 1"),
-        (text.replace("arm: mtmr", "arms: mtmr"), "not a model file"),
-        ("]", "not a model file"),
+        (text.replace("arm: mtmr", "arms: mtmr"), 'key "arms" is unknown; did you mean "arm"'),
+        ("]", "not YAML: line 1"),
     ):
         assert bad != text
         (tmp_path / "bad.yaml").write_text(bad)
