@@ -164,12 +164,18 @@ def _friction_compensator(options: argparse.Namespace) -> FrictionCompensator | 
             "not known well"
         )
     arm, model = load_arm(options.arm), IdentifiedModel.load(options.model)
+    error = holding_error(model)
+    if options.friction_ratio and not error.any():
+        raise ControllerError(
+            f"--friction-ratio needs a --model from identify of poses at rest; {options.model} does not say how wrong "
+            "its weight may be, so nothing would keep the arm from creeping"
+        )
     friction = Friction.of_model(arm, IdentifiedModel.load(options.friction or options.model))
     compensator = FrictionCompensator(
         friction,
         ratio=options.friction_ratio,
         hysteresis_ratio=options.hysteresis_ratio,
-        holding_error=holding_error(model),
+        holding_error=error,
     )
     of_effects = zip(friction.effects, compensator.ratios, friction.springs_back, strict=True)
     less = {e.coordinate: r for e, r, springs_back in of_effects if not springs_back}

@@ -37,10 +37,10 @@ class FrictionCompensator(LeafSystem):
 
     **Why it is passive.** An elasto-plastic element takes c |slip|. One that starts later (`widening` >= 1 times the
     travel until it slips) slips no more than the arm's own, so ratio times it gives back at most `ratio` of what the
-    arm's friction takes, beside what it can store, ratio c d / 2. Viscous and smoothed Coulomb terms are at most
-    `ratio` of the arm's at every speed. A delay turns such a term's phase, but not beyond that of the arm's own, which
-    stays larger. What remains is friction of its own: no cycle can feed on it. And it holds the arm against errors of
-    the gravity compensation, as `safe_ratios` sees to.
+    arm's friction takes, beside what it can store, ratio c d widening / 2. Viscous and smoothed Coulomb terms are at
+    most `ratio` of the arm's at every speed. A delay turns such a term's phase, but not beyond that of the arm's own,
+    which stays larger. What remains is friction of its own: no cycle can feed on it. And it holds the arm against
+    errors of the gravity compensation, as `safe_ratios` sees to.
 
     **Time.** State (the elements' stretch, the last position) changes every `period`, at initialization, when the
     elements are relaxed, and by a forced update. While `state_estimated` is not finite `friction_effort` is zero; then

@@ -193,6 +193,14 @@ def test_run_prints_what_is_new_and_nothing_twice(controller, monkeypatch, capsy
     assert not said.err
 
 
+def test_friction_is_not_compensated_if_nobody_knows_how_wrong_the_weight_may_be(tmp_path, capsys):
+    path = str(tmp_path / "model.yaml")
+    IdentifiedModel.from_arm(ARM).save(path)
+    assert main(["run", "--arm", "mtml", "--model", path, "--friction-ratio", "0.5"]) == 2
+    said = capsys.readouterr().err
+    assert "--friction-ratio needs a --model from identify of poses at rest" in said and said.count("\n") == 1
+
+
 def test_rate_and_round_trip_of_the_report():
     maker, status = LiveStatusMaker(7, Status()), Status()
     assert maker.make(status, 0.1, 0).pace == "0 Hz, no command accepted yet, 0 statuses lost"

@@ -216,7 +216,7 @@ def _plot_distribution(path: Path, what: str, ours: Drifts, paper: Drifts, means
         if j:
             ax.axvline(means[j - 1], color="black", linestyle=":", label="published, mean of five trials")
         ax.set_xscale("log")
-        ax.set_xlim(8e-6, 10)
+        ax.set_xlim(8e-6, 20)  # the roll's range is 15 rad
         ax.set_title(_JOINTS[j], fontsize=10)
         ax.tick_params(labelsize=7)
         ax.grid(alpha=0.3)
