@@ -74,7 +74,7 @@ def _add_run(verbs: argparse._SubParsersAction) -> None:
         type=float,
         default=0.0,
         metavar="R",
-        help="in mode gravity, the share of the friction to take off the hand, 0..0.9; less where the arm could creep",
+        help="in mode gravity, the share of the friction to take off the hand, 0..0.6; less where the arm could creep",
     )
     verb.add_argument(
         "--hysteresis-ratio",

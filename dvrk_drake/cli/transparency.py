@@ -29,7 +29,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
         help="compensate with this model; again for more; default: what the arm's SDF states",
     )
     verb.add_argument(
-        "--friction-ratio", type=float, default=0.5, metavar="R", help="share of the friction, 0..0.9; default: 0.5"
+        "--friction-ratio", type=float, default=0.5, metavar="R", help="share of the friction, 0..0.6; default: 0.5"
     )
     verb.add_argument(
         "--real-arm",
@@ -94,11 +94,11 @@ def _compensations(options: argparse.Namespace, arm: Arm) -> list[Compensation]:
         ControllerError: a friction ratio that is not allowed.
     """
     from dvrk_drake.analysis.transparency.transparency import Compensation
+    from dvrk_drake.dynamics.friction_compensation import check_ratios
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.errors import ControllerError, ModelError
+    from dvrk_drake.errors import ModelError
 
-    if not 0 <= options.friction_ratio <= 0.9:
-        raise ControllerError(f"--friction-ratio must be between 0 and 0.9; got {options.friction_ratio:g}")
+    check_ratios(options.friction_ratio)
     models = {}
     for given in options.model:
         name, equals, path = given.partition("=")

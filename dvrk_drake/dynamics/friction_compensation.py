@@ -19,6 +19,13 @@ from dvrk_drake.models.arm import Arm
 #: Travel within which friction must hold the arm [rad, m]: an element that is stretched further before it slips lets
 #: the arm move that far. The smoothed sign of an identification stands for friction that holds at once.
 HOLDING_TRAVEL = 0.015
+#: A smoothed sign of the velocity stands for friction that holds if it is no wider [rad/s, m/s].
+HOLDING_SPEED = 0.1
+#: Share of the friction that may be compensated. On another day an arm may have a third less friction than identified
+#: (docs/dynamics.md); more than is there must never be given, also not late.
+LARGEST_RATIO = 0.6
+#: The same of hysteresis that springs back, which is a part of it.
+LARGEST_HYSTERESIS_RATIO = 0.9
 #: How many times as wrong as on average over its own recording a model is anywhere: rarely more on simulated arms.
 WRONG_AT_MOST = 2.0
 
@@ -83,8 +90,8 @@ class Friction:
         Raises:
             ModelError: it was identified from poses, or of another arm.
         """
-        if model.load_arm().joint_names != arm.joint_names:
-            raise ModelError(f"friction: the model is of {model.arm}, not of {arm.name}")
+        if (of := model.load_arm().name) != arm.name:
+            raise ModelError(f"friction: the model is of {of}, not of {arm.name}")
         if model.dynamics is None:
             raise ModelError(
                 "friction: the model was identified from poses, which tell nothing of friction; give a motion's"
@@ -100,9 +107,8 @@ class Friction:
     @property
     def holds(self) -> NDArray[np.bool_]:
         """(k,) whether the effect holds the arm at rest, within `HOLDING_TRAVEL`."""
-        return np.array(
-            [e.kind == "coulomb" or (e.kind == "presliding" and e.scale <= HOLDING_TRAVEL) for e in self.effects], bool
-        )
+        widest = {"coulomb": HOLDING_SPEED, "presliding": HOLDING_TRAVEL}
+        return np.array([e.scale <= widest.get(e.kind, -1.0) for e in self.effects], bool)
 
     @property
     def springs_back(self) -> NDArray[np.bool_]:
@@ -113,6 +119,20 @@ class Friction:
     def of_joints(self) -> NDArray[np.float64]:
         """(n,) friction that holds each joint at rest if it alone moves [N m, N]."""
         return np.abs(self.rows[self.holds]).T @ self.coefficients[self.holds]
+
+
+def check_ratios(ratio: float, hysteresis_ratio: float = 0.0) -> None:
+    """Whether these shares may be asked for.
+
+    Raises:
+        ControllerError: one is below 0, or above `LARGEST_RATIO` or `LARGEST_HYSTERESIS_RATIO`.
+    """
+    for name, share, largest in (
+        ("friction ratio", ratio, LARGEST_RATIO),
+        ("hysteresis ratio", hysteresis_ratio, LARGEST_HYSTERESIS_RATIO),
+    ):
+        if not 0 <= share <= largest:
+            raise ControllerError(f"{name} must be between 0 and {largest:g}; got {share:g}")
 
 
 def safe_ratios(
@@ -128,22 +148,21 @@ def safe_ratios(
 
     Args:
         friction: of the arm.
-        ratio: wanted, 0..1.
+        ratio: wanted, 0..`LARGEST_RATIO`.
         holding_error: (n,) by which the gravity compensation may be wrong [N m, N].
-        hysteresis_ratio: at least this of what `springs_back`, 0..1. That holds no arm where it was let go, so nothing
-            has to remain of it.
+        hysteresis_ratio: wanted of what `springs_back`, 0..`LARGEST_HYSTERESIS_RATIO`. That holds no arm where it was
+            let go, so nothing has to remain of it; but of all that rubs along a coordinate at most `LARGEST_RATIO` is
+            compensated, this first.
 
     Returns:
-        (k,) one ratio for each effect; effects of one coordinate have the same, or `hysteresis_ratio`.
+        (k,) one ratio for each effect.
 
     Raises:
-        ControllerError: a ratio outside 0..1, or an error that is none.
+        ControllerError: a ratio that is not allowed, or an error that is none.
     """
     error = np.asarray(holding_error, float)
     arm = friction.arm
-    for name, share in (("friction ratio", ratio), ("hysteresis ratio", hysteresis_ratio)):
-        if not 0 <= share <= 1:
-            raise ControllerError(f"{name} must be between 0 and 1; got {share:g}")
+    check_ratios(ratio, hysteresis_ratio)
     if error.shape != (arm.num_joints,) or not np.all((error >= 0) & np.isfinite(error)):
         raise ControllerError(f"holding_error must be {arm.num_joints} numbers from 0; got {error.tolist()}")
     names = list(dict.fromkeys(effect.coordinate for effect in friction.effects))
@@ -155,8 +174,18 @@ def safe_ratios(
     for block in range(block_of.max() + 1):
         joints = block_of == block
         along = np.any(rows[:, joints] != 0, axis=1)
+        if not np.any(along):  # no friction there
+            continue
         ratios[along] = _largest(rows[np.ix_(along, joints)], holding[along], error[joints], ratio)
-    return np.where(friction.springs_back, np.maximum(ratios[index], hysteresis_ratio), ratios[index])
+    if hysteresis_ratio <= ratio:
+        return ratios[index]
+    dry = np.array([effect.kind != "viscous" for effect in friction.effects], bool)
+    wide = np.bincount(index, friction.coefficients * friction.springs_back, len(names))
+    most = LARGEST_RATIO * np.bincount(index, friction.coefficients * dry, len(names))
+    of_wide = np.minimum(hysteresis_ratio, most / np.maximum(wide, 1e-12))
+    left_for_rest = (most - of_wide * wide) / np.maximum(most / LARGEST_RATIO - wide, 1e-12)
+    of_rest = np.where(wide > 0, np.minimum(ratios, np.maximum(left_for_rest, 0.0)), ratios)
+    return np.where(friction.springs_back, of_wide[index], of_rest[index])
 
 
 def _largest(

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, effect_step
-from dvrk_drake.dynamics.friction_compensation import Friction, safe_ratios
+from dvrk_drake.dynamics.friction_compensation import Friction, check_ratios, safe_ratios
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.systems.gravity_pid_step import ABSURD
 
@@ -61,10 +61,9 @@ class FrictionCompensator(LeafSystem):
 
         Args:
             friction: as identified.
-            ratio: share of it that is compensated, 0..0.9; above, an error of a tenth in the friction would be enough
-                to move the arm.
-            hysteresis_ratio: at least this share, 0..0.9, of the wide hysteresis that moves an arm back where it was
-                led from when it is let go, see `safe_ratios`.
+            ratio: share of it that is compensated, 0..`LARGEST_RATIO`.
+            hysteresis_ratio: at least this share, 0..`LARGEST_HYSTERESIS_RATIO`, of the wide hysteresis that moves an
+                arm back where it was led from when it is let go, see `safe_ratios`.
             holding_error: (n,) by which the gravity compensation may be wrong [N m, N]; lowers the ratio where needed.
             widening: the compensation's scales over the identified ones, from 1.
             period: of the update [s].
@@ -73,9 +72,7 @@ class FrictionCompensator(LeafSystem):
             ControllerError: a number that is none of these.
         """
         super().__init__()
-        for name, share in (("friction ratio", ratio), ("hysteresis ratio", hysteresis_ratio)):
-            if not 0 <= share <= 0.9:
-                raise ControllerError(f"{name} must be between 0 and 0.9; got {share:g}")
+        check_ratios(ratio, hysteresis_ratio)
         if not (1 <= widening <= 10 and 0 < period < 1):
             raise ControllerError(f"widening must be 1..10 and period 0..1 s; got {widening:g}, {period:g}")
         n = friction.arm.num_joints

@@ -87,7 +87,7 @@ def torque_table(laboratory: Laboratory) -> ResultTable:
 def _dry_friction(arm: Arm) -> NDArray[np.float64]:
     total = np.zeros(arm.num_joints)
     for law in arm.effects.friction:
-        if law.kind != "viscous":
+        if law.kind not in ("viscous", "presliding forward"):  # the latter holds in one direction only
             total += law.coefficient * np.abs(joint_row(arm, law.coordinate))
     return total
 

@@ -14,7 +14,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
 
 #: Share of the friction that is compensated in the last row.
-FRICTION_RATIO = 0.7
+FRICTION_RATIO = 0.6
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
 from dvrk_drake.dynamics.arm_frame import ArmFrame
+from dvrk_drake.dynamics.friction_compensation import check_ratios
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import ArmError, ScenarioError
+from dvrk_drake.errors import ArmError, ControllerError, ScenarioError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
@@ -33,9 +34,9 @@ class ControllerScenario:
     what the SDF states.
 
     `gains` replaces the arm's own (kp, kd, ki: one number a joint; in a file also the name of a file of gains).
-    `friction_ratio` is the share of the friction that the arm's files state which is compensated, 0..0.9, and
-    `hysteresis_ratio` that of the part that springs back; in mode "gravity" only. `parameter_error` makes the model
-    wrong: each of its base parameters is multiplied by a factor of its own from 1 - `parameter_error`..1 +
+    `friction_ratio` is the share of the friction that the arm's files state which is compensated, 0..0.6, and
+    `hysteresis_ratio` that of the part that springs back, 0..0.9; in mode "gravity" only. `parameter_error` makes the
+    model wrong: each of its base parameters is multiplied by a factor of its own from 1 - `parameter_error`..1 +
     `parameter_error`, drawn by the scenario's seed. `knows` names those of "cables" and "springs" of the arm's own
     effects that the model has beside the SDF; not for a model from a file.
     """
@@ -188,10 +189,12 @@ class Scenario:
             _check_choice("controller.knows", part, ("cables", "springs"))
         if self.controller.knows and self.controller.model:
             raise ScenarioError("controller.knows is of a model from the arm's files; controller.model names another")
+        try:
+            check_ratios(self.controller.friction_ratio, self.controller.hysteresis_ratio)
+        except ControllerError as error:
+            raise ScenarioError(f"controller: {error}") from error
         for name in ("friction_ratio", "hysteresis_ratio"):
-            ratio = getattr(self.controller, name)
-            _check_number(f"controller.{name}", ratio, 0.0, 0.9)
-            if ratio and self.controller.mode != "gravity":
+            if getattr(self.controller, name) and self.controller.mode != "gravity":
                 raise ScenarioError(f'controller.{name} needs mode "gravity"; it is "{self.controller.mode}"')
         if self.targets and self.controller.mode != "hold":
             raise ScenarioError(f'targets need controller.mode "hold"; it is "{self.controller.mode}"')

@@ -196,13 +196,13 @@ def joint_facts(arm: Arm, masses: NDArray[np.float64]) -> tuple[JointFacts, ...]
 
 
 def friction(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(n,) the most that dry friction holds [N m, N], (n,) viscous [N m s/rad; N s/m], of each joint moving alone."""
+    """(n,) what dry friction holds in both directions [N m, N], (n,) viscous [N m s/rad; N s/m], each joint alone."""
     dry, viscous = np.zeros(arm.num_joints), np.zeros(arm.num_joints)
     for effect in arm.effects.friction:
         row = np.abs(joint_row(arm, effect.coordinate))
         if effect.kind == "viscous":
             viscous += effect.coefficient * row**2
-        else:
+        elif effect.kind != "presliding forward":  # that holds in one direction only
             dry += effect.coefficient * row
     return dry, viscous
 

@@ -42,7 +42,7 @@ def test_a_hand_that_holds_a_limp_arm_still_does_the_work_of_lifting_it():
 def test_each_compensation_takes_more_off_the_hand():
     path = rambling_path(ARM, poses=3)
     friction = ARM.effects.only(["friction", "encoder", "delay"])
-    listed = [Compensation("nothing"), Compensation("gravity", MODEL), Compensation("friction", MODEL, 0.7)]
+    listed = [Compensation("nothing"), Compensation("gravity", MODEL), Compensation("friction", MODEL, 0.6)]
     limp, gravity, both = (feel(ARM, path, one, effects=friction) for one in listed)
     assert limp.rms_force > 2 * gravity.rms_force
     assert gravity.rms_force > 1.3 * both.rms_force
@@ -102,7 +102,7 @@ def test_the_verb_writes_its_table(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--friction-ratio", "1"], "between 0 and 0.9"),
+        (["--friction-ratio", "1"], "between 0 and 0.6"),
         (["--model", "nothing.yaml"], "must be NAME=MODEL.yaml"),
         (["--real-arm", "wings"], "unknown effect wings; allowed: all, friction"),
         (["--frame", "dh_9"], 'MTML: its SDF has no frame "dh_9"; it has dh_0, dh_1'),
