@@ -20,7 +20,7 @@ from dvrk_drake.models.arm import Arm
 #: the arm move that far. The smoothed sign of an identification stands for friction that holds at once.
 HOLDING_TRAVEL = 0.015
 #: A smoothed sign of the velocity stands for friction that holds if it is no wider [rad/s, m/s].
-HOLDING_SPEED = 0.1
+HOLDING_SPEED = 0.25
 #: Share of the friction that may be compensated. On another day an arm may have a third less friction than identified
 #: (docs/dynamics.md); more than is there must never be given, also not late.
 LARGEST_RATIO = 0.6
