@@ -98,6 +98,17 @@ def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray
     return -arm.linkage.pull_back_effort(tau_g)
 
 
+def holding_torques(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(m, n) torques that hold the arm, as its SDF states it, at poses (m, n) of the independent joints [N m, N]."""
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    tau = np.empty(poses.shape)
+    for row, q in enumerate(poses):
+        set_arm_positions(plant, context, arm, q)
+        tau[row] = holding_torque(plant, context, arm)
+    return tau
+
+
 def _pin(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClosure) -> None:
     """Pins frame_a of the closing bar to frame_b, and holds the bar's length once more as an equation of its own.
 

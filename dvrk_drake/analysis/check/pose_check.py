@@ -9,7 +9,7 @@ from dvrk_drake.analysis.check.report import Finding
 from dvrk_drake.analysis.static.doubts import find_doubts, usable_measurements
 from dvrk_drake.analysis.static.static_identification import LEAST_POSES, average_repeated_poses
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
+from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.models.recording import Recording
 
 #: Poses at which the SDF's gravity is compared.
@@ -41,7 +41,7 @@ def check_poses(recording: Recording, arm: Arm) -> list[Finding]:
 def _wrong_sign(recording: Recording, joints: Recording, usable: NDArray[np.bool_], arm: Arm) -> list[Finding]:
     """In the recording's own coordinates, where a sign is one effort's; `usable` (m, n): no stop carries it."""
     rows = np.linspace(0, len(joints) - 1, min(len(joints), MOST_COMPARED)).astype(int)
-    gravity, tau = _gravity(joints.q[rows], arm), recording.measured_effort()[rows]
+    gravity, tau = holding_torques(arm, joints.q[rows]), recording.measured_effort()[rows]
     if recording.coordinates == "actuator":
         gravity = arm.transmission.inverse().pull_back_effort(gravity)
     findings = []
@@ -54,17 +54,6 @@ def _wrong_sign(recording: Recording, joints: Recording, usable: NDArray[np.bool
                 advice = f"tau{j + 1} must be positive towards +q{j + 1}, and --gravity must be that of the mounting"
                 findings.append(Finding("refusal", "effort sign", arm.joint_names[j], what, advice, (j,), correlation))
     return findings
-
-
-def _gravity(q: NDArray[np.float64], arm: Arm) -> NDArray[np.float64]:
-    """(m, n) torque of the joints that holds the poses q (m, n), as the SDF says."""
-    plant = make_arm_plant(arm)
-    context = plant.CreateDefaultContext()
-    tau = np.empty_like(q)
-    for row, pose in enumerate(q):
-        set_arm_positions(plant, context, arm, pose)
-        tau[row] = holding_torque(plant, context, arm)
-    return tau
 
 
 def _sure_correlation(gravity: NDArray[np.float64], tau: NDArray[np.float64]) -> float:

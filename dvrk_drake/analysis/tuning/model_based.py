@@ -13,7 +13,7 @@ from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains
-from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, tree_selector
+from dvrk_drake.models.plant import holding_torques, make_arm_plant, set_arm_positions, tree_selector
 
 #: Damping ratio of a joint at its largest inertia, without its dry friction, which damps it more.
 DAMPING_RATIO = 0.8
@@ -209,10 +209,5 @@ def friction(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def largest_gravity(arm: Arm) -> NDArray[np.float64]:
     """(n,) the largest torque that holds the arm against gravity, over poses of its box [N m, N]."""
-    plant = make_arm_plant(arm)
-    context = plant.CreateDefaultContext()
-    torques = []
-    for q in arm.sample_poses(POSES, np.random.default_rng(1)):
-        set_arm_positions(plant, context, arm, q)
-        torques.append(holding_torque(plant, context, arm))
-    return np.asarray(np.max(np.abs(torques), axis=0))
+    poses = arm.sample_poses(POSES, np.random.default_rng(1))
+    return np.asarray(np.abs(holding_torques(arm, poses)).max(axis=0))

@@ -10,7 +10,7 @@ from dvrk_drake.analysis.check.identifiable import check_for_identification
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.cli import main
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
+from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.models.recording import Recording, read_recording, write_recording
 
 ARM = load_arm("mtmr")
@@ -23,13 +23,7 @@ def with_sign(recording, joint):
 
 def with_efforts(q, arm=ARM, **columns):
     """Poses (m, 7) with the torque that the SDF says holds them."""
-    plant = make_arm_plant(arm)
-    context = plant.CreateDefaultContext()
-    tau = np.empty_like(q)
-    for row, pose in enumerate(q):
-        set_arm_positions(plant, context, arm, pose)
-        tau[row] = holding_torque(plant, context, arm)
-    return Recording(q=q, tau=tau + 1e-4 * np.random.default_rng(1).normal(size=q.shape), **columns)
+    return Recording(q=q, tau=holding_torques(arm, q) + 1e-4 * np.random.default_rng(1).normal(size=q.shape), **columns)
 
 
 def poses(count):

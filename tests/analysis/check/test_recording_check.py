@@ -19,7 +19,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.lcm_log import LcmEvent, event_bytes
 from dvrk_drake.models.lcm_messages import status_channel
-from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
+from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.models.recording import Recording, read_recording, write_recording
 
 pytestmark = pytest.mark.slow
@@ -102,13 +102,7 @@ def test_outside_limits():
 
 def poses(arm, count=40):
     q = arm.sample_poses(count, np.random.default_rng(1), margin=0.1)
-    plant = make_arm_plant(arm)
-    context = plant.CreateDefaultContext()
-    tau = []
-    for pose in q:
-        set_arm_positions(plant, context, arm, pose)
-        tau.append(holding_torque(plant, context, arm))
-    return Recording(q, np.array(tau))
+    return Recording(q, holding_torques(arm, q))
 
 
 def test_poses_have_no_signals():
