@@ -74,14 +74,14 @@ def _add_run(verbs: argparse._SubParsersAction) -> None:
         type=float,
         default=0.0,
         metavar="R",
-        help="in mode gravity, the share of the friction to take off the hand, 0..0.6; less where the arm could creep",
+        help="in mode gravity, the share of the friction to take off the hand; less where the arm could creep",
     )
     verb.add_argument(
         "--hysteresis-ratio",
         type=float,
         default=0.0,
         metavar="R",
-        help="in mode gravity, the share of wide hysteresis to compensate, 0..0.9: the arm stays where it was led",
+        help="in mode gravity, the share of wide hysteresis to compensate: the arm stays where it was led",
     )
     verb.add_argument(
         "--friction", metavar="MODEL.yaml", help="from identify of a motion: whose friction; default: that of --model"

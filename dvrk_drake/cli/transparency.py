@@ -29,7 +29,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
         help="compensate with this model; again for more; default: what the arm's SDF states",
     )
     verb.add_argument(
-        "--friction-ratio", type=float, default=0.5, metavar="R", help="share of the friction, 0..0.6; default: 0.5"
+        "--friction-ratio", type=float, default=0.5, metavar="R", help="share of the friction; default: 0.5"
     )
     verb.add_argument(
         "--real-arm",

@@ -15,13 +15,12 @@ from dvrk_drake.analysis.reproduction.drift_tables import drift_table, rate_tabl
 from dvrk_drake.analysis.reproduction.laboratory import Laboratory
 from dvrk_drake.analysis.reproduction.releases import APPROACH, BAND, RESTING, SAMPLE_PERIOD, Drifts
 from dvrk_drake.analysis.reproduction.report import Section, share
+from dvrk_drake.dynamics.friction_compensation import LARGEST_HYSTERESIS_RATIO
 from dvrk_drake.models.effects_schema import EFFECT_NAMES
 
 _JOINTS = tuple(f"J{j}" for j in range(1, 8))
 #: How long an arm without friction is watched [s].
 LOOSE_DURATION = 3.0
-#: Share of the wide hysteresis that is compensated where it is.
-HYSTERESIS_RATIO = 0.9
 
 
 def reproduce_figure_5(laboratory: Laboratory) -> Section:
@@ -41,7 +40,7 @@ def reproduce_figure_5(laboratory: Laboratory) -> Section:
         poses[: extent.led_releases],
         "Fig. 5: leading and releasing, hysteresis compensated",
         led=True,
-        hysteresis_ratio=HYSTERESIS_RATIO,
+        hysteresis_ratio=LARGEST_HYSTERESIS_RATIO,
     )
     frictionless = [name for name in EFFECT_NAMES if name != "friction"]
 
@@ -87,7 +86,7 @@ def reproduce_figure_5(laboratory: Laboratory) -> Section:
         "hysteresis with a travel of 0.06-0.25 rad pushes joints 2 and 3 back and leaves less friction for what the "
         "model errs by, and joint 7's friction gives by 15 mrad before it slips. An exact model is let down alike. "
         "The published drifts of joints 2 and 3, up to 0.13 rad, are as large. **With that hysteresis compensated** "
-        f"(`run --hysteresis-ratio {HYSTERESIS_RATIO:g}`, the friction known) the joints that leave are "
+        f"(`run --hysteresis-ratio {LARGEST_HYSTERESIS_RATIO:g}`, the friction known) the joints that leave are "
         f"{_any_lost(kept)} of {len(kept.positions)}, by at most {_furthest(kept)} mrad.",
         "**Without friction** nothing but an exact model holds an arm: an error of torque over the inertia of a "
         f"wrist is tens of rad/s^2. So, in {LOOSE_DURATION:g} s, both models let it run into its limits, the "

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.reproduction.laboratory import Laboratory
 from dvrk_drake.analysis.reproduction.releases import SAMPLE_PERIOD, Drifts
 from dvrk_drake.analysis.reproduction.report import ResultTable, numbers
-from dvrk_drake.dynamics.actuator_effects import joint_row
+from dvrk_drake.analysis.tuning.model_based import friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import Arm
 
 #: Over what a drift rate is taken [s].
 RATE_TIME = 1.0
@@ -79,17 +78,9 @@ def torque_table(laboratory: Laboratory) -> ResultTable:
         ("zero torque", *rms(true)),
         ("the paper's", *rms(paper - true)),
         ("ours", *rms(mtm.model.holding_torque(q) - true)),
-        ("dry friction of the joint that can resist it", *numbers(_dry_friction(mtm.truth.arm), "{:.4f}")),
+        ("dry friction of the joint that can resist it", *numbers(friction(mtm.truth.arm)[0], "{:.4f}")),
     )
     return ResultTable("fig5_torques", "Why: RMS torque error over the joint box [N m]", ("", *_JOINTS), rows)
-
-
-def _dry_friction(arm: Arm) -> NDArray[np.float64]:
-    total = np.zeros(arm.num_joints)
-    for law in arm.effects.friction:
-        if law.kind not in ("viscous", "presliding forward"):  # the latter holds in one direction only
-            total += law.coefficient * np.abs(joint_row(arm, law.coordinate))
-    return total
 
 
 def rate_table(releases: dict[str, Drifts]) -> ResultTable:

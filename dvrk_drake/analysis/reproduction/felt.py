@@ -9,12 +9,9 @@ from dvrk_drake.analysis.reproduction.laboratory import Laboratory
 from dvrk_drake.analysis.reproduction.report import ResultTable, Section
 from dvrk_drake.analysis.transparency.report import plot_transparency
 from dvrk_drake.analysis.transparency.transparency import Compensation, Felt, feel, rambling_path
-from dvrk_drake.dynamics.friction_compensation import Friction
+from dvrk_drake.dynamics.friction_compensation import LARGEST_RATIO, Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
-
-#: Share of the friction that is compensated in the last row.
-FRICTION_RATIO = 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +44,7 @@ def reproduce_transparency(laboratory: Laboratory) -> Section:
         ("limp motors", None, 0.0),
         ("the paper's compensation", paper, 0.0),
         ("ours", mtm.file, 0.0),
-        (f"ours, friction {FRICTION_RATIO:g}", mtm.file, FRICTION_RATIO),
+        (f"ours, friction {LARGEST_RATIO:g}", mtm.file, LARGEST_RATIO),
     ]
     leads = [Lead(name, mtm.truth.arm, str(model or ""), ratio, poses, seed) for name, model, ratio in rows]
     felt = []
@@ -65,7 +62,7 @@ def reproduce_transparency(laboratory: Laboratory) -> Section:
         "The paper wishes for it and gives no number: force and torque at the handle while a hand (a spring and damper "
         "of a person's stiffness) leads the true arm along a path through random poses, slowly.",
         mtm.truth.origin,
-        f"The last row also takes {FRICTION_RATIO:g} of the friction off the hand, less where what remains must hold "
+        f"The last row also takes {LARGEST_RATIO:g} of the friction off the hand, less where what remains must hold "
         "the arm against the error of the identified gravity (docs/friction_compensation.md).",
     )
     return Section(

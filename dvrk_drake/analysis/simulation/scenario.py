@@ -34,11 +34,11 @@ class ControllerScenario:
     what the SDF states.
 
     `gains` replaces the arm's own (kp, kd, ki: one number a joint; in a file also the name of a file of gains).
-    `friction_ratio` is the share of the friction that the arm's files state which is compensated, 0..0.6, and
-    `hysteresis_ratio` that of the part that springs back, 0..0.9; in mode "gravity" only. `parameter_error` makes the
-    model wrong: each of its base parameters is multiplied by a factor of its own from 1 - `parameter_error`..1 +
-    `parameter_error`, drawn by the scenario's seed. `knows` names those of "cables" and "springs" of the arm's own
-    effects that the model has beside the SDF; not for a model from a file.
+    `friction_ratio` is the share of the friction that the arm's files state which is compensated, and
+    `hysteresis_ratio` that of the part that springs back, see `check_ratios`; in mode "gravity" only.
+    `parameter_error` makes the model wrong: each of its base parameters is multiplied by a factor of its own from
+    1 - `parameter_error`..1 + `parameter_error`, drawn by the scenario's seed. `knows` names those of "cables" and
+    "springs" of the arm's own effects that the model has beside the SDF; not for a model from a file.
     """
 
     mode: str = "hold"

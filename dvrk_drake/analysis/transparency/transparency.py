@@ -40,7 +40,7 @@ class Compensation:
     Attributes:
         name: in tables and plots.
         model: whose gravity torque; None for limp motors.
-        friction_ratio: share of the friction, 0..0.6, as `safe_ratios` allows.
+        friction_ratio: share of the friction, as `safe_ratios` allows.
         friction: which; that of the arm's files by default.
     """
 
