@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from own_network import pytest_terminal_summary  # noqa: F401
 
 # Before numpy is imported. Matrices are small here, and each core has a worker already: more threads of BLAS only wait
 # for each other, and take two thirds more processor time.

@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import pytest
+from patience import PATIENCE
 
 from dvrk_drake import allocation
 from dvrk_drake.cli import main
@@ -32,7 +33,7 @@ def test_a_program_starts_again_once(tmp_path):
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    out, errors = process.communicate("and its input\n", timeout=60)
+    out, errors = process.communicate("and its input\n", timeout=PATIENCE)
     assert not errors
     expected = allocation.allocator_environment()
     tunables, library = expected.get("GLIBC_TUNABLES"), expected.get("LD_PRELOAD")
@@ -52,7 +53,7 @@ def test_what_somebody_chose_stays(monkeypatch, said):
 def test_what_came_from_a_pipe_is_not_started_again():
     program = PROGRAM.replace("input()", "0")
     command = [sys.executable, "-"]
-    done = subprocess.run(command, check=True, input=program, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, check=True, input=program, capture_output=True, text=True, timeout=PATIENCE)
     assert done.stdout.count("start") == 1
     assert not done.stderr
 
@@ -72,5 +73,5 @@ def test_the_same_scenario_gives_the_same_bytes(tmp_path, capsys):
     words = ["simulate", "mtml", "--set", "real_arm=[all]", "--set", "duration=0.3", "--output"]
     assert main([*words, str(here)]) == 0
     command = [sys.executable, "-m", "dvrk_drake.cli", *words, str(restarted)]
-    subprocess.run(command, check=True, timeout=120, capture_output=True)
+    subprocess.run(command, check=True, timeout=PATIENCE, capture_output=True)
     assert here.read_bytes() == restarted.read_bytes()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,6 +77,7 @@ class Collector:
         *,
         stopped: Callable[[], bool] = lambda: False,
         report: Callable[[str], None] = lambda line: None,
+        writer: Executor | None = None,
     ) -> None:
         """Of the controller's arm.
 
@@ -87,6 +88,7 @@ class Collector:
             settings: how.
             stopped: asked once a status.
             report: hears a line a finished pose.
+            writer: runs the writing of rows; default: a thread of its own.
         """
         self.finished = False
         self.problem: DvrkDrakeError | None = None
@@ -105,7 +107,7 @@ class Collector:
         self._stopping = self._led = False
         self._what = "waiting for the arm"
         # The disk may take longer than the arm waits for a command.
-        self._writer = ThreadPoolExecutor(max_workers=1)
+        self._writer = writer or ThreadPoolExecutor(max_workers=1)
         self._steps = self._collect()
 
     def lead(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:

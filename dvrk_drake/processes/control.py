@@ -74,6 +74,10 @@ class ArmLink:
         # The subscription holds this link and LCM, unseen by the garbage collector.
         del self._subscription, self._lcm
 
+    def now(self) -> float:
+        """Time by the computer's monotonic clock [s]."""
+        return time.monotonic()
+
     def next_status(self, seconds: float) -> lcmt_dvrk_status:
         """The newest status that comes within `seconds`.
 
@@ -153,17 +157,17 @@ def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
     tell(f"{name} has a fault, which is reset now: {fault}")
     sender = DvrkCommandSender(link.arm)
     context = sender.CreateDefaultContext()
-    start = time.monotonic()
+    start = link.now()
     # The flag must be seen to change: false, then true.
     for reset in [0.0, 0.0, *[1.0] * 20]:
-        context.SetTime(time.monotonic() - start)
+        context.SetTime(link.now() - start)
         sender.GetInputPort("reset_fault").FixValue(context, np.array([reset]))
         sender.GetInputPort("lcmt_dvrk_status").FixValue(context, AbstractValue.Make(status))
         link.send(sender.get_output_port().Eval(context))
         status = link.next_status(_SILENCE)
     # Whoever comes while this sender is still remembered would be a second one: a guard may wait a second for that.
-    end = time.monotonic() + _FORGOTTEN
-    while time.monotonic() < end:
+    end = link.now() + _FORGOTTEN
+    while link.now() < end:
         status = link.next_status(_SILENCE)
     if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
         raise ControllerError(f"{name} has a fault that stays: {status.fault_text or fault}")
@@ -200,13 +204,13 @@ def control(
     Raises:
         ControllerError: the arm fell silent, faulted, was restarted, or lets no command act.
     """
-    start = time.monotonic()
+    start = link.now()
     first = link.next_status(_SILENCE)
     live, tell_at, acted = LiveStatusMaker(controller.sender_id, first), _TELL, 0.0
     while not stopped():
         status = link.next_status(_SILENCE)
         _check(status, link.arm.name, first.session_id)
-        now = time.monotonic() - start
+        now = link.now() - start
         link.send(controller.answer(status, now, lead(status, now)))
         live.answer(status, now)
         if controller.acting:
@@ -224,13 +228,13 @@ def control(
 
 def _release(link: ArmLink, controller: ArmController, start: float, session: int) -> None:
     """Asks the arm to hold until it says that it does."""
-    end = time.monotonic() + _RELEASE
-    while time.monotonic() < end:
+    end = link.now() + _RELEASE
+    while link.now() < end:
         status = link.next_status(_SILENCE)
         _check(status, link.arm.name, session)
         if status.guard_state in (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_OFF):
             return
-        command = controller.answer(status, time.monotonic() - start)
+        command = controller.answer(status, link.now() - start)
         command.control_mode = lcmt_dvrk_command.HOLD
         link.send(command)
     raise ControllerError(f"{link.arm.name} did not confirm that it holds; without commands it does after its expiry")

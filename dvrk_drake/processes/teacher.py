@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import select
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import IO
 
@@ -36,6 +36,7 @@ class Teacher:
         at_rest: bool,
         told: Callable[[], bool],
         report: Callable[[str], None],
+        writer: Executor | None = None,
     ) -> None:
         """Of the controller's arm.
 
@@ -45,6 +46,7 @@ class Teacher:
             at_rest: take each pose at which the arm rests for a second.
             told: whether to take the present pose; asked once a status.
             report: hears of each pose, a line.
+            writer: runs the writing of the file; default: a thread of its own.
 
         Raises:
             CollectionError: the file is there and is none of poses of this arm.
@@ -54,7 +56,7 @@ class Teacher:
         self._told, self._report = told, report
         self._detector = RestDetector(controller.arm.per_joint(*_REST), _REST_TIME)
         # The disk may take longer than the arm waits for a command.
-        self._writer = ThreadPoolExecutor(max_workers=1)
+        self._writer = writer or ThreadPoolExecutor(max_workers=1)
         self._writing: Future[None] | None = None
 
     def lead(self, status: lcmt_dvrk_status, time: float) -> None:

@@ -209,17 +209,17 @@ def test_unknown_frames_are_refused(arm):
         derive_gravity(arm, "craig")
 
 
-def test_derivation_takes_under_a_second_after_import():
-    """In a process of its own; beside a fixed piece of sympy work, so that a slow machine is no excuse."""
+def test_derivation_is_as_quick_as_a_known_expansion():
+    """A ratio of processor times in one new process: it depends neither on the machine nor on other processes."""
     code = (
         "import time, sympy\n"
         "from dvrk_drake.models.arm import load_arm\n"
         "from dvrk_drake.dynamics.symbolic_gravity import derive_gravity\n"
         "arm = load_arm('mtml')\n"
-        "t = time.perf_counter(); derive_gravity(arm); print(time.perf_counter() - t)\n"
-        "x = sympy.symbols('x:4'); t = time.perf_counter(); sympy.expand((sum(x) + 1) ** 14)\n"
-        "print(time.perf_counter() - t)"
+        "t = time.process_time(); derive_gravity(arm); print(time.process_time() - t)\n"
+        "x = sympy.symbols('x:4'); t = time.process_time(); sympy.expand((sum(x) + 1) ** 14)\n"
+        "print(time.process_time() - t)"
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     derivation, reference = map(float, output)
-    assert derivation < max(1.0, 20 * reference), (derivation, reference)
+    assert derivation < 3 * reference  # measured: about 1

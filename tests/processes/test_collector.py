@@ -1,8 +1,10 @@
 """Collecting poses without a network: friction cancels, and whatever happens on the way ends well."""
 
+import threading
+
 import numpy as np
 import pytest
-from sticky_arm import PERIOD, lead, make_collector, make_quick, near_poses, random_poses
+from sticky_arm import PERIOD, Disk, lead, make_collector, make_quick, near_poses, random_poses
 
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm import load_arm
@@ -125,6 +127,32 @@ def test_a_file_that_cannot_be_written_ends_it(tmp_path):
     collector.close()
     assert collector.finished and isinstance(collector.problem, RecordingError)
     assert not collector.done.any()
+
+
+def test_an_arm_is_held_at_its_pose_while_the_disk_is_slow(tmp_path):
+    disk = Disk(slow=True)
+    collector, controller, sticky = make_quick(tmp_path, writer=disk)
+    lead(collector, controller, sticky, 10.0, lambda: disk.waiting)
+    lead(collector, controller, sticky, 12.0)  # longer than the arm may take to settle
+    assert collector.problem is None and not collector.finished and not collector.done.any()
+    assert collector.describe() == "0 of 3 poses, writing pose 1"
+    np.testing.assert_allclose(sticky.q, near_poses()[0], atol=2e-3)
+    disk.finish()
+    disk.slow = False
+    lead(collector, controller, sticky, 10.0)
+    collector.close()
+    assert collector.problem is None and collector.done.all()
+
+
+def test_rows_are_written_by_another_thread(tmp_path):
+    """What Python's executor does with it; how long that takes is the disk's, so simulated time has no limit here."""
+    collector, controller, sticky = make_quick(tmp_path, writer=None)
+    written_by, append = [], collector._output.append
+    collector._output.append = lambda *row: (append(*row), written_by.append(threading.get_ident()))
+    lead(collector, controller, sticky, np.inf, collector.done.any)
+    collector.close()
+    assert threading.get_ident() not in written_by and len(written_by) == 1
+    assert len(read_recording(tmp_path / "o.csv")) == 1
 
 
 @pytest.mark.parametrize("seconds", [0.5, 61.0])

@@ -1,11 +1,11 @@
-"""Controlling, resetting and releasing an arm behind a guard, by the wall clock but without a network."""
+"""Controlling, resetting and releasing an arm behind a guard, on a simulated clock and without a network."""
 
 import itertools
-import time
 
 import numpy as np
 import pytest
 from guard_bench import ARM, LIMIT, SESSION, N, Q
+from patience import PATIENCE
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -21,21 +21,24 @@ from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
 
 
 class GuardedArm:
-    """In place of an ArmLink: an arm that stays where it is, and its guard, which is stepped when it is listened to."""
+    """Replaces an ArmLink: an arm that does not move, and its guard. A status comes every simulated millisecond."""
 
     def __init__(self):
-        self.arm, self.lost = ARM, 0
+        self.arm, self.lost, self.utime = ARM, 0, 10**9
         self.guard, self.commands, self.status = CommandGuard(ARM, SESSION), [], Status()
         self.before_step = lambda: None
         self.status.arm_name, self.status.num_joints = ARM.name, N
         self.status.position, self.status.velocity = list(Q), [0.0] * N
         self.status.effort_measured = self.status.effort_commanded = list(0.05 * LIMIT)
 
+    def now(self):
+        return 1e-6 * self.utime
+
     def next_status(self, seconds):
-        time.sleep(1e-3)
+        self.utime += 1000
         self.before_step()
         status = Status.decode(self.status.encode()) if self.status.session_id else self.status
-        status.utime, status.sequence = time.monotonic_ns() // 1000, self.status.sequence + 1
+        status.utime, status.sequence = self.utime, self.status.sequence + 1
         self.guard.step(status.utime, status.utime, status.position, status.velocity, status.effort_measured)
         fill_in_guard(status, self.guard)
         self.status = status
@@ -43,7 +46,7 @@ class GuardedArm:
 
     def send(self, command):
         self.commands.append(command)
-        self.guard.receive(command, time.monotonic_ns() // 1000)
+        self.guard.receive(command, self.utime)
 
     def restart(self):
         self.guard, self.status.sequence = CommandGuard(ARM, SESSION + 1), 0
@@ -77,10 +80,10 @@ def test_a_fault_is_said_then_cleared_and_a_controller_may_follow():
     assert (link.guard.state, link.guard.fault_code) == (Status.STATE_HOLD, Status.FAULT_NONE)
     assert {command.control_mode for command in link.commands} == {Command.HOLD}
     # Another sender is no second one any more, with the longest memory that a guard may have.
-    assert time.monotonic_ns() // 1000 - link.commands[-1].status_utime > 10**6
+    assert link.utime - link.commands[-1].status_utime > 10**6
     status, period = first_status(link)
     assert status.fault_code == Status.FAULT_NONE
-    assert 0.9e-3 < period < 0.02
+    assert period == pytest.approx(1e-3)
 
 
 def test_a_fault_whose_cause_lasts_is_an_error_and_no_fault_needs_no_reset():
@@ -144,16 +147,16 @@ def test_the_release_of_an_arm_that_faults_or_restarts_does_not_wait(controller,
     link = GuardedArm()
     action = link.restart if happens == "restart" else lambda: link.guard.report_fault("the amplifier is hot")
     link.before_step = after(2, action)  # the first status is that of the beginning
-    began = time.monotonic()
+    began = link.now()
     with pytest.raises(ControllerError, match=message):
         control(link, controller, lambda: True, lambda status: None)
-    assert time.monotonic() - began < 0.5
+    assert link.now() - began < 0.01
 
 
 def test_control_acts_tells_how_it_goes_and_releases(controller):
     link, told = GuardedArm(), []
-    end = time.monotonic() + 1.5
-    control(link, controller, lambda: time.monotonic() > end, told.append)
+    end = link.now() + 1.5
+    control(link, controller, lambda: link.now() > end, told.append)
     assert {status.state for status in told} >= {"starting", "effort"}
     assert "round trip" in str(told[-1]) and not told[-1].problem
     assert link.guard.state == Status.STATE_HOLD and link.commands[-1].control_mode == Command.HOLD
@@ -236,16 +239,16 @@ def test_statuses_of_the_past_are_not_heard_as_the_present(replays):
 
     for sequence in (100, 3, 101, 4):
         hear(sequence, SESSION)
-    assert link.next_status(0.1).sequence == (4 if replays else 101)
+    assert link.next_status(PATIENCE).sequence == (4 if replays else 101)
     assert link.lost == (97 if replays else 0)
     hear(4, SESSION)
     if replays:
-        assert link.next_status(0.1).sequence == 4
+        assert link.next_status(PATIENCE).sequence == 4
     else:
         with pytest.raises(ControllerError, match="no status of MTML"):
-            link.next_status(0.1)
+            link.next_status(0.01)
     hear(1, SESSION + 1)  # restarted: the controller is to know
-    assert link.next_status(0.1).session_id == SESSION + 1
+    assert link.next_status(PATIENCE).session_id == SESSION + 1
 
 
 def test_an_arm_that_lets_no_command_act_is_given_up_with_the_reason(controller, monkeypatch):

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -71,7 +72,7 @@ def test_realtime_is_real_time_and_locks_memory():
         "print(len(make_realtime()), os.sched_getscheduler(0) == os.SCHED_FIFO, "
         "'VmLck:\\t       0 kB' not in open('/proc/self/status').read())"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=True)
     if result.stdout.split()[0] != "0":
         pytest.skip("no permission for real-time scheduling, locked memory or cores that stay awake")
     assert result.stdout.split() == ["0", "True", "True"]
@@ -87,7 +88,11 @@ def test_a_network_without_a_route_is_an_error():
     code = "from dvrk_drake.processes.lcm_network import open_lcm; open_lcm()"
     try:
         done = subprocess.run(
-            ["unshare", "-rn", sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+            ["unshare", "-rn", sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=False,
         )
     except OSError:
         pytest.skip("no unshare here")

@@ -9,10 +9,14 @@ import tempfile
 from pathlib import Path
 
 import lcm_controller
+from patience import PATIENCE
 
 from dvrk_drake import cli
 
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
+
+#: The configuration of a driver that is seldom too strict for a busy computer.
+PATIENT_DRIVER = Path(__file__).with_name("patient_driver.yaml")
 
 FORKSERVER = multiprocessing.get_context("forkserver")
 FORKSERVER.set_forkserver_preload(["lcm_precompiled"])
@@ -30,23 +34,24 @@ class Forked:
     def send_signal(self, number):
         os.kill(self.process.pid, number)
 
-    def wait(self, seconds):
+    def wait(self):
         """The exit code."""
-        self.process.join(seconds)
-        assert self.process.exitcode is not None, f"runs on after {seconds} s: {self.said()}"
-        return self.process.exitcode
+        self.process.join(PATIENCE)
+        assert self.poll() is not None, f"does not end: {self.said()}"
+        return self.poll()
 
-    def is_running(self):
-        return self.process.exitcode is None
+    def poll(self):
+        """The exit code, or None while it runs."""
+        return self.process.exitcode
 
     def said(self):
         return Path(self.path).read_text()
 
     def end(self, number=signal.SIGKILL):
         """Ends it, and returns what it said."""
-        if self.is_running():
+        if self.poll() is None:
             self.send_signal(number)
-        self.wait(20)
+        self.wait()
         return self.said()
 
 
@@ -59,13 +64,14 @@ class CommandLine(Forked):
         self.process = subprocess.Popen(command, stdout=descriptor, stderr=descriptor)
         os.close(descriptor)
 
-    def wait(self, seconds):
-        return self.process.wait(seconds)
+    def wait(self):
+        return self.process.wait(PATIENCE)
 
-    def end(self, number=signal.SIGKILL):
-        self.send_signal(number)
-        self.wait(20)
-        return self.said()
+    def poll(self):
+        return self.process.poll()
+
+    def send_signal(self, number):
+        self.process.send_signal(number)
 
 
 def run_forked(main, arguments, path):

@@ -3,8 +3,10 @@
 python tests/support/formula_study.py study STUDY.yaml --output RESULTS.csv --workers 2
 """
 
+import os
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -12,10 +14,25 @@ import dvrk_drake.analysis.study.study as study_module
 from dvrk_drake.analysis.simulation.simulation import Simulation
 from dvrk_drake.models.recording import Recording
 
+#: Names a folder of tickets. Where it is set, each simulation waits for a file there, and takes it.
+TICKETS = "DVRK_DRAKE_TEST_TICKETS"
+
+
+def take_ticket(folder):
+    while True:
+        for ticket in Path(folder).iterdir():
+            try:
+                ticket.unlink()
+                return
+            except FileNotFoundError:  # another worker took it
+                continue
+        time.sleep(0.01)
+
 
 def simulate(scenario):
-    """A quarter of a second for a drift that seed, start and parameter error decide."""
-    time.sleep(0.25)
+    """A drift that seed, start and parameter error decide."""
+    if folder := os.environ.get(TICKETS):
+        take_ticket(folder)
     t = np.arange(0.0, scenario.duration + 1e-9, scenario.sample_period)
     rate = (1 + scenario.controller.parameter_error) * (scenario.seed % 1000) / 5e4
     q = np.array(scenario.start) + rate * t[:, None]

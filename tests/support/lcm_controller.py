@@ -1,8 +1,9 @@
 """A small controller process for tests: holds the pose at which it first hears of the arm, by efforts.
 
-    python lcm_controller.py ARM [--echo] [--clock-jump SECONDS]
+    python lcm_controller.py ARM [--echo] [--clock-jump SECONDS] [--lcm-url URL]
 
 With --echo it only answers with HOLD commands. Its clock jumps by those seconds at its 1000th command.
+It is scheduled as real-time where that is permitted.
 """
 
 import sys
@@ -13,16 +14,17 @@ import numpy as np
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.processes.pace import make_realtime
 from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
 
 
 class Controller:
-    def __init__(self, arm_name: str, echo: bool = False, clock_jump: float = 0.0) -> None:
+    def __init__(self, arm_name: str, echo: bool, clock_jump: float, url: str) -> None:
         self.arm, self.echo, self.clock_jump = load_arm(arm_name), echo, clock_jump
         self.kp, self.kd = np.array(self.arm.gains.kp), np.array(self.arm.gains.kd)
         self.sender_id, self.sequence = draw_id(), 0
         self.held = None
-        self.lcm = lcm.LCM()
+        self.lcm = lcm.LCM(url)
         self.lcm.subscribe(f"DVRK_STATUS_{self.arm.name}", self.answer)
 
     def answer(self, channel: str, data: bytes) -> None:
@@ -46,8 +48,13 @@ class Controller:
 
 
 def main(arguments: list[str]) -> None:
-    jump = arguments[arguments.index("--clock-jump") + 1] if "--clock-jump" in arguments else 0.0
-    controller = Controller(arguments[0], "--echo" in arguments, float(jump))
+    def option(name: str, default: str) -> str:
+        return arguments[arguments.index(name) + 1] if name in arguments else default
+
+    make_realtime()  # before LCM's reading thread is there
+    controller = Controller(
+        arguments[0], "--echo" in arguments, float(option("--clock-jump", "0")), option("--lcm-url", "")
+    )
     while True:
         controller.lcm.handle()
 

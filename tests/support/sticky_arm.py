@@ -1,5 +1,7 @@
 """An arm whose dry friction sticks, and a collector that leads it, without a network."""
 
+from concurrent.futures import Executor, Future
+
 import numpy as np
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -10,6 +12,31 @@ from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.collector import CollectionSettings, Collector
 
 PERIOD = 1e-3
+
+
+class Disk(Executor):
+    """Replaces the thread that writes, so that no test depends on a real disk.
+
+    It writes at once, or if it is `slow`, when `finish` is called.
+    """
+
+    def __init__(self, slow=False):
+        self.slow, self.waiting = slow, []
+
+    def submit(self, work, *arguments):
+        future = Future()
+        self.waiting.append((future, work, arguments))
+        if not self.slow:
+            self.finish()
+        return future
+
+    def finish(self):
+        while self.waiting:
+            future, work, arguments = self.waiting.pop(0)
+            try:
+                future.set_result(work(*arguments))
+            except Exception as error:
+                future.set_exception(error)
 
 
 def random_poses(arm, count, seed=0, margin=0.1):
@@ -55,11 +82,12 @@ def make_collector(path, poses, friction, both_sides=True, **options):
     controller = ArmController(arm, model, "hold", PERIOD)
     sticky = StickyArm(arm, model, friction, poses[0] * 0.9)
     output = CollectionFile(path, arm, both_sides)
-    return Collector(poses, controller, output, CollectionSettings(1.0, both_sides), **options), controller, sticky
+    settings = CollectionSettings(1.0, both_sides)
+    return Collector(poses, controller, output, settings, **{"writer": Disk()} | options), controller, sticky
 
 
 def lead(collector, controller, sticky, seconds, until=lambda: False):
-    end = sticky.ticks + round(seconds / PERIOD)
+    end = sticky.ticks + seconds / PERIOD
     while not (collector.finished or until()) and sticky.ticks < end:
         status, time = sticky.status(), PERIOD * sticky.ticks
         sticky.step(controller.answer(status, time, collector.lead(status, time)))

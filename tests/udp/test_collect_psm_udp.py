@@ -6,9 +6,8 @@ This file starts itself again inside a network namespace. Processes are forked f
 import signal
 
 import numpy as np
-from arm_observer import Observer
-from arm_processes import dvrk_drake
-from collecting import collect_until, holds
+from arm_observer import Observer, holds
+from arm_processes import PATIENT_DRIVER, dvrk_drake
 from own_network import inside, outside, run_inside
 
 from dvrk_drake.cli import main
@@ -21,8 +20,8 @@ POSES = 3
 
 
 @outside
-def test_in_a_network_of_its_own():
-    run_inside(__file__)
+def test_in_a_network_of_its_own(request):
+    run_inside(request)
 
 
 @inside
@@ -30,23 +29,19 @@ def test_a_collection_of_a_psm_from_both_sides_completes(tmp_path):
     arm, poses, output = load_arm("psm"), tmp_path / "poses.yaml", tmp_path / "poses.csv"
     assert main(["collect", "--arm", "psm", "--poses", str(poses), "--random", str(POSES), "--seed", "3"]) == 0
     observer = Observer("psm")
-    process = dvrk_drake("arm", "--arm", "psm", "--realtime")
+    process = dvrk_drake("arm", "--arm", "psm", "--realtime", "--driver", PATIENT_DRIVER)
     try:
-        observer.until(lambda status: True, 90, "first status")
+        observer.until(lambda status: True, "first status", process=process)
         command = ["collect", "--arm", "psm", "--poses", poses, "--output", output]
         command += ["--realtime", "--traverse-time", "2"]
-
-        def finished():
-            return output.exists() and output.read_bytes().count(b"\n") == 1 + POSES
-
-        collecting = collect_until(finished, command)
-        assert collecting.wait(60) == 0, collecting.said()
+        collecting = dvrk_drake(*command)
+        assert collecting.wait() == 0, collecting.said()
         assert f"{POSES} of {POSES} poses" in collecting.said()
-        observer.until(holds, 2, "hold")
+        observer.until(holds, "hold")
         assert observer.last.fault_code == 0
     finally:
         print(process.end(signal.SIGINT))
-    assert process.wait(0) == 0
+    assert process.wait() == 0
     recording = read_recording(output, arm)
     away = np.abs(recording.q - load_poses(poses, arm))
     print("measured at, from the pose:", away.max(axis=0))

@@ -5,12 +5,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import formula_study
 import pytest
+from patience import PATIENCE, wait_until
 
 import dvrk_drake.analysis.study.study as study_module
 from dvrk_drake.analysis.study.executors import dask_executor
@@ -28,7 +29,6 @@ measures: [{kind: held, time: 1}, {kind: drift, time: 0.5}, {kind: effort_share}
 """
 #: The command line with a formula in place of the simulation, which workers would compile for seconds.
 FORMULA = Path(formula_study.__file__)
-PATIENCE = 120.0  # s, for a crowded machine
 
 
 @pytest.fixture(scope="module")
@@ -66,12 +66,18 @@ def started():
         process.communicate()
 
 
-def wait_for(condition, process):
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+@pytest.fixture
+def sell(tmp_path, monkeypatch):
+    """Lets so many more simulations of the formula finish; without this fixture none waits."""
+    folder = tmp_path / "tickets"
+    folder.mkdir()
+    monkeypatch.setenv(formula_study.TICKETS, str(folder))
+
+    def sell(count):
+        for _ in range(count):
+            tempfile.mkstemp(dir=folder)
+
+    return sell
 
 
 def rows_in(path):
@@ -85,37 +91,37 @@ def children_of(process):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds workers in /proc")
-def test_a_killed_study_goes_on_and_a_killed_worker_costs_nothing(study, started, tmp_path, monkeypatch):
+def test_a_killed_study_goes_on_and_a_killed_worker_costs_nothing(study, started, sell, tmp_path, monkeypatch):
     monkeypatch.setattr(study_module, "simulate", formula_study.simulate)
     path = tmp_path / "killed.csv"
     command = [FORMULA, "study", study, "--output", path, "--workers", 2]
+    sell(3)
     first = started(*command)
-    wait_for(lambda: rows_in(path) >= 2, first)
+    wait_until(lambda: rows_in(path) == 3, "three rows", first)
     workers = children_of(first)
     first.kill()
     first.wait()
-    deadline = time.monotonic() + PATIENCE
-    while any(Path(f"/proc/{worker}").exists() for worker in workers):  # they do not outlive it
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    before = rows_in(path)
-    assert 2 <= before < 10
+    wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), "end of the workers")
+    assert rows_in(path) == 3
 
+    sell(1)
     second = started(*command)
-    wait_for(lambda: rows_in(path) > before, second)
+    wait_until(lambda: rows_in(path) == 4, "a fourth row", second)
     os.kill(children_of(second)[0], signal.SIGKILL)
+    sell(20)
     output, error = second.communicate(timeout=PATIENCE)
     assert (second.returncode, error) == (0, "")
     assert "nominal: 5 runs" in output
+    monkeypatch.delenv(formula_study.TICKETS)
     assert path.read_bytes() == undisturbed(study)
 
 
 def test_a_dask_cluster_that_loses_a_worker_gives_the_same(study, started, tmp_path):
-    pytest.importorskip("distributed", reason="needs the extra dask")
+    distributed = pytest.importorskip("distributed", reason="needs the extra dask")
     path, address = tmp_path / "dask.csv", tmp_path / "scheduler.json"
     options = ["--no-dashboard", "--scheduler-file", address]
     scheduler = started("-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 0, *options)
-    wait_for(lambda: address.exists() and address.stat().st_size, scheduler)
+    wait_until(lambda: address.exists() and address.stat().st_size, "the scheduler's address", scheduler)
     worker = ["-m", "distributed.cli.dask_worker", "--nthreads", 1, "--no-nanny", *options]
     workers = [started(*worker), started(*worker)]
 
@@ -123,20 +129,24 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same(study, started, tmp_p
         if done == 2:
             workers[0].kill()
 
-    with dask_executor(json.loads(address.read_text())["address"]) as executor:
+    url = json.loads(address.read_text())["address"]
+    with distributed.Client(url, timeout=PATIENCE, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=PATIENCE)
+    with dask_executor(url) as executor:
         run_study(load_study(study), executor, path, kill_one)
     assert workers[0].wait(PATIENCE) == -signal.SIGKILL
     assert path.read_bytes() == undisturbed(study)
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds workers in /proc")
-def test_ctrl_c_ends_in_one_line_and_leaves_no_worker(study, started, tmp_path):
+def test_ctrl_c_ends_in_one_line_and_leaves_no_worker(study, started, sell, tmp_path):
     path = tmp_path / "interrupted.csv"
+    sell(1)
     run = started(FORMULA, "study", study, "--output", path, "--workers", 2)
-    wait_for(lambda: rows_in(path) >= 1, run)
+    wait_until(lambda: rows_in(path) == 1, "a row", run)
     workers = children_of(run)
     run.send_signal(signal.SIGINT)
     _, error = run.communicate(timeout=PATIENCE)
     assert (run.returncode, error) == (130, "dvrk-drake: interrupted\n")
     assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
-    assert 1 <= rows_in(path) < 10
+    assert rows_in(path) == 1
