@@ -54,7 +54,7 @@ def start_logger(path):
 def by_utime(path):
     """{utime: measurements} of a recorded file, CSV or log."""
     if path.suffix == ".csv":
-        table = np.genfromtxt(path, delimiter=",", names=True)
+        table = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True))
         return {int(row["utime"]): [row[name] for name in COLUMNS] for row in table}
     messages = [Status.decode(event.data) for event in LcmLogReader(path) if event.channel == "DVRK_STATUS_MTML"]
     return {message.utime: list(measurements(message)) for message in messages}
