@@ -1,4 +1,4 @@
-"""Computed numbers are compared with a tolerance: their last bits depend on the CPU, as BLAS and numba do."""
+"""Tests compare computed numbers with a tolerance, because BLAS and numba round differently on each CPU."""
 
 import ast
 from pathlib import Path
@@ -6,14 +6,14 @@ from pathlib import Path
 TESTS = Path(__file__).parent
 #: Smallest absolute tolerance: 450 times the rounding of a number near 1.
 LEAST = 1e-13
-#: Methods and functions whose results are computed with BLAS or numba, and so are never compared exactly.
+#: Functions that compute with BLAS or numba. Tests never compare their results exactly.
 COMPUTED = {"column", "effect_effort", "effort", "holding_torque", "mass_matrix", "predict", "predict_motion"} | {
     *("pull_back_effort", "regressor", "torque"),
 }
 
 
 def calls(*names):
-    """Place and call of each function of these names in the tests."""
+    """Yields the place and the node of each call of these functions in the tests."""
     for path in sorted(TESTS.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and called(node) in names:
@@ -29,7 +29,7 @@ def argument(node, name):
 
 
 def test_every_comparison_states_an_absolute_tolerance():
-    """Relative ones alone fail where the number can be zero; `atol=0` says that it cannot."""
+    """A relative tolerance alone fails where a number can be zero. `atol=0` states that it cannot."""
     found = dict(calls("assert_allclose", "isclose", "allclose"))
     assert len(found) > 100
     assert not [place for place, node in found.items() if argument(node, "atol") is None]

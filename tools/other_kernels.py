@@ -2,7 +2,7 @@
 
     python tools/other_kernels.py make test-fast
 
-A CPU with AVX-512 takes the code of one without it, any other CPU the code of one without AVX.
+A CPU with AVX-512 runs the kernels of a CPU without it. Any other CPU runs the kernels of a CPU without AVX.
 """
 
 import os
@@ -11,7 +11,7 @@ import sys
 
 import numpy as np
 
-#: Prints what is used: numpy's features, numba's CPU, and each OpenBLAS ("Core: ..." with OPENBLAS_VERBOSE=2).
+#: Prints numpy's CPU features and numba's CPU; each OpenBLAS prints "Core: ..." with OPENBLAS_VERBOSE=2.
 REPORT = """
 import numpy as np, scipy.linalg
 from numba.core.registry import cpu_target
@@ -21,18 +21,18 @@ print("numba:", cpu_target.target_context.codegen().magic_tuple()[1])
 
 
 def other_kernels() -> dict[str, str]:
-    """Environment variables that choose them."""
+    """Returns the environment variables that select other kernels."""
     found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
     newest = [name for name in found if name == "X86_V4" or name.startswith("AVX512")]
     return {
         "OPENBLAS_CORETYPE": "Haswell" if newest else "Nehalem",
         "NPY_DISABLE_CPU_FEATURES": " ".join(newest or found),
-        "NUMBA_CPU_NAME": "generic",  # numba caches by this name, too
+        "NUMBA_CPU_NAME": "generic",  # part of the key of numba's cache
     }
 
 
 def used_kernels(variables: dict[str, str]) -> list[str]:
-    """Lines of `REPORT` in a process with these variables."""
+    """Returns the lines that `REPORT` prints in a process with these variables."""
     environment = os.environ | variables | {"OPENBLAS_VERBOSE": "2"}
     done = subprocess.run(
         [sys.executable, "-c", REPORT],
@@ -46,14 +46,14 @@ def used_kernels(variables: dict[str, str]) -> list[str]:
 
 
 def main() -> None:
-    """Check that the variables act, then become the command."""
+    """Checks that the variables take effect, then runs the command."""
     variables = other_kernels()
     used = used_kernels(variables)
     left = next(line for line in used if line.startswith("numpy:")).split()
     disabled = variables["NPY_DISABLE_CPU_FEATURES"].split()
     wanted = {f"Core: {variables['OPENBLAS_CORETYPE']}", f"numba: {variables['NUMBA_CPU_NAME']}"}
     if not wanted <= set(used) or set(disabled) & set(left):
-        sys.exit(f"other_kernels.py: the variables {variables} do not act; used are: {'; '.join(used)}")
+        sys.exit(f"other_kernels.py: the variables {variables} have no effect; in use: {'; '.join(used)}")
     print("kernels:", "; ".join(used), flush=True)
     os.execvpe(sys.argv[1], sys.argv[1:], os.environ | variables)
 

@@ -1,4 +1,4 @@
-"""Runs a check as a user without root's rights, so that what root may do is tested everywhere."""
+"""Runs a check without root's permissions, so that tests of permissions also run as root."""
 
 import os
 import tempfile
@@ -12,7 +12,7 @@ NOBODY = 65534
 
 @contextmanager
 def public_folder() -> Iterator[Path]:
-    """A temporary folder that every user may enter and write to, unlike pytest's own for root."""
+    """Yields a temporary folder that every user may use; `tmp_path` of root is closed to others."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         folder.chmod(0o777)
@@ -20,7 +20,7 @@ def public_folder() -> Iterator[Path]:
 
 
 def run_unprivileged(check: Callable[[], None]) -> None:
-    """Calls `check` in a forked process; root becomes nobody there. Fails where `check` fails."""
+    """Calls `check` in a forked process, where root becomes nobody. Fails if `check` fails."""
     pid = os.fork()
     if pid == 0:
         try:
