@@ -79,7 +79,7 @@ def test_the_written_arm_moves_by_the_parameters_it_was_given(name, tmp_path):
     assert np.abs((expected - regressor.torque(*motion, regressor.values)) / scale).max() > 0.05
     for before, after in zip(links, link_inertias(written), strict=True):
         assert before.link == after.link
-        np.testing.assert_allclose(after.parameters, before.parameters, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(after.parameters, before.parameters, rtol=0, atol=1e-13)
 
 
 def parse(path):
@@ -135,7 +135,7 @@ def test_urdf_has_the_equations_of_motion_of_the_sdf(name, tmp_path):
     for i, joint_name in enumerate(arm.joint_names):
         joint = urdf_plant.GetJointByName(joint_name)
         assert (joint.position_lower_limits()[0], joint.position_upper_limits()[0]) == pytest.approx(
-            (arm.position_lower[i], arm.position_upper[i]), abs=1e-15
+            (arm.position_lower[i], arm.position_upper[i]), abs=1e-12
         )
         assert urdf_plant.GetJointActuatorByName(joint_name).effort_limit() == arm.effort_limits[i]
     root = compose_sdf(arm.sdf, arm.mirrored_links)
@@ -178,7 +178,7 @@ def test_only_what_changed_is_written_anew(tmp_path):
     changed = [line for line in lines if line[:1] in "+-" and line[:3] not in ("+++", "---")]
     before = next(link for link in links if link.link == "forearm_link").parameters[0]
     assert f"-        <mass>{before:g}</mass>" in changed and f"+        <mass>{2 * before:g}</mass>" in changed
-    assert all("mass" in line or "i" in line for line in changed) and len(changed) <= 18
+    assert all(re.match(r"[-+] +</?(mass|inertia|i[xyz]{2})>", line) for line in changed) and len(changed) <= 18
 
 
 def test_meshes_that_cannot_be_copied_are_one_line_and_no_model(tmp_path, capsys):
@@ -210,7 +210,7 @@ def test_an_arm_file_can_name_the_written_sdf(name, tmp_path, capsys):
     assert main(["export", str(tmp_path / "arm.yaml"), "--sdf", str(tmp_path / "again.sdf")]) == 0
     assert "All links are as in the arm's own SDF" in capsys.readouterr().out
     assert own.joint_names == arm.joint_names and own.sdf == (str(tmp_path / "identified.sdf"),)
-    np.testing.assert_array_equal(own.transmission.matrix, arm.transmission.matrix)
+    np.testing.assert_allclose(own.transmission.matrix, arm.transmission.matrix, rtol=0, atol=1e-12)
     np.testing.assert_allclose(derive_gravity(own).base_values, 1.1 * derive_gravity(arm).base_values, atol=1e-12)
 
 

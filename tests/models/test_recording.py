@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from recordings import HEADER, Q_NAMES, ROW, SIX, TAU_NAMES, random_recording, six_joint_arm, write_text
+from unprivileged import public_folder, run_unprivileged
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.recording import read_recording
@@ -133,12 +133,16 @@ def test_files_that_are_none(tmp_path):
         read_recording(tmp_path)
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-def test_a_file_that_may_not_be_read(tmp_path):
-    path = write_text(tmp_path, HEADER)
-    path.chmod(0)
-    with pytest.raises(RecordingError, match=r"cannot be read: Permission denied"):
-        read_recording(path)
+def test_a_file_that_may_not_be_read():
+    with public_folder() as folder:
+        path = write_text(folder, HEADER)
+        path.chmod(0)
+
+        def check():
+            with pytest.raises(RecordingError, match=r"cannot be read: Permission denied"):
+                read_recording(path)
+
+        run_unprivileged(check)
 
 
 def test_unknown_coordinates(tmp_path):

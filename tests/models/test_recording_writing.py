@@ -9,6 +9,7 @@ import stat
 import numpy as np
 import pytest
 from recordings import random_recording, write_text
+from unprivileged import public_folder, run_unprivileged
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.atomic_file import atomic_write
@@ -77,13 +78,17 @@ def test_other_errors_of_the_caller_stay_what_they_are(tmp_path):
         (tmp_path / "absent").read_text()
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everything")
-def test_a_read_only_file_is_not_replaced(tmp_path):
-    path = write_text(tmp_path, "old")
-    path.chmod(0o444)
-    with pytest.raises(DvrkDrakeError, match="cannot be written: it is read-only"), atomic_write(path):
-        pass
-    assert path.read_text() == "old"
+def test_a_read_only_file_is_not_replaced():
+    with public_folder() as folder:
+        path = write_text(folder, "old")
+        path.chmod(0o444)
+
+        def check():
+            with pytest.raises(DvrkDrakeError, match="cannot be written: it is read-only"), atomic_write(path):
+                pass
+
+        run_unprivileged(check)
+        assert path.read_text() == "old"
 
 
 def test_links_and_permissions_survive(tmp_path):

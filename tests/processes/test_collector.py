@@ -36,7 +36,7 @@ def test_both_sides_cancel_dry_friction_and_one_does_not(tmp_path):
     assert np.sqrt(np.mean(one_sided**2)) > 0.5
     table = np.genfromtxt(tmp_path / "both.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
     friction = np.array([table[f"friction{j + 1}"] for j in range(7)])
-    np.testing.assert_allclose(friction, FRICTION, rtol=0.01)
+    np.testing.assert_allclose(friction, FRICTION, rtol=0.01, atol=0)
 
 
 def test_a_stop_on_the_way_brakes_and_the_rest_is_done_next_time(tmp_path):

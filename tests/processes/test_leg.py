@@ -27,7 +27,7 @@ def test_no_joint_is_faster_than_it_may_be_or_leaves_the_limits(name):
         if leg.duration > 0.3:  # and none is slower than it need be
             assert np.max(np.abs(v) / speed) > 0.99
         assert not any(arm.limit_violations(pose, 1e-9) for pose in q)
-        np.testing.assert_array_equal(q[0], start)
+        np.testing.assert_allclose(q[0], start, atol=1e-12)
         np.testing.assert_allclose(q[-1], end, atol=1e-12)
         assert np.abs(v[[0, -1]]).max() < 1e-12
 
@@ -58,7 +58,7 @@ def test_approaches_begin_inside_the_limits(name):
             assert not arm.limit_violations(point, 1e-9)
             assert np.all(side * (point - pose) >= 0)
     middle = random_poses(arm, 1, margin=0.3)[0]
-    np.testing.assert_allclose(beside(arm, middle, offset), middle + offset)
+    np.testing.assert_allclose(beside(arm, middle, offset), middle + offset, atol=1e-12)
 
 
 def test_rest_is_all_joints_near_one_pose_for_a_while():

@@ -199,7 +199,8 @@ def test_unconnected_inputs_mean_a_limp_arm():
     q = POSES[2]
     unconnected = acceleration_of(ArmStation(ARM), q, {})
     zero = {"mtml.effort_commanded": np.zeros(N), "mtml.effort_disturbance": np.zeros(N)}
-    np.testing.assert_array_equal(unconnected, acceleration_of(ArmStation(ARM), q, zero))
+    limp = acceleration_of(ArmStation(ARM), q, zero)
+    np.testing.assert_allclose(unconnected, limp, rtol=0, atol=1e-9 * np.abs(limp).max())
     station = ArmStation(ARM)
     context = station.CreateDefaultContext()
     np.testing.assert_array_equal(station.GetOutputPort("mtml.effort_measured").Eval(context), np.zeros(N))
@@ -226,8 +227,8 @@ def test_set_positions_closes_the_linkage_and_rests():
     station = ArmStation(ARM, closure="ball")
     context = station.CreateDefaultContext()
     station.set_positions(context, POSES[4])
-    assert loop_gap(station, context) < 1e-15
-    assert linkage_error(station, context) < 1e-15
+    assert loop_gap(station, context) < 1e-12
+    assert linkage_error(station, context) < 1e-12
     assert not np.any(station.GetOutputPort("mtml.velocity_estimated").Eval(context))
 
 

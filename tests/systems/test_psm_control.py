@@ -74,6 +74,7 @@ def step_poses():
 
 
 def check_steps(bench, poses, largest_overshoot):
+    assert len(poses) > 0
     for q0 in poses:
         for j, name in enumerate(ARM.joint_names):
             step = STEP[j] if q0[j] < (ARM.position_lower[j] + ARM.position_upper[j]) / 2 else -STEP[j]

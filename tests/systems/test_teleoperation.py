@@ -78,10 +78,10 @@ def test_no_joint_is_commanded_faster_than_its_limit_whatever_the_master_does():
             jaw_angle=generator.uniform(-2, 2),
         )
         fastest = np.maximum(fastest, np.abs(q - before) / PERIOD)
-        assert np.all(np.abs(v) <= SPEED)
+        assert np.all(np.abs(v) <= SPEED * (1 + 1e-9))
         before = q
     assert np.all(fastest <= SPEED * (1 + 1e-9))
-    np.testing.assert_allclose(fastest[[0, 2, 3, 6]], SPEED[[0, 2, 3, 6]])
+    np.testing.assert_allclose(fastest[[0, 2, 3, 6]], SPEED[[0, 2, 3, 6]], atol=1e-9)
 
 
 @pytest.mark.parametrize("turn", [np.array([0, 0, 0, 0, 0, 0, 6.0]), np.array([0.8, 0.5, -0.7, 0, 1.5, 0.6, 0])])
@@ -94,7 +94,7 @@ def test_limits_are_kept_and_the_tip_comes_back_with_the_master(turn):
     way = np.vstack([away, back])
     assert np.all(way >= PSM.position_lower - 1e-12)
     assert np.all(way <= PSM.position_upper + 1e-12)
-    touched = np.isclose(away, PSM.position_upper) | np.isclose(away, PSM.position_lower)
+    touched = np.isclose(away, PSM.position_upper, atol=1e-9) | np.isclose(away, PSM.position_lower, atol=1e-9)
     assert touched.any()
     # The pose of the tip: a roll may be another turn.
     np.testing.assert_allclose(tip(back[-1]).GetAsMatrix4(), tip(q_start).GetAsMatrix4(), atol=1e-9)

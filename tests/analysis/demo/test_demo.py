@@ -7,6 +7,7 @@ from dvrk_drake.analysis.collection import visiting_trajectory
 from dvrk_drake.analysis.demo import demo
 from dvrk_drake.analysis.demo.true_arm import make_true_arm
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.models.recording import read_recording
@@ -69,6 +70,7 @@ def test_true_arm_is_possible_and_differs():
     arm = load_arm("mtml")
     true_arm = make_true_arm(arm, np.random.default_rng(3))
     plant = make_arm_plant(arm)
+    assert set(true_arm.inertias) == {link.link for link in link_inertias(arm)}
     for name, M in true_arm.inertias.items():
         assert M.IsPhysicallyValid(), name
         assert M.get_mass() != plant.GetBodyByName(name).default_mass()

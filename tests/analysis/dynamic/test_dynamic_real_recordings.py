@@ -80,7 +80,7 @@ def test_the_fit_is_what_validation_finds(case):
     validation = validate_motion(model, recording)
     # The tilt enters the fit to first order, and effects of no weight are left out of the model.
     fitted = percent(model, "rms_fit")
-    np.testing.assert_allclose([100 * a.relative_error for a in validation.actuators], fitted, rtol=0.02)
+    np.testing.assert_allclose([100 * a.relative_error for a in validation.actuators], fitted, rtol=0.02, atol=0)
 
 
 def test_the_verbs_take_a_real_motion(case, tmp_path):

@@ -89,7 +89,7 @@ def test_of_a_loaded_file_too_and_what_contradicts_itself_is_refused(case, tmp_p
     model.save(tmp_path / "model.yaml")
     q = arm.sample_poses(20, np.random.default_rng(1))
     loaded = IdentifiedModel.load(tmp_path / "model.yaml")
-    np.testing.assert_array_equal(loaded.holding_torque(q), model.holding_torque(q))
+    np.testing.assert_allclose(loaded.holding_torque(q), model.holding_torque(q), atol=1e-12)
     assert all(e.value != 0 and e.standard_error > 0 for e in model.holding_effects)
     with pytest.raises(ModelError, match="has effects only there"):
         dataclasses.replace(model, effects=model.holding_effects[:1]).check()
@@ -117,7 +117,7 @@ def test_no_effect_runs_away_outside_of_what_was_recorded():
         assert np.abs(ActuatorEffect("joint.yaw", kind, 0.7).column(x, 0 * x)).max() <= 1.0
     inside = np.abs(x) <= 0.7
     spring = ActuatorEffect("joint.yaw", "spring", 0.7).column(x, 0 * x)
-    np.testing.assert_array_equal(spring[inside], x[inside])
+    np.testing.assert_allclose(spring[inside], x[inside], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])

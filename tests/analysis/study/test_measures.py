@@ -60,7 +60,7 @@ def test_only_the_joints_that_are_named_count():
     run = released(wrist_roll=0.1 * T, wrist_yaw=0.001 * T)
     assert Measure("drift_rate")(*run) == pytest.approx(0.1)
     assert Measure("drift_rate", joints=["wrist_yaw"])(*run) == pytest.approx(0.001)
-    assert Measure("drift_rate", joints=["elbow_pitch"])(*run) == pytest.approx(0.0, abs=1e-15)
+    assert Measure("drift_rate", joints=["elbow_pitch"])(*run) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_what_a_hand_does_before_it_lets_go_does_not_count():
@@ -101,12 +101,13 @@ def test_arriving_early_is_settled_at_once_and_not_overshot():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_worst_is_no_better_than_any_run(kind):
+def test_a_run_that_failed_counts_as_the_worst(kind):
     scenario, simulation = stepped(0.4 * np.clip(T / 2, 0, 1))
     measure = Measure(kind)
     measure.check(scenario)
     assert measure.is_answer == isinstance(measure(scenario, simulation), bool)
-    assert measure.worst in (math.inf, kind == "ran_away")
+    worst = measure.worst
+    assert worst is {"held": False, "ran_away": True}[kind] if measure.is_answer else worst == math.inf
 
 
 @pytest.mark.parametrize(

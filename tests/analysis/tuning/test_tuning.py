@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from dvrk_drake.analysis.simulation.scenario_file import load_scenario
 from dvrk_drake.analysis.study.executors import local_executor
 from dvrk_drake.analysis.tuning.bench import Bench, Response
-from dvrk_drake.analysis.tuning.comparison import CONDITIONS, DURATION, REST, measure_step
+from dvrk_drake.analysis.tuning.comparison import CONDITIONS, DURATION, REST, Comparison, StepMeasures, measure_step
 from dvrk_drake.analysis.tuning.joint_on_bench import JointOnBench
 from dvrk_drake.analysis.tuning.model_based import (
     GAIN_MARGIN,
@@ -253,18 +253,35 @@ def test_measures_of_a_known_step():
     q[:, 1] = goal[1] * (1 - np.exp(-w * t) * (np.cos(3 * w * t) + np.sin(3 * w * t) / 3))  # no speed at first
     q[:, 2] = 0.5 * goal[2]
     q[:, 3] = goal[3] * (1 + 0.1 * np.sin(50 * t)) - goal[3] * (t == 0)
-    measured = measure_step(arm, Response(t, q, q, np.zeros((len(t), n)), goal))
+    effort = np.zeros((len(t), n))
+    effort[:, 4] = 0.1 * arm.effort_limits[4] * np.sin(50 * t)
+    effort[t < DURATION - REST, 5] = arm.effort_limits[5]  # the motor works on the way and rests at the end
+    measured = measure_step(arm, Response(t, q, q, effort, goal))
     assert measured.settling[0] == pytest.approx(np.log(goal[0] / band(arm)[0]) / w, abs=2e-3)
     assert measured.overshoot[0] == 0.0
-    assert measured.overshoot[1] == pytest.approx(
-        np.exp(-np.arctan2(3, 1) / 3 - np.pi / 3) * 0 + np.max(q[:, 1]) / goal[1] - 1
-    )
+    # Its speed is 10/3 w exp(-w t) sin(3 w t): the first and largest peak is at 3 w t = pi.
+    assert measured.overshoot[1] == pytest.approx(np.exp(-np.pi / 3), rel=1e-3)
     assert np.isinf(measured.settling[2])
     assert measured.steady_error[2] == pytest.approx(0.5 * goal[2])
     assert np.isinf(measured.settling[3])  # it comes into the band again and again and never stays
     assert measured.overshoot[3] == pytest.approx(0.1, rel=1e-2)
-    assert np.all(measured.unrest == 0)
-    assert REST < DURATION
+    np.testing.assert_allclose(measured.unrest, [0, 0, 0, 0, 0.2, 0, 0], rtol=1e-2, atol=1e-12)
+
+
+def test_best_gains_settle_most_often_and_then_fastest():
+    arm = load_arm("psm")
+    never, rest = np.full(7, np.inf), np.zeros(7)
+    settling = {
+        "fails": np.r_[np.inf, np.full(6, 0.1)],
+        "slow": np.full(7, 0.9),
+        "fast": np.full(7, 0.8),
+        "never": never,
+    }
+    measures = {name: [[StepMeasures(times, rest, rest, rest)]] for name, times in settling.items()}
+    comparison = Comparison(arm, {}, CONDITIONS[:1], np.zeros((1, 7)), measures, {})
+    assert comparison.best(settling) == "fast"
+    assert comparison.best(["never", "fails", "slow"]) == "slow"
+    assert comparison.best(["never", "fails"]) == "fails"
 
 
 def test_published_gains_are_per_second_and_of_an_mtm():
@@ -372,7 +389,6 @@ def test_the_designed_gains_settle_every_joint_of_a_psm(tmp_path, monkeypatch):
     settling = tuning.comparison.table("model", "settling")
     assert np.all(np.isfinite(settling))
     assert tuning.found == {"model": tuning.design.gains}
-    assert tuning.comparison.best(["model"]) == "model"
     console = Console(record=True, width=120, file=io.StringIO())
     print_tuning(console, tuning)
     said = console.export_text()

@@ -11,10 +11,10 @@ from dvrk_drake.models.arm import load_arm
 
 def test_efforts_are_clamped_and_limited_in_rate_from_the_measured_one():
     bench = Bench().started()
-    np.testing.assert_allclose(bench.output.effort, 0.05 * LIMIT)
+    np.testing.assert_allclose(bench.output.effort, 0.05 * LIMIT, atol=1e-12)
     for k in range(1, 30):
         output = bench.run(Command.EFFORT, 1, effort=list(10 * LIMIT))
-        np.testing.assert_allclose(output.effort, np.minimum(0.05 + 0.05 * k, 1.0) * LIMIT, rtol=1e-12)
+        np.testing.assert_allclose(output.effort, np.minimum(0.05 + 0.05 * k, 1.0) * LIMIT, rtol=0, atol=1e-12)
         assert np.all(output.joint_flags & Status.FLAG_EFFORT_CLAMPED)
         assert k == 19 or np.all((output.joint_flags & Status.FLAG_RATE_LIMITED != 0) == (k < 19))  # 19: by rounding
 
@@ -43,7 +43,7 @@ def test_a_soft_wall_turns_outward_effort_inward_before_each_limit(row, side):
         return limits.restrain_effort(command, q, rate * side * a)
 
     effort, flags = settled(-0.01)
-    np.testing.assert_allclose(effort, command)
+    np.testing.assert_allclose(effort, command, atol=1e-12)
     assert not np.any(flags[joints] & (Status.FLAG_POSITION_LIMIT | Status.FLAG_COUPLED_LIMIT))
     effort, flags = settled(0.25)
     assert np.all(effort[joints] * command[joints] < LIMIT[joints] ** 2)
@@ -51,14 +51,14 @@ def test_a_soft_wall_turns_outward_effort_inward_before_each_limit(row, side):
     effort, _ = settled(0.5)
     assert np.all(effort[joints] * np.sign(command[joints]) <= 1e-12)  # nothing outward is left
     effort, _ = settled(1.0)
-    np.testing.assert_allclose(effort, -command)
+    np.testing.assert_allclose(effort, -command, atol=1e-12)
     # One width before the wall, but there within Kd/Kp at this speed.
     seconds = max(np.divide(ARM.gains.kd, ARM.gains.kp)[joints])
     effort, _ = settled(-1.0, 2 * limits.wall_width[row] / (seconds * (a @ a)))
-    np.testing.assert_allclose(effort, -command)
+    np.testing.assert_allclose(effort, -command, atol=1e-12)
     # It never pulls: on the way out it lets go.
     effort, _ = settled(0.5, -0.6 * limits.wall_width[row] / (seconds * (a @ a)))
-    np.testing.assert_allclose(effort, command)
+    np.testing.assert_allclose(effort, command, atol=1e-12)
 
 
 def test_positions_move_at_their_rate_and_stop_at_the_limits():
@@ -75,7 +75,7 @@ def test_positions_move_at_their_rate_and_stop_at_the_limits():
             assert np.all((A @ output.position <= upper + 1e-9) & (A @ output.position >= lower - 1e-9))
             last = output.position
         free = [0, 3, 4, 5, 6]
-        np.testing.assert_allclose(last[free], (upper if sign > 0 else lower)[:N][free])
+        np.testing.assert_allclose(last[free], (upper if sign > 0 else lower)[:N][free], atol=1e-12)
         assert last[1] + last[2] == pytest.approx((upper if sign > 0 else lower)[N])
         assert not np.any(output.velocity)
 
@@ -107,4 +107,4 @@ def test_other_arms(name):
     bench = Bench(arm)
     bench.started(Command.EFFORT)
     output = bench.run(Command.EFFORT, 50, effort=list(100 * arm.effort_limits))
-    np.testing.assert_allclose(output.effort, arm.effort_limits)
+    np.testing.assert_allclose(output.effort, arm.effort_limits, atol=1e-12)

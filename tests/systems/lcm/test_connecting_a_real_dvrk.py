@@ -127,12 +127,12 @@ def test_efforts_act_after_the_start_guard_and_a_dead_controller_is_followed_by_
     assert scene.topics(0, 250) == {"servo_jp"}
     assert scene.topics(260, 445) == {"servo_jf"}
     assert scene.topics(455, 500) == {"servo_jp"}
-    np.testing.assert_allclose(scene.crtk.told[400][1], HELD)
+    np.testing.assert_allclose(scene.crtk.told[400][1], HELD, atol=1e-12)
     assert scene.crtk.told[500:] == [("hold", None)]
     assert [s.sequence for s in scene.statuses] == list(range(1, 501))
     assert {s.session_id for s in scene.statuses} == {scene.statuses[0].session_id} != {0}
     assert scene.statuses[-1].num_expired == 1
-    np.testing.assert_allclose(scene.statuses[400].effort_commanded, HELD)
+    np.testing.assert_allclose(scene.statuses[400].effort_commanded, HELD, atol=1e-12)
 
 
 def test_a_measurement_that_stops_ends_efforts():

@@ -78,7 +78,7 @@ def test_a_cables_effort_is_minus_what_identification_calls_the_effect():
     run = Run(arm, ArmEffects(cables=[sine], springs=[offset]), q)
     force = run.station.GetSubsystemByName("drive_force")
     effort = force.get_output_port().Eval(force.GetMyContextFromRoot(run.context))[run.station._joints.index]
-    np.testing.assert_allclose(effort, [0, -0.1, -0.1, 0, -0.2 * np.sin(0.5), 0, 0], atol=1e-16)
+    np.testing.assert_allclose(effort, [0, -0.1, -0.1, 0, -0.2 * np.sin(0.5), 0, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])

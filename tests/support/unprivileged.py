@@ -1,0 +1,36 @@
+"""Runs a check without root's permissions, so that tests of permissions also run as root."""
+
+import os
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+NOBODY = 65534
+
+
+@contextmanager
+def public_folder() -> Iterator[Path]:
+    """Yields a temporary folder that every user may use; `tmp_path` of root is closed to others."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o777)
+        yield folder
+
+
+def run_unprivileged(check: Callable[[], None]) -> None:
+    """Calls `check` in a forked process, where root becomes nobody. Fails if `check` fails."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            if os.geteuid() == 0:
+                os.setgroups([])
+                os.setgid(NOBODY)
+                os.setuid(NOBODY)
+            check()
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
