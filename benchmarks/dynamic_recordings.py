@@ -8,8 +8,10 @@ them (docs/public_recordings.md) or in the actuators' coordinates with `--coordi
 Errors are |tau - tau_hat| / |tau| of the actuators, both behind a zero-phase Butterworth low-pass of order 6 (5.65 Hz
 for the MTM, 16.96 Hz for the PSM), without the ends. "Published" are those of Wang et al., "A Convex Optimization-based
 Dynamic Model Identification Package for the da Vinci Research Kit", RA-L 2019: fitted to the same motion, and on a
-second one that is not in FOLDER. Ours are of the fit, of phases that are predicted from the other phases, and the
-repeatability of the motion itself, below which no function of q, v and vd can be on all of its periods.
+second one. Ours are of the fit, of phases that are predicted from the other phases, and of other recordings, those that
+FOLDER holds of mtm_two.csv and psm_two.csv (other motions) and psm_one_no_weight.csv (another day), before and after
+friction is refitted to the other half of its phases. The repeatability of the motion itself is what no function of q, v
+and vd can be below on all of its periods.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from rich.table import Table
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.recalibration.recalibration import predict_other_phases
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
 from dvrk_drake.models.arm import Arm, load_arm
@@ -44,7 +47,10 @@ def main() -> None:
     parser.add_argument("--coordinates", choices=("joint", "actuator"), default="joint")
     parser.add_argument("--poses", type=int, default=2000, help="random poses at which M(q) is looked at")
     options = parser.parse_args()
-    for name, file, others in (("mtmr", "mtm_one.csv", []), ("psm", "psm_one.csv", ["psm_one_no_weight.csv"])):
+    for name, file, others in (
+        ("mtmr", "mtm_one.csv", ["mtm_two.csv"]),
+        ("psm", "psm_one.csv", ["psm_two.csv", "psm_one_no_weight.csv"]),
+    ):
         arm = load_arm(name)
 
         def read(file: str, arm: Arm = arm) -> Recording:
@@ -68,8 +74,10 @@ def main() -> None:
         }
         for other in others:
             if (options.folder / other).is_file():
-                errors = validate_motion(model, read(other)).actuators
+                recording = read(other)
+                errors = validate_motion(model, recording).actuators
                 rows[f"ours on {other}"] = [100 * (e.relative_error or 0.0) for e in errors]
+                rows[f"{other}, friction from other phases"] = 100 * predict_other_phases(model, recording, 2)[1]
         print_table(f"{arm.name}: error of the actuators' effort [%]", arm, rows)
         box = (arm.position_lower, arm.position_upper)
         q = np.random.default_rng(0).uniform(*box, (options.poses, arm.num_joints))

@@ -1,4 +1,5 @@
-"""The known weights of the public PSM recordings as `payload` finds them, and how short a recalibration may be.
+"""The known weights of the public PSM recordings as `payload` finds them, and what a recalibration gains: how short it
+may be, and on the same phases of a motion or on others.
 
     python benchmarks/payload_recordings.py FOLDER
 
@@ -19,7 +20,7 @@ from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.payload.payload import Payload, estimate_payload
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
-from dvrk_drake.analysis.recalibration.recalibration import recalibrate
+from dvrk_drake.analysis.recalibration.recalibration import predict_other_phases, recalibrate
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -58,6 +59,7 @@ def main() -> int:
             name = f"{other} with {1000 * mass:.0f} g added to its efforts"
             _print_payload(arm, loaded, reference, name, payload, mass, np.array(place))
     _print_seconds(models["psm_one"], read("psm_one_no_weight"))
+    _print_phases(models["psm_one"], read("psm_one_no_weight"))
     return 0
 
 
@@ -107,6 +109,23 @@ def _print_seconds(model: IdentifiedModel, whole: Recording) -> None:
         result = recalibrate(model, _rows(whole, slice(0, int(np.searchsorted(whole.t, seconds)))))
         left = [a.name for a in result.actuators if not a.kept]
         print(f"{seconds:5.1f} s   {percent(result.model)}   left alone: {', '.join(left) or 'none'}")
+
+
+def _print_phases(model: IdentifiedModel, whole: Recording) -> None:
+    """Errors with friction refitted to the same phases at another time, and to the other half of the phases."""
+    first, second = (_rows(whole, rows) for rows in (slice(0, len(whole) // 2), slice(len(whole) // 2, None)))
+
+    def errors(which: IdentifiedModel) -> list[float]:
+        return [a.relative_error or 0.0 for a in validate_motion(which, second).actuators]
+
+    before, after = predict_other_phases(model, whole, 2)
+    for name, values in (
+        ("same phases, second half of the time: before", errors(model)),
+        ("same phases, refitted to the first half of the time", errors(recalibrate(model, first).model)),
+        ("other phases: before", list(before)),
+        ("other phases, each half refitted to the other half", list(after)),
+    ):
+        print(f"{name:52}", "  ".join(f"{100 * x:5.1f}" for x in (*values, np.mean(values))))
 
 
 def _rows(recording: Recording, rows: slice) -> Recording:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import replace
 
 from dvrk_drake.cli.dynamics import identify_motion, refuse_unusable, validate_in_motion
@@ -105,6 +106,14 @@ def _identify(options: argparse.Namespace) -> None:
         )
     result.model.save(options.output)
     console.print(f"model: {options.output}")
+    commanded = [joint.name for joint in result.model.joints if joint.trust > 0]
+    if measured is not None and commanded:
+        print(
+            f"dvrk-drake: warning: {options.recording}: friction in low-speed segments can look like gravity, also in "
+            f"the ten-fold error; the torque on {', '.join(commanded)} may be worse than zero torque elsewhere: "
+            "validate the model on static poses before it commands an arm",
+            file=sys.stderr,
+        )
     if plots is not None:
         plot_identification(plots, result)
         console.print(f"plots: {options.plots}")

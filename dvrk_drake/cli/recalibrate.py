@@ -10,7 +10,12 @@ from dvrk_drake.cli.support import add_recording, check_output, print_notes
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
     """Adds the verb and its options."""
-    verb = verbs.add_parser("recalibrate", help="refit a model's friction and offsets to a short motion of another day")
+    verb = verbs.add_parser(
+        "recalibrate",
+        help="refit a model's friction and offsets to a short motion of another day",
+        description="Refit a model's friction and offsets to a short motion of another day. The gain is for motions "
+        "like that one; at other positions and speeds it can be much smaller (docs/payload.md).",
+    )
     verb.add_argument("model", metavar="MODEL.yaml", help="a model that was identified from a motion")
     add_recording(verb)
     verb.add_argument("--output", required=True, metavar="NEW.yaml", help="the model file to write")

@@ -1,10 +1,14 @@
 """A left arm's wrist mirrors a right arm's: in the equations, in files of real arms, in what is written."""
 
+import dataclasses
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
 
+from dvrk_drake.analysis.reproduction.recordings import PAPER_ARM
+from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.analysis.static.validation import validate
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.gravity_compensation import CompensationOptions, compensation_from_model, controller_torque
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -13,6 +17,7 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.mirrored_links import mirror_links
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
+from dvrk_drake.models.recording import read_recording
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 
 #: Mirrored in the plane x = 0, an arm has these joint angles in place of its own, and these torques.
@@ -48,6 +53,19 @@ def test_the_wrists_brackets_are_on_the_sides_that_files_of_real_arms_say(shared
     for name, serial in (("mtml", "MTML-22723"), ("mtml", "MTML-34863"), ("mtmr", "MTMR-32336")):
         file = GravityCompensationFile.load(folder / f"gc-{serial}.json")
         assert np.sign(p6(name)) == np.sign((file.positive + file.negative)[P6])
+
+
+@pytest.mark.slow
+def test_the_papers_recording_is_of_a_right_arm(shared_data):
+    """A model of another right arm predicts it better as it is than as its mirror image."""
+    model = identify_static(
+        read_recording(shared_data / "mtm_static/mtmr_2017_coupled12_may10.csv"), load_arm(PAPER_ARM)
+    ).model
+    poses = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
+    mirrored = dataclasses.replace(poses, q=MIRROR * poses.q, tau=MIRROR * poses.measured_effort())
+    right, left = (validate(model, recording).joints[1:4] for recording in (poses, mirrored))
+    for as_it_is, as_mirrored in zip(right, left, strict=True):
+        assert as_it_is.rms_error_undoubted < 0.5 * as_mirrored.rms_error_undoubted
 
 
 def test_a_file_of_a_real_right_arm_mirrored_predicts_real_left_arms(shared_data):

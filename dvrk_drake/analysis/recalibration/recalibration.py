@@ -129,10 +129,26 @@ def recalibrate(model: IdentifiedModel, recording: Recording) -> Recalibration:
     return Recalibration(_with_section(model, section, recording), actuators, shared, float(len(fit.tau) / fit.rate))
 
 
+def predict_other_phases(
+    model: IdentifiedModel, recording: Recording, parts: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Relative errors (n,) of the model, and with the friction of each part of the motion refitted to the other parts.
+
+    The parts are cut by the phase of a motion that repeats, so no refit has seen a phase that it is judged on. All
+    actuators that move both ways are refitted.
+
+    Raises:
+        RecordingError: it is no motion of this arm.
+        ModelError: the model has no dynamics.
+    """
+    fit = _Fit(model.dynamic_model, recording, parts)
+    return fit.error(fit.nothing), fit.left_out_error(fit.excited)
+
+
 class _Fit:
     """Least squares for friction scales and offsets about what the model has: x is (scales - 0 ... , offsets)."""
 
-    def __init__(self, model: DynamicModel, recording: Recording) -> None:
+    def __init__(self, model: DynamicModel, recording: Recording, folds: int = FOLDS) -> None:
         grid = motion_grid(recording, model.arm, model.section.signals)
         self.names = model.arm.joint_names
         self.rate = grid.rate
@@ -144,7 +160,8 @@ class _Fit:
         rows = effect_coordinates(model.arm)
         self._loads = np.array([rows[coordinate] != 0 for coordinate, _ in self.keys])
         self.expected = expected.total()
-        self._fold, self._edge = phase_folds(grid, period_of(grid), FOLDS)
+        self._folds = folds
+        self._fold, self._edge = phase_folds(grid, period_of(grid), folds)
         self.excited = _moves_both_ways(model, grid)
         self.nothing = np.concatenate([np.ones(len(self.keys)), np.zeros(len(self.names))])
 
@@ -155,10 +172,10 @@ class _Fit:
     def left_out_error(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
         """(n,) relative error of parts of the motion that are predicted from the others, less what is beside them."""
         squares = np.zeros(len(self.names))
-        for fold in range(FOLDS):
+        for fold in range(self._folds):
             own = self._fold == fold
-            beside = (self._edge[:, 0] & (self._fold == (fold + 1) % FOLDS)) | (
-                self._edge[:, 1] & (self._fold == (fold - 1) % FOLDS)
+            beside = (self._edge[:, 0] & (self._fold == (fold + 1) % self._folds)) | (
+                self._edge[:, 1] & (self._fold == (fold - 1) % self._folds)
             )
             squares += np.sum(self._left(self.solve(free, ~own & ~beside))[own] ** 2, axis=0)
         return self._relative(squares)

@@ -24,6 +24,11 @@ def print_recalibration(console: Console, result: Recalibration) -> None:
         f"{FOLDS} parts of the motion predicted from the others\n",
         style="dim",
     )
+    console.print(
+        "This gain is for motions like the recalibration recording. At other positions and speeds it can be much "
+        "smaller: validate the new model on the motion that you need.\n",
+        soft_wrap=True,
+    )
     shared = [f"{name} x {scale:.2f}" for name, scale in result.shared.items()]
     if shared:
         console.print(f"friction that actuators share: {', '.join(shared)}", soft_wrap=True)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydrake.multibody.plant import MultibodyPlant
 
 from dvrk_drake.analysis.reproduction.published import LENGTHS, TABLE_1, TableRow
+from dvrk_drake.analysis.reproduction.recordings import PAPER_ARM
 from dvrk_drake.analysis.reproduction.report import ResultTable, Section
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
@@ -65,7 +66,7 @@ def published_row(row: TableRow) -> NDArray[np.float64]:
 
 def reproduce_table_1() -> Section:
     """Table I beside the same of the plant."""
-    arm = load_arm("mtml")
+    arm = load_arm(PAPER_ARM)
     ours, worst = recomputed_table(arm)
     published = np.array([published_row(row) for row in TABLE_1])
     rows = []

@@ -13,6 +13,7 @@ from dvrk_drake.analysis.plots import MEASURED_COLOUR, MODEL_COLOUR, save_figure
 from dvrk_drake.analysis.reproduction import published
 from dvrk_drake.analysis.reproduction.drift_tables import drift_table, rate_table, torque_table
 from dvrk_drake.analysis.reproduction.laboratory import Laboratory
+from dvrk_drake.analysis.reproduction.recordings import PAPER_ARM
 from dvrk_drake.analysis.reproduction.releases import APPROACH, BAND, RESTING, SAMPLE_PERIOD, Drifts
 from dvrk_drake.analysis.reproduction.report import Section, share
 from dvrk_drake.dynamics.friction_compensation import LARGEST_HYSTERESIS_RATIO
@@ -26,15 +27,15 @@ LOOSE_DURATION = 3.0
 def reproduce_figure_5(laboratory: Laboratory) -> Section:
     """All torques on: ours at all poses, the paper's at the first of them, and ours without friction."""
     mtm, extent = laboratory.mtm, laboratory.extent
-    poses = laboratory.random_poses("mtml", extent.releases)
+    poses = laboratory.random_poses(PAPER_ARM, extent.releases)
     few = poses[: extent.paper_releases]
-    ours = laboratory.release("mtml", mtm.truth, mtm.file, poses, "Fig. 5: releasing ours")
-    paper = laboratory.release("mtml", mtm.truth, laboratory.paper_file, few, "Fig. 5: releasing the paper's")
+    ours = laboratory.release(PAPER_ARM, mtm.truth, mtm.file, poses, "Fig. 5: releasing ours")
+    paper = laboratory.release(PAPER_ARM, mtm.truth, laboratory.paper_file, few, "Fig. 5: releasing the paper's")
     led = laboratory.release(
-        "mtml", mtm.truth, mtm.file, poses[: extent.led_releases], "Fig. 5: leading and releasing ours", led=True
+        PAPER_ARM, mtm.truth, mtm.file, poses[: extent.led_releases], "Fig. 5: leading and releasing ours", led=True
     )
     kept = laboratory.release(
-        "mtml",
+        PAPER_ARM,
         mtm.truth,
         mtm.file,
         poses[: extent.led_releases],
@@ -46,7 +47,7 @@ def reproduce_figure_5(laboratory: Laboratory) -> Section:
 
     def loose(model: Path, where: NDArray[np.float64], what: str, damped: bool = False) -> Drifts:
         return laboratory.release(
-            "mtml",
+            PAPER_ARM,
             mtm.truth,
             model,
             where,
@@ -101,10 +102,10 @@ def reproduce_figure_5(laboratory: Laboratory) -> Section:
 def reproduce_figure_6(laboratory: Laboratory) -> Section:
     """Joints 5-7 without torque, as the paper tried against their drift."""
     mtm, extent = laboratory.mtm, laboratory.extent
-    few = laboratory.random_poses("mtml", extent.paper_releases)
+    few = laboratory.random_poses(PAPER_ARM, extent.paper_releases)
     zeroed = laboratory.zeroed(laboratory.paper_file)
-    paper = laboratory.release("mtml", mtm.truth, zeroed, few, "Fig. 6: releasing the paper's")
-    ours = laboratory.release("mtml", mtm.truth, laboratory.zeroed(mtm.file), few, "Fig. 6: releasing ours")
+    paper = laboratory.release(PAPER_ARM, mtm.truth, zeroed, few, "Fig. 6: releasing the paper's")
+    ours = laboratory.release(PAPER_ARM, mtm.truth, laboratory.zeroed(mtm.file), few, "Fig. 6: releasing ours")
     figures = _plots(
         laboratory.folder, "fig6", "joints 5-7 zeroed", ours, paper, published.FIGURE_6, published.FIGURE_6_MEANS
     )

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.reproduction.laboratory import Laboratory
+from dvrk_drake.analysis.reproduction.recordings import PAPER_ARM
 from dvrk_drake.analysis.reproduction.releases import SAMPLE_PERIOD, Drifts
 from dvrk_drake.analysis.reproduction.report import ResultTable, numbers
 from dvrk_drake.analysis.tuning.model_based import friction
@@ -67,7 +68,7 @@ def _shares(drifts: Drifts) -> tuple[str, ...]:
 def torque_table(laboratory: Laboratory) -> ResultTable:
     """How wrong the torques are over the joint box; the truth is known here."""
     mtm = laboratory.mtm
-    q = laboratory.random_poses("mtml", 500)
+    q = laboratory.random_poses(PAPER_ARM, 500)
     true = mtm.truth.model.holding_torque(q)
     paper = IdentifiedModel.load(laboratory.paper_file).holding_torque(q)
 

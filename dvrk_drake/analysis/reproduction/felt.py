@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dvrk_drake.analysis.reproduction.laboratory import Laboratory
+from dvrk_drake.analysis.reproduction.recordings import PAPER_ARM
 from dvrk_drake.analysis.reproduction.report import ResultTable, Section
 from dvrk_drake.analysis.transparency.report import plot_transparency
 from dvrk_drake.analysis.transparency.transparency import Compensation, Felt, feel, rambling_path
@@ -30,7 +31,7 @@ def led(lead: Lead) -> Felt:
     """What the hand feels along a path through random poses."""
     model = IdentifiedModel.load(lead.model) if lead.model else None
     # Which friction there is, a controller knows from the same files as the arm; its weight it has to identify.
-    friction = Friction.of_arm(load_arm("mtml"))
+    friction = Friction.of_arm(load_arm(PAPER_ARM))
     compensation = Compensation(lead.name, model, lead.friction_ratio, friction)
     path = rambling_path(lead.arm, lead.poses, seed=lead.seed)
     return feel(lead.arm, path, compensation, effects=lead.arm.effects, seed=lead.seed)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.reproduction.paper_parameters import paper_model, with_zeroed
 from dvrk_drake.analysis.reproduction.published import FIGURE_7_FAULTY
-from dvrk_drake.analysis.reproduction.recordings import PaperRecordings
+from dvrk_drake.analysis.reproduction.recordings import PAPER_ARM, PaperRecordings
 from dvrk_drake.analysis.reproduction.releases import DURATION, Drifts, Release, release_all
 from dvrk_drake.analysis.reproduction.simulated_collection import collect
 from dvrk_drake.analysis.reproduction.true_arms import KnownTruth, paper_arm, unlike_its_drawing
@@ -82,10 +82,10 @@ class Laboratory:
         """The paper's arm if its recording is there, else one unlike its drawing; identified."""
         self.progress("finding the true MTM", 0.0)
         if self.recordings.folder is None:
-            truth = unlike_its_drawing("mtml", self.folder, self.seed)
+            truth = unlike_its_drawing(PAPER_ARM, self.folder, self.seed)
         else:
             truth = paper_arm(self.recordings.poses, self.folder)
-        return self._identified(truth, "mtml")
+        return self._identified(truth, PAPER_ARM)
 
     @cached_property
     def psm(self) -> Identified:
@@ -97,9 +97,9 @@ class Laboratory:
         """The file of the paper's own parameters; on another arm than the paper's, of its method on the same poses."""
         mtm, path = self.mtm, self.folder / "paper_model.yaml"
         if mtm.truth.is_the_papers:
-            paper_model(load_arm("mtml")).save(path)
+            paper_model(load_arm(PAPER_ARM)).save(path)
         else:
-            identify_static(mtm.poses, load_arm("mtml"), "paper").model.save(path)
+            identify_static(mtm.poses, load_arm(PAPER_ARM), "paper").model.save(path)
         return path
 
     def release(

@@ -14,6 +14,8 @@ from dvrk_drake.models.recording import Recording, read_recording
 
 #: The paper's identification set; the squared errors behind its Fig. 4, if somebody has them.
 STATIC, FIGURE_4 = "mtm_2015_good72.csv", "paper_fig4_squared_errors.csv"
+#: The arm that was recorded: a right one, by the moment of its wrist's brackets (docs/public_recordings.md).
+PAPER_ARM = "mtmr"
 #: Names the folder above data/mtm_static, as the tests have it.
 VARIABLE = "DVRK_DRAKE_SHARED"
 

@@ -17,6 +17,7 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from dvrk_drake.analysis.plots import save_figure
 from dvrk_drake.analysis.reproduction import published
 from dvrk_drake.analysis.reproduction.laboratory import Laboratory
+from dvrk_drake.analysis.reproduction.recordings import PAPER_ARM
 from dvrk_drake.analysis.reproduction.report import ResultTable, Section, numbers
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
@@ -47,7 +48,7 @@ def reproduce_figure_7(laboratory: Laboratory, duration: float = DURATION) -> Se
     def progress(share: float) -> None:
         laboratory.progress("Fig. 7: stepping to zero", share)
 
-    theirs_arm = paper_simulated_arm(load_arm("mtml"), folder / "paper_simulated_mtm.sdf")
+    theirs_arm = paper_simulated_arm(load_arm(PAPER_ARM), folder / "paper_simulated_mtm.sdf")
     faulty = simulate_paper_controller(theirs_arm, duration, True, lambda share: progress(0.4 * share))
     damped = simulate_paper_controller(theirs_arm, duration, False, lambda share: progress(0.4 + 0.4 * share))
     ours = simulate_ours(mtm.truth.arm, mtm.model, min(duration, OUR_DURATION))
@@ -140,12 +141,12 @@ def simulate_paper_controller(
 
 def simulate_ours(true_arm: Arm, model: IdentifiedModel, duration: float) -> NDArray[np.float64]:
     """q (samples, n) every `PERIOD` under gravity compensation and PID, with all effects but the stops."""
-    arm = load_arm("mtml")
+    arm = load_arm(PAPER_ARM)
     station = ArmStation(arm, plant_arm=true_arm, effects=true_arm.effects.without("stops"))
     builder = DiagramBuilder()
     controller = GravityPidController(model)
     add_closed_loop(builder, station, controller, ConstantVectorSource(np.zeros(2 * arm.num_joints)))
-    log = LogVectorOutput(station.GetOutputPort("mtml.state_true"), builder, PERIOD)
+    log = LogVectorOutput(station.GetOutputPort(f"{PAPER_ARM}.state_true"), builder, PERIOD)
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
     station.set_positions(station.GetMyMutableContextFromRoot(context), published.FIGURE_7_START)

@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.plots import MEASURED_COLOUR, MODEL_COLOUR, ZERO_COLOUR, save_figure
 from dvrk_drake.analysis.reproduction.published import FIGURE_4_MEANS
-from dvrk_drake.analysis.reproduction.recordings import PaperRecordings
+from dvrk_drake.analysis.reproduction.recordings import PAPER_ARM, PaperRecordings
 from dvrk_drake.analysis.reproduction.report import ResultTable, Section, numbers
 from dvrk_drake.analysis.static.static_identification import StaticIdentification, identify_static
 from dvrk_drake.models.arm import load_arm
 
-#: The arm's side is not stated; joint 1 bottoms at the left one's limit, and the joints of Fig. 4 do not depend on it.
-ARM = "mtml"
 _FILE = "fig4.png"
 #: Smaller squared errors are drawn as this [(N m)^2]: efforts that were measured as exactly 0.
 FLOOR = 1e-9
@@ -31,7 +29,7 @@ def reproduce_figure_4(
     Raises:
         RecordingError: the recording is not there.
     """
-    recording, arm = recordings.poses, load_arm(ARM)
+    recording, arm = recordings.poses, load_arm(PAPER_ARM)
     paper = identify_static(recording, arm, "paper")
     ours = identify_static(recording, arm, progress=progress)
     published = recordings.figure_4

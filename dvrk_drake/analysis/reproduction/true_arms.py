@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dvrk_drake.analysis.reproduction.recordings import PAPER_ARM
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -51,7 +52,7 @@ def paper_arm(recording: Recording, folder: Path) -> KnownTruth:
     Raises:
         RecordingError, IdentificationError, ModelError: the recording is not of an MTM at rest.
     """
-    arm = load_arm("mtml")
+    arm = load_arm(PAPER_ARM)
     model = identify_static(recording, arm).model
     one_sided = {law.coordinate for law in arm.effects.friction if law.kind == "presliding forward"}
     lasting = [e for e in model.effects if not (e.kind == "offset" and _at_actuator(e.coordinate) in one_sided)]
@@ -87,7 +88,7 @@ def unlike_its_drawing(name: str, folder: Path, seed: int) -> KnownTruth:
         for link in link_inertias(arm)
     ]
     true_arm = _with_links(arm, links, folder / f"true_{name}.sdf", "no arm: each link's mass is drawn at random")
-    if name == "mtml":
+    if name == PAPER_ARM:
         true_arm = dataclasses.replace(true_arm, effects=arm.effects.without("springs"))
     effects = [
         ActuatorEffectEstimate(law.coordinate, law.kind, law.scale, law.coefficient)

@@ -35,6 +35,8 @@ LEAST_POSES = 8
 LEAST_TORQUE, CLEAR_GAIN_RATIO = 0.02, 0.5
 #: Nor does one that moved by less than this share of its range: its torque elsewhere would be a guess.
 LEAST_MOTION = 0.02
+#: The same for low-speed segments of a motion: over less, friction has the same direction in all of them.
+LEAST_SEGMENT_MOTION = 0.05
 #: Leave-one-out must lower the RMS error to this share of zero torque's, or the joint's torque is scaled down.
 LEAST_GAIN_RATIO = 0.98
 FOLDS = 10
@@ -115,6 +117,8 @@ def identify_static(
         usable = usable & ~robust.outliers
         trust = _trust(problem, fit.left_out_residuals, usable)
         validated = _cross_validate(problem, progress)
+        if not np.all(measured):
+            trust = np.where(_segments_support(problem, validated, usable), trust, 0.0)
     fit = _scaled(fit, tau, trust)
     model = IdentifiedModel(
         arm=arm.source,
@@ -214,6 +218,24 @@ def _trust(problem: StaticProblem, left_out: NDArray[np.float64], usable: NDArra
             power = np.sum(predicted**2)
             trust[j] = float(np.clip(measured @ predicted / power, 0.0, 1.0)) if power > 0 else 1.0
     return trust
+
+
+def _segments_support(
+    problem: StaticProblem, validated: NDArray[np.float64], usable: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Returns (n,) whether low-speed segments of a motion support a torque on each joint.
+
+    Few segments or a short travel cannot separate gravity from friction, which leave-one-out does not show: the
+    left-out segment and its neighbours have the same friction. A joint needs `LEAST_POSES` segments over
+    `LEAST_SEGMENT_MOTION` of its range, and a cross-validated error below that of zero torque.
+    """
+    arm = problem.arm
+    supported = np.zeros(arm.num_joints, dtype=bool)
+    for j, travel in enumerate(LEAST_SEGMENT_MOTION * (arm.position_upper - arm.position_lower)):
+        use = usable[:, j]
+        if np.sum(use) >= LEAST_POSES and np.ptp(problem.q[use, j]) >= travel:
+            supported[j] = rms(validated[use, j]) < LEAST_GAIN_RATIO * rms(problem.tau[use, j])
+    return supported
 
 
 def _cross_validate(problem: StaticProblem, progress: Callable[[float], None]) -> NDArray[np.float64]:

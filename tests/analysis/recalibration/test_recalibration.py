@@ -8,7 +8,7 @@ from loaded_arm import friction, other_day
 from motions import fourier_motion, recorded, true_dynamics
 
 from dvrk_drake.analysis.dynamic.validation import validate_motion
-from dvrk_drake.analysis.recalibration.recalibration import recalibrate
+from dvrk_drake.analysis.recalibration.recalibration import predict_other_phases, recalibrate
 from dvrk_drake.analysis.signals.drive_efforts import FRICTION_PARTS
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
@@ -151,6 +151,21 @@ def test_the_error_after_is_of_parts_that_were_not_fitted():
     assert result.actuators[3].after > 0.3
 
 
+def test_a_refit_is_judged_on_phases_that_it_has_not_seen():
+    """Friction that differs in one half of the phases alone is no gain for the other half."""
+    model, truth, generator = days("psm")
+    recording = motion(truth, generator, seconds=16.0)
+    before, after = predict_other_phases(model, recording, 2)
+    np.testing.assert_allclose(before, errors(model, recording), atol=1e-9)
+    assert np.mean(after) < 0.5 * np.mean(before)
+    half = (np.asarray(recording.t) - 1.0) % 8.0 < 4.0  # phases are counted from where the filters end
+    old = motion(model.dynamic_model, np.random.default_rng(0), seconds=16.0)
+    mixed = dataclasses.replace(old, tau=np.where(half[:, None], recording.tau, old.tau))
+    before, after = predict_other_phases(model, mixed, 2)
+    # Each refit learns the friction that the other half does not have.
+    assert np.mean(after) > np.mean(before)
+
+
 def test_from_the_command_line(tmp_path, capsys):
     model, truth, generator = days("psm")
     paths = {name: str(tmp_path / name) for name in ("model.yaml", "short.csv", "new.yaml", "static.yaml")}
@@ -160,7 +175,7 @@ def test_from_the_command_line(tmp_path, capsys):
     assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], "--output", paths["new.yaml"]]) == 0
     assert IdentifiedModel.load(paths["new.yaml"]).provenance.method.endswith(f"recalibrated on {paths['short.csv']}")
     table = capsys.readouterr().out
-    assert all(name in table for name in ("before", "refit", "wrist_yaw", "kept"))
+    assert all(name in table for name in ("before", "refit", "wrist_yaw", "kept", "motions like the recalibration"))
     assert main(["recalibrate", paths["static.yaml"], paths["short.csv"], "--output", paths["new.yaml"]]) == 2
     assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], "--output", paths["model.yaml"]]) == 2
     lines = capsys.readouterr().err.splitlines()

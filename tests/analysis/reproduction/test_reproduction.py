@@ -15,7 +15,7 @@ from dvrk_drake.analysis.reproduction.felt import reproduce_transparency
 from dvrk_drake.analysis.reproduction.laboratory import Extent, Identified, Laboratory
 from dvrk_drake.analysis.reproduction.paper_parameters import paper_model, paper_torque, with_zeroed
 from dvrk_drake.analysis.reproduction.psm import mechanism_errors
-from dvrk_drake.analysis.reproduction.recordings import PaperRecordings
+from dvrk_drake.analysis.reproduction.recordings import PAPER_ARM, PaperRecordings
 from dvrk_drake.analysis.reproduction.releases import BAND, SAMPLE_PERIOD, Drifts, Release, release, release_all
 from dvrk_drake.analysis.reproduction.report import ResultTable, Section, share, write_page
 from dvrk_drake.analysis.reproduction.run import NAMES, reproduce
@@ -35,7 +35,7 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.models.recording import Recording, read_recording
 
-ARM = load_arm("mtml")
+ARM = load_arm(PAPER_ARM)
 
 
 # Table I.
@@ -195,7 +195,7 @@ def test_a_joint_is_held_if_it_never_left():
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
     """A true arm, derived and compiled once."""
-    return unlike_its_drawing("mtml", tmp_path_factory.mktemp("truth"), seed=8)
+    return unlike_its_drawing(PAPER_ARM, tmp_path_factory.mktemp("truth"), seed=8)
 
 
 @pytest.mark.slow
@@ -204,7 +204,7 @@ def test_what_is_known_exactly_is_held_and_what_is_not_falls(truth, tmp_path):
     truth.model.save(exact)
     with_zeroed(truth.model, range(7)).save(nothing)
     start = ARM.sample_poses(1, np.random.default_rng(5), margin=0.2)[0]
-    cases = [Release("mtml", truth.arm, ("all",), str(model), start, duration=1.0) for model in (exact, nothing)]
+    cases = [Release(PAPER_ARM, truth.arm, ("all",), str(model), start, duration=1.0) for model in (exact, nothing)]
     with ThreadPoolExecutor(1) as executor:
         held, fallen = release_all(cases, executor)
     assert held.shape == (round(1.0 / SAMPLE_PERIOD) + 1, 7)
@@ -260,11 +260,11 @@ def test_psm_keeps_its_remote_centre_and_its_wrist_axes_apart():
 
 @pytest.mark.slow
 def test_a_led_arm_stays_if_its_wide_hysteresis_is_compensated(tmp_path):
-    arm = load_arm("mtml")
+    arm = load_arm(PAPER_ARM)
     truth, exact = KnownTruth(arm, IdentifiedModel.from_arm(arm), False, ""), tmp_path / "exact.yaml"
     truth.model.save(exact)
     start = ARM.sample_poses(1, np.random.default_rng(10), margin=0.2)[0]
-    case = Release("mtml", arm, ("friction",), str(exact), start, led=True, duration=1.5, seed=10)
+    case = Release(PAPER_ARM, arm, ("friction",), str(exact), start, led=True, duration=1.5, seed=10)
     with ThreadPoolExecutor(1) as executor:
         gone, kept = (
             Drifts(arm, positions[None]).largest[0]

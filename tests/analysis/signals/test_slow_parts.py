@@ -10,7 +10,9 @@ from dvrk_drake.analysis.convert.convert import convert
 from dvrk_drake.analysis.signals.poses import find_poses
 from dvrk_drake.analysis.signals.rests import SAME_REST, rest_poses
 from dvrk_drake.analysis.signals.slow_parts import slow_parts
-from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.analysis.static.static_identification import LEAST_POSES, identify_static
+from dvrk_drake.analysis.static.validation import validate
+from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import load_arm
@@ -121,12 +123,42 @@ def test_what_has_no_slow_parts_is_refused(arm):
         slow_parts(Recording(q=np.sin(2 * np.pi * t)[:, None] + 0 * qd, qd=qd, tau=qd, t=t), arm)
 
 
-def test_the_slow_parts_of_the_real_excitation_motion_say_nothing_of_yaw_and_insertion(arm, shared_data, tmp_path):
-    """It was made to move: an honest tool commands no torque from it rather than a guess."""
-    path = tmp_path / "psm_one.csv"
-    convert(shared_data / "trajectories/psm_one.csv", path, arm=arm)
-    parts, measured = slow_parts(read_recording(path, arm), arm)
+def test_few_segments_give_no_feedforward(arm):
+    poses = arm.sample_poses(LEAST_POSES - 1, np.random.default_rng(0), margin=0.1)
+    parts, measured = slow_parts(motion_with_rests(arm, poses, np.random.default_rng(1)), arm)
+    assert 0 < measured.sum(axis=0).max() < LEAST_POSES
     model = identify_static(parts, arm, measured=measured).model
-    assert measured[:, 0].sum() == 0
-    assert model.joints[0].trust == model.joints[2].trust == 0.0
-    assert np.all(model.holding_torque(np.array([0.5, 0.4, 0.1, 0, 0, 0, 0]))[[0, 2]] == 0.0)
+    assert [joint.trust for joint in model.joints] == [0.0] * arm.num_joints
+
+
+@pytest.fixture(scope="module")
+def real_parts(arm, shared_data, tmp_path_factory):
+    """Low-speed segments of two real motions: on one day, and on another with a weight."""
+
+    def parts_of(name):
+        path = tmp_path_factory.mktemp("converted") / f"{name}.csv"
+        convert(shared_data / f"trajectories/{name}.csv", path, format="wpi-csv", arm=arm)
+        return path, slow_parts(read_recording(path, arm), arm)
+
+    return {name: parts_of(name) for name in ("psm_one", "psm_one_205g_insertion")}
+
+
+def test_a_real_excitation_motion_is_no_recording_of_poses(arm, real_parts):
+    """No joint of a model from its segments is worse than zero torque on another day, with or without a weight."""
+    for name, other in (("psm_one", "psm_one_205g_insertion"), ("psm_one_205g_insertion", "psm_one")):
+        parts, measured = real_parts[name][1]
+        model = identify_static(parts, arm, measured=measured).model
+        assert measured[:, 0].sum() == 0
+        assert model.joints[0].trust == model.joints[2].trust == 0.0
+        assert np.all(model.holding_torque(np.array([0.5, 0.4, 0.1, 0, 0, 0, 0]))[[0, 2]] == 0.0)
+        for joint in validate(model, real_parts[other][1].recording, real_parts[other][1].measured).joints:
+            assert joint.rms_error_undoubted <= joint.rms_torque_undoubted + 1e-12, (name, joint.name)
+
+
+def test_identify_warns_of_torques_from_segments(real_parts, tmp_path, capsys):
+    path = real_parts["psm_one"][0]
+    output = str(tmp_path / "model.yaml")
+    assert main(["identify", str(path), "--arm", "psm", "--slow-parts", "--output", output]) == 0
+    warnings = [line for line in capsys.readouterr().err.splitlines() if "low-speed segments" in line]
+    commanded = [joint.name for joint in IdentifiedModel.load(output).joints if joint.trust > 0]
+    assert len(warnings) == 1 and ", ".join(commanded) in warnings[0]
