@@ -52,16 +52,24 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--output", required=True, metavar="FILE.csv", help="columns tau1.., one row a row")
     verb.set_defaults(run=_predict)
 
-    verb = verbs.add_parser("convert", help="turn a recording (LCM log, team .mat, WPI 21-column CSV) into our CSV")
+    verb = verbs.add_parser("convert", help="turn a recording (CSV, LCM log, team .mat, WPI CSV) into our CSV")
     verb.add_argument("input", metavar="INPUT")
     verb.add_argument("output", metavar="OUTPUT.csv")
-    verb.add_argument("--format", choices=("team-mat", "wpi-csv", "lcm-log"), help="default: detected")
+    verb.add_argument("--format", choices=("csv", "team-mat", "wpi-csv", "lcm-log"), help="default: detected")
+    verb.add_argument(
+        "--coordinates",
+        choices=("joint", "actuator"),
+        help="what q and tau of a CSV with a header are of; needed there, the other formats define it",
+    )
     verb.add_argument("--variable", metavar="NAME", help="the .mat's variable, where several fit")
     verb.add_argument(
-        "--rate", type=float, default=200.0, metavar="HZ", help="samples a second of the CSV; default: 200"
+        "--rate",
+        type=float,
+        metavar="HZ",
+        help="samples a second of a CSV without time stamps; default: WPI 200, with a header none are written",
     )
     verb.add_argument(
-        "--arm", help="e.g. psm; WPI: write its joint coordinates instead of the actuators'; LCM log: which arm"
+        "--arm", help="e.g. psm; CSV, WPI: write its joint coordinates, not the actuators'; LCM log: which arm"
     )
     verb.add_argument("--skip-invalid", action="store_true", help="leave out rows that are not numbers, and count them")
     verb.set_defaults(run=_convert)
@@ -191,6 +199,7 @@ def _convert(options: argparse.Namespace) -> None:
         options.input,
         options.output,
         format=options.format,
+        coordinates=options.coordinates,
         variable=options.variable,
         rate=options.rate,
         arm=None if options.arm is None else load_arm(options.arm),

@@ -124,7 +124,7 @@ def test_what_has_no_slow_parts_is_refused(arm):
 def test_the_slow_parts_of_the_real_excitation_motion_say_nothing_of_yaw_and_insertion(arm, shared_data, tmp_path):
     """It was made to move: an honest tool commands no torque from it rather than a guess."""
     path = tmp_path / "psm_one.csv"
-    convert(shared_data / "trajectories/psm_one.csv", path, arm=arm)
+    convert(shared_data / "trajectories/psm_one.csv", path, format="wpi-csv", arm=arm)
     parts, measured = slow_parts(read_recording(path, arm), arm)
     model = identify_static(parts, arm, measured=measured).model
     assert measured[:, 0].sum() == 0
