@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import replace
 
 from dvrk_drake.cli.dynamics import identify_motion, refuse_unusable, validate_in_motion
@@ -38,7 +39,13 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb = verbs.add_parser("validate", help="compare a model with a recording that it was not made from")
     verb.add_argument("model", metavar="MODEL.yaml")
     add_recording(verb)
-    verb.add_argument("--json", metavar="FILE", help="write the errors as JSON")
+    verb.add_argument(
+        "--require",
+        choices=("good", "usable"),
+        help="exit code 2 unless every joint that the model commands has this verdict or a better one",
+    )
+    verb.add_argument("--save", action="store_true", help="store the verdicts in MODEL.yaml, where run looks for them")
+    verb.add_argument("--json", metavar="FILE", help="write verdicts and errors as JSON")
     verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.set_defaults(run=_validate)
@@ -123,7 +130,9 @@ def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.signals.poses import find_poses
     from dvrk_drake.analysis.static.validation import validate
     from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.analysis.verdict import unfit
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary
+    from dvrk_drake.errors import ModelError
     from dvrk_drake.models.atomic_file import atomic_write
     from dvrk_drake.models.recording import read_recording
 
@@ -135,30 +144,54 @@ def _validate(options: argparse.Namespace) -> None:
         check_output(options.json, options.recording, options.model)
     plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
+    sha256, source = recording.sha256, recording.source
+    same = bool(sha256) and sha256 == model.provenance.sha256
+    if options.save:
+        check_output(options.model, options.recording)
+        if same:
+            raise ModelError(f"{source}: --save needs a recording that the model was not identified from")
     recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
-    refuse_unusable(console, recording, arm, warn=True)
+    warnings = refuse_unusable(console, recording, arm)
     if moves and model.dynamics is not None:
-        validate_in_motion(options, model, recording, plots)
-        return
+        verdicts = validate_in_motion(options, model, recording, plots)
+        note = ""
+    else:
+        validation = validate(model, recording, measured)
+        verdicts = validation.verdicts
+        print_validation(console, validation)
+        if motion := recording.motion(arm):
+            console.print(
+                f"the arm moves in this recording ({motion}): the model holds poses, and "
+                "knows nothing of inertia and of moving friction",
+                style="yellow",
+                soft_wrap=True,
+            )
+        print_doubts(console, validation.doubts)
+        if options.json is not None:
+            with atomic_write(options.json) as stream:
+                json.dump(validation.as_dict(), stream, indent=2)
+                stream.write("\n")
+        if plots is not None:
+            plot_validation(plots, model, validation, recording.in_joint_coordinates(arm))
+            console.print(f"plots: {options.plots}")
     if note:
         console.print(note)
-    if motion := recording.motion(arm):
-        console.print(
-            f"the arm moves in this recording ({motion}): the model holds poses, and "
-            "knows nothing of inertia and of moving friction",
-            style="yellow",
-            soft_wrap=True,
+    for warning in warnings:
+        console.print(warning, style="yellow", markup=False, soft_wrap=True)
+    if same:
+        print(
+            f"dvrk-drake: warning: {source}: the model was identified from this recording, so these are errors of the "
+            "fit; validate with another one",
+            file=sys.stderr,
         )
-    validation = validate(model, recording, measured)
-    print_doubts(console, validation.doubts)
-    print_validation(console, validation)
-    if options.json is not None:
-        with atomic_write(options.json) as stream:
-            json.dump(validation.as_dict(), stream, indent=2)
-            stream.write("\n")
-    if plots is not None:
-        plot_validation(plots, model, validation, recording.in_joint_coordinates(arm))
-        console.print(f"plots: {options.plots}")
+    if options.save:
+        replace(model, validation=ValidationSummary(source, sha256, dict(verdicts))).save(options.model)
+        console.print(f"verdicts saved: {options.model}")
+    if options.require is not None and (bad := unfit(verdicts, options.require)):
+        raise ModelError(
+            f"{options.model}: not {options.require} on {source}: {', '.join(bad)}; identify from a recording with "
+            "more varied poses, or recalibrate"
+        )
 
 
 def _predict(options: argparse.Namespace) -> None:
