@@ -244,10 +244,10 @@ def print_rule(console: Console, in_motion: bool) -> None:
 def print_validation(console: Console, validation: Validation) -> None:
     """Verdict and error beside zero torque, joint by joint."""
     print_verdict(console, validation.verdicts)
-    title = f"RMS torque error over {validation.poses} poses [N m; N if prismatic]"
+    title = f"RMS torque error, {validation.poses} poses [N m; N if prismatic]"
     doubted = any(j.num_doubted for j in validation.joints)
     if doubted:
-        title += ", doubted measurements left out"
+        title += "; doubted left out"
     table = make_table(title, "", "zero torque", "model", "ratio", "doubted", "verdict")
     table.columns[-1].justify = "left"
     for j in validation.joints:

@@ -246,10 +246,9 @@ def model_warning(path: str, model: IdentifiedModel) -> str:
 
     if model.validation is None:
         bad = unfit(cross_validated_verdicts(model), "usable")
-        found = f"; cross-validation: {', '.join(bad)}" if bad else ""
-        return (
-            f"{path}: not validated on another recording{found}; dvrk-drake validate MODEL.yaml OTHER.csv --save does"
-        )
+        found = f"; cross-validated: {', '.join(bad)}" if bad else ""
+        command = f"dvrk-drake validate {path} OTHER.csv --save"
+        return f"{path}: no other recording has validated this model{found}; run: {command}"
     verdicts = model.validation.verdicts
     if not (bad := unfit({joint.name: verdicts[joint.name] for joint in model.joints}, "usable")):
         return ""

@@ -205,7 +205,7 @@ def test_the_recording_of_the_identification_validates_nothing(files, tmp_path, 
 def test_saved_verdicts_are_those_that_run_warns_of(files, capsys):
     model, good, bad = files
     loaded = IdentifiedModel.load(model)
-    assert "not validated on another recording" in model_warning(model, loaded)
+    assert "no other recording has validated this model; cross-validated: " in model_warning(model, loaded)
     assert main(["validate", model, bad, "--save"]) == 0
     saved = IdentifiedModel.load(model)
     assert dataclasses.replace(saved, validation=None) == loaded
