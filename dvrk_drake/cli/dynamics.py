@@ -13,7 +13,7 @@ from dvrk_drake.errors import RecordingError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from dvrk_drake.analysis.verdict import Verdict
+    from dvrk_drake.analysis.dynamic.validation import DynamicValidation
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.recording import Recording
@@ -84,29 +84,26 @@ def identify_motion(options: argparse.Namespace, recording: Recording, arm: Arm,
         console.print(f"plots: {options.plots}")
 
 
-def validate_in_motion(
-    options: argparse.Namespace, model: IdentifiedModel, recording: Recording, plots: Path | None
-) -> dict[str, Verdict]:
-    """Compares a dynamic model with a motion, prints verdicts and errors, writes the JSON and the plots."""
+def show_motion_validation(
+    options: argparse.Namespace, validation: DynamicValidation, model: IdentifiedModel, source: str, plots: Path | None
+) -> None:
+    """Writes the JSON of a dynamic model compared with a motion, prints verdicts and errors, writes the plots."""
     from dvrk_drake.analysis.dynamic.tables import print_dynamic_validation
-    from dvrk_drake.analysis.dynamic.validation import validate_motion
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.models.atomic_file import atomic_write
 
     console = make_console()
-    validation = validate_motion(model, recording)
-    print_dynamic_validation(console, validation)
-    bad = (a for a in validation.actuators if a.verdict == "do not use")
-    errors = {a.name: a.relative_error for a in bad if a.relative_error is not None}
-    _warn_unexplained(console, errors)
     if options.json is not None:
         with atomic_write(options.json) as stream:
             json.dump(validation.as_dict(), stream, indent=2)
             stream.write("\n")
+    print_dynamic_validation(console, validation)
+    bad = (a for a in validation.actuators if a.verdict == "do not use")
+    errors = {a.name: a.relative_error for a in bad if a.relative_error is not None}
+    _warn_unexplained(console, errors)
     if plots is not None:
         from dvrk_drake.analysis.dynamic.plots import plot_motion
 
         arm = model.load_arm()
-        plot_motion(plots, arm, validation, f"{arm.name}, {Path(recording.source).name}")
+        plot_motion(plots, arm, validation, f"{arm.name}, {Path(source).name}")
         console.print(f"plots: {options.plots}")
-    return validation.verdicts

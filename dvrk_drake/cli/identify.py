@@ -6,8 +6,10 @@ import argparse
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from dvrk_drake.cli.dynamics import identify_motion, refuse_unusable, validate_in_motion
+from dvrk_drake.cli.dynamics import identify_motion, refuse_unusable, show_motion_validation
 from dvrk_drake.cli.support import (
     ProgressBar,
     add_gravity,
@@ -18,6 +20,11 @@ from dvrk_drake.cli.support import (
     print_notes,
     write_tables,
 )
+
+if TYPE_CHECKING:
+    from dvrk_drake.analysis.static.validation import Validation
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.models.recording import Recording
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -126,14 +133,13 @@ def _identify(options: argparse.Namespace) -> None:
 
 
 def _validate(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.plots import plot_validation
+    from dvrk_drake.analysis.dynamic.validation import DynamicValidation, validate_motion
     from dvrk_drake.analysis.signals.poses import find_poses
     from dvrk_drake.analysis.static.validation import validate
-    from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
+    from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.analysis.verdict import unfit
     from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary
     from dvrk_drake.errors import ModelError
-    from dvrk_drake.models.atomic_file import atomic_write
     from dvrk_drake.models.recording import read_recording
 
     model = IdentifiedModel.load(options.model)
@@ -152,46 +158,65 @@ def _validate(options: argparse.Namespace) -> None:
             raise ModelError(f"{source}: --save needs a recording that the model was not identified from")
     recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
     warnings = refuse_unusable(console, recording, arm)
-    if moves and model.dynamics is not None:
-        verdicts = validate_in_motion(options, model, recording, plots)
-        note = ""
+    in_motion = moves and model.dynamics is not None
+    validation = validate_motion(model, recording) if in_motion else validate(model, recording, measured)
+    # Before anything is printed: whoever reads the output may close it (head).
+    if options.save:
+        summary = ValidationSummary(source, sha256, dict(validation.verdicts))
+        replace(model, validation=summary).save(options.model)
+    failed = [] if options.require is None else unfit(validation.verdicts, options.require)
+    if isinstance(validation, DynamicValidation):
+        show_motion_validation(options, validation, model, source, plots)
     else:
-        validation = validate(model, recording, measured)
-        verdicts = validation.verdicts
-        print_validation(console, validation)
-        if motion := recording.motion(arm):
-            console.print(
-                f"the arm moves in this recording ({motion}): the model holds poses, and "
-                "knows nothing of inertia and of moving friction",
-                style="yellow",
-                soft_wrap=True,
-            )
-        print_doubts(console, validation.doubts)
-        if options.json is not None:
-            with atomic_write(options.json) as stream:
-                json.dump(validation.as_dict(), stream, indent=2)
-                stream.write("\n")
-        if plots is not None:
-            plot_validation(plots, model, validation, recording.in_joint_coordinates(arm))
-            console.print(f"plots: {options.plots}")
-    if note:
-        console.print(note)
+        _show_validation(options, validation, model, recording, plots)
+        if note:
+            console.print(note)
     for warning in warnings:
         console.print(warning, style="yellow", markup=False, soft_wrap=True)
+    if options.save:
+        console.print(f"verdicts saved: {options.model}")
     if same:
         print(
             f"dvrk-drake: warning: {source}: the model was identified from this recording, so these are errors of the "
             "fit; validate with another one",
             file=sys.stderr,
         )
-    if options.save:
-        replace(model, validation=ValidationSummary(source, sha256, dict(verdicts))).save(options.model)
-        console.print(f"verdicts saved: {options.model}")
-    if options.require is not None and (bad := unfit(verdicts, options.require)):
+    if failed:
         raise ModelError(
-            f"{options.model}: not {options.require} on {source}: {', '.join(bad)}; identify from a recording with "
+            f"{options.model}: not {options.require} on {source}: {', '.join(failed)}; identify from a recording with "
             "more varied poses, or recalibrate"
         )
+
+
+def _show_validation(
+    options: argparse.Namespace,
+    validation: Validation,
+    model: IdentifiedModel,
+    recording: Recording,
+    plots: Path | None,
+) -> None:
+    """Writes the JSON of a model compared with poses, prints verdicts and errors, writes the plots."""
+    from dvrk_drake.analysis.plots import plot_validation
+    from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
+    from dvrk_drake.models.atomic_file import atomic_write
+
+    console, arm = make_console(), model.load_arm()
+    if options.json is not None:
+        with atomic_write(options.json) as stream:
+            json.dump(validation.as_dict(), stream, indent=2)
+            stream.write("\n")
+    print_validation(console, validation)
+    if motion := recording.motion(arm):
+        console.print(
+            f"the arm moves in this recording ({motion}): the model holds poses, and "
+            "knows nothing of inertia and of moving friction",
+            style="yellow",
+            soft_wrap=True,
+        )
+    print_doubts(console, validation.doubts)
+    if plots is not None:
+        plot_validation(plots, model, validation, recording.in_joint_coordinates(arm))
+        console.print(f"plots: {options.plots}")
 
 
 def _predict(options: argparse.Namespace) -> None:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -178,6 +181,18 @@ def test_require_sets_the_exit_code_and_names_the_joints(files, tmp_path, capsys
         found = json.loads(report.read_text())
         assert found["verdict"] == "do not use" and found["rule"] == rule_text(in_motion=False)
         assert [j["verdict"] for j in found["joints"]] == ["off", "do not use", "good", "good", "good", "good", "off"]
+
+
+def test_a_closed_pipe_neither_passes_nor_loses_the_verdicts(files):
+    """`validate ... | head -1` with pipefail: the pipe is closed before anything is written."""
+    model, _, bad = files
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "dvrk_drake.cli", "validate", model, bad, "--require", "usable", "--save"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert done.returncode != 0 and "Traceback" not in done.stderr
+    assert IdentifiedModel.load(model).validation.verdicts["shoulder_pitch"] == "do not use"
 
 
 def test_the_tables_fit_80_columns(files, monkeypatch, capsys):
