@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,11 +19,13 @@ from dvrk_drake.analysis.demo.teleoperation import TeleoperationResult
 from dvrk_drake.analysis.simulation.simulation import Simulation
 from dvrk_drake.analysis.static.doubts import Doubt
 from dvrk_drake.analysis.static.validation import Validation
+from dvrk_drake.analysis.verdict import Verdict, rule_text, worst
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity, derive_gravity
 from dvrk_drake.models.arm import Arm, load_arm
 
 TABLE_WIDTH = 112
+RULE_WIDTH = 80
 #: A space in a heading, but none of a unit in brackets or at a bar.
 _BETWEEN_WORDS = re.compile(r"(?<!\|) (?![^\[]*\]|\|)")
 
@@ -35,8 +37,8 @@ With a real arm:
      each, coming from changing sides (friction is in every measurement), and write q1..q7, tau1..tau7 of every
      settled pose into a CSV [rad, N m; m, N] (lines for that are in docs/public_recordings.md).
   2. dvrk-drake identify poses.csv --arm {arm} --output model.yaml --plots plots
-  3. Record some more on another day:  dvrk-drake validate model.yaml other.csv
-  4. Only when no joint is worse than zero torque there, let GravityPidController(model) near the arm, with a
+  3. Record some more on another day:  dvrk-drake validate model.yaml other.csv --require usable --save
+  4. Only when no joint's verdict is "do not use" there, let GravityPidController(model) near the arm, with a
      hand on the stop button. Switch the controller's own gravity compensation off first, or it is compensated twice."""
 
 
@@ -222,27 +224,51 @@ def print_doubts(console: Console, doubts: Sequence[Doubt], most: int = 30) -> N
         console.print(f"  and {len(doubts) - most} more", style="yellow")
 
 
-def print_validation(console: Console, validation: Validation) -> None:
-    """Error beside zero torque, joint by joint."""
-    table = make_table(
-        f"RMS over {validation.poses} poses [N m; N if prismatic]; without doubted measurements in brackets",
-        "",
-        "zero torque",
-        "model",
-        "ratio",
-        "doubted",
+#: Colours of rows by verdict.
+VERDICT_STYLES: dict[Verdict, str] = {"do not use": "red", "not judged": "yellow"}
+
+
+def print_verdict(console: Console, verdicts: Mapping[str, Verdict]) -> None:
+    """The least favourable verdict and the joints that have it, in one line."""
+    verdict, names = worst(verdicts)
+    console.print(
+        f"verdict: {verdict} ({', '.join(names)})", style=VERDICT_STYLES.get(verdict, "green"), soft_wrap=True
     )
+
+
+def print_rule(console: Console, in_motion: bool) -> None:
+    """The rule behind the verdicts."""
+    console.print(rule_text(in_motion) + "\n", style="dim", width=min(console.width, RULE_WIDTH))
+
+
+def print_validation(console: Console, validation: Validation) -> None:
+    """Verdict and error beside zero torque, joint by joint."""
+    print_verdict(console, validation.verdicts)
+    title = f"RMS torque error, {validation.poses} poses [N m; N if prismatic]"
+    doubted = any(j.num_doubted for j in validation.joints)
+    if doubted:
+        title += "; doubted left out"
+    table = make_table(title, "", "zero torque", "model", "ratio", "doubted", "verdict")
+    table.columns[-1].justify = "left"
     for j in validation.joints:
-        worse = j.rms_error > j.rms_torque
         table.add_row(
             j.name,
-            f"{j.rms_torque:.4f} ({j.rms_torque_undoubted:.4f})",
-            f"{j.rms_error:.4f} ({j.rms_error_undoubted:.4f})",
-            "" if j.relative_error is None else f"{j.relative_error:.2f}",
+            f"{j.rms_torque_undoubted:.4f}",
+            f"{j.rms_error_undoubted:.4f}",
+            "" if j.relative_error_undoubted is None else f"{j.relative_error_undoubted:.2f}",
             str(j.num_doubted),
-            style="red" if worse else "",
+            j.verdict,
+            style=VERDICT_STYLES.get(j.verdict, ""),
         )
     console.print(table)
+    print_rule(console, in_motion=False)
+    if doubted:
+        table = make_table("The same with the doubted measurements", "", "zero torque", "model", "ratio")
+        for j in validation.joints:
+            ratio = "" if j.relative_error is None else f"{j.relative_error:.2f}"
+            table.add_row(j.name, f"{j.rms_torque:.4f}", f"{j.rms_error:.4f}", ratio)
+        console.print(table)
+        console.print()
 
 
 def print_teleoperation(console: Console, result: TeleoperationResult, file: str) -> None:

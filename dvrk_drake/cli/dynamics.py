@@ -13,19 +13,19 @@ from dvrk_drake.errors import RecordingError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from dvrk_drake.analysis.dynamic.validation import DynamicValidation
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.recording import Recording
 
 
-#: Published and our own models are off by at most 0.34 of an actuator's effort, in other motions of the same arm.
-_UNEXPLAINED = 0.5
-
-
 def refuse_unusable(
     console: Console, recording: Recording, arm: Arm, warn: bool = False, apart_from: tuple[str, ...] = ()
-) -> None:
+) -> list[str]:
     """Prints what `check` refuses in a recording, and its warnings if wanted, `apart_from` kinds of findings.
+
+    Returns:
+        The warnings.
 
     Raises:
         RecordingError: it refuses anything.
@@ -39,11 +39,14 @@ def refuse_unusable(
     if refusals := [finding for finding in findings if finding.severity == "refusal"]:
         first = refusals[0]
         raise RecordingError(f"{recording.source or 'recording'}: refused: {first.where}: {first.what}; {first.advice}")
+    return [str(finding) for finding in findings if finding.severity == "warning"]
 
 
 def _warn_unexplained(console: Console, errors: dict[str, float]) -> None:
     """Says which actuators' efforts are explained so badly (relative errors) that something else must be wrong."""
-    if bad := [f"{name} ({error:.0%})" for name, error in errors.items() if error > _UNEXPLAINED]:
+    from dvrk_drake.analysis.verdict import USABLE_RATIO_IN_MOTION
+
+    if bad := [f"{name} ({error:.0%})" for name, error in errors.items() if error > USABLE_RATIO_IN_MOTION]:
         console.print(
             f"warning: {', '.join(bad)}: most of the effort is not explained; is a sign, a unit or --coordinates "
             "wrong, or is it another arm? Do not use the model for these",
@@ -81,27 +84,26 @@ def identify_motion(options: argparse.Namespace, recording: Recording, arm: Arm,
         console.print(f"plots: {options.plots}")
 
 
-def validate_in_motion(
-    options: argparse.Namespace, model: IdentifiedModel, recording: Recording, plots: Path | None
+def show_motion_validation(
+    options: argparse.Namespace, validation: DynamicValidation, model: IdentifiedModel, source: str, plots: Path | None
 ) -> None:
-    """Compares a dynamic model with a motion, prints the errors, writes the JSON and the plots."""
+    """Writes the JSON of a dynamic model compared with a motion, prints verdicts and errors, writes the plots."""
     from dvrk_drake.analysis.dynamic.tables import print_dynamic_validation
-    from dvrk_drake.analysis.dynamic.validation import validate_motion
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.models.atomic_file import atomic_write
 
     console = make_console()
-    validation = validate_motion(model, recording)
-    print_dynamic_validation(console, validation)
-    errors = {a.name: a.relative_error for a in validation.actuators if a.relative_error is not None}
-    _warn_unexplained(console, errors)
     if options.json is not None:
         with atomic_write(options.json) as stream:
             json.dump(validation.as_dict(), stream, indent=2)
             stream.write("\n")
+    print_dynamic_validation(console, validation)
+    bad = (a for a in validation.actuators if a.verdict == "do not use")
+    errors = {a.name: a.relative_error for a in bad if a.relative_error is not None}
+    _warn_unexplained(console, errors)
     if plots is not None:
         from dvrk_drake.analysis.dynamic.plots import plot_motion
 
         arm = model.load_arm()
-        plot_motion(plots, arm, validation, f"{arm.name}, {Path(recording.source).name}")
+        plot_motion(plots, arm, validation, f"{arm.name}, {Path(source).name}")
         console.print(f"plots: {options.plots}")

@@ -6,8 +6,10 @@ import argparse
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from dvrk_drake.cli.dynamics import identify_motion, refuse_unusable, validate_in_motion
+from dvrk_drake.cli.dynamics import identify_motion, refuse_unusable, show_motion_validation
 from dvrk_drake.cli.support import (
     ProgressBar,
     add_gravity,
@@ -18,6 +20,11 @@ from dvrk_drake.cli.support import (
     print_notes,
     write_tables,
 )
+
+if TYPE_CHECKING:
+    from dvrk_drake.analysis.static.validation import Validation
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.models.recording import Recording
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -39,7 +46,13 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb = verbs.add_parser("validate", help="compare a model with a recording that it was not made from")
     verb.add_argument("model", metavar="MODEL.yaml")
     add_recording(verb)
-    verb.add_argument("--json", metavar="FILE", help="write the errors as JSON")
+    verb.add_argument(
+        "--require",
+        choices=("good", "usable"),
+        help="exit code 2 unless every joint that the model commands has this verdict or a better one",
+    )
+    verb.add_argument("--save", action="store_true", help="store the verdicts in MODEL.yaml, where run looks for them")
+    verb.add_argument("--json", metavar="FILE", help="write verdicts and errors as JSON")
     verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.set_defaults(run=_validate)
@@ -53,16 +66,24 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--output", required=True, metavar="FILE.csv", help="columns tau1.., one row a row")
     verb.set_defaults(run=_predict)
 
-    verb = verbs.add_parser("convert", help="turn a recording (LCM log, team .mat, WPI 21-column CSV) into our CSV")
+    verb = verbs.add_parser("convert", help="turn a recording (CSV, LCM log, team .mat, WPI CSV) into our CSV")
     verb.add_argument("input", metavar="INPUT")
     verb.add_argument("output", metavar="OUTPUT.csv")
-    verb.add_argument("--format", choices=("team-mat", "wpi-csv", "lcm-log"), help="default: detected")
+    verb.add_argument("--format", choices=("csv", "team-mat", "wpi-csv", "lcm-log"), help="default: detected")
+    verb.add_argument(
+        "--coordinates",
+        choices=("joint", "actuator"),
+        help="what q and tau of a CSV with a header are of; needed there, the other formats define it",
+    )
     verb.add_argument("--variable", metavar="NAME", help="the .mat's variable, where several fit")
     verb.add_argument(
-        "--rate", type=float, default=200.0, metavar="HZ", help="samples a second of the CSV; default: 200"
+        "--rate",
+        type=float,
+        metavar="HZ",
+        help="samples a second of a CSV without time stamps; default: WPI 200, with a header none are written",
     )
     verb.add_argument(
-        "--arm", help="e.g. psm; WPI: write its joint coordinates instead of the actuators'; LCM log: which arm"
+        "--arm", help="e.g. psm; CSV, WPI: write its joint coordinates, not the actuators'; LCM log: which arm"
     )
     verb.add_argument("--skip-invalid", action="store_true", help="leave out rows that are not numbers, and count them")
     verb.set_defaults(run=_convert)
@@ -120,12 +141,13 @@ def _identify(options: argparse.Namespace) -> None:
 
 
 def _validate(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.plots import plot_validation
+    from dvrk_drake.analysis.dynamic.validation import DynamicValidation, validate_motion
     from dvrk_drake.analysis.signals.poses import find_poses
     from dvrk_drake.analysis.static.validation import validate
-    from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.analysis.verdict import unfit
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary
+    from dvrk_drake.errors import ModelError
     from dvrk_drake.models.recording import read_recording
 
     model = IdentifiedModel.load(options.model)
@@ -136,13 +158,62 @@ def _validate(options: argparse.Namespace) -> None:
         check_output(options.json, options.recording, options.model)
     plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
+    sha256, source = recording.sha256, recording.source
+    same = bool(sha256) and sha256 == model.provenance.sha256
+    if options.save:
+        check_output(options.model, options.recording)
+        if same:
+            raise ModelError(f"{source}: --save needs a recording that the model was not identified from")
     recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
-    refuse_unusable(console, recording, arm, warn=True)
-    if moves and model.dynamics is not None:
-        validate_in_motion(options, model, recording, plots)
-        return
-    if note:
-        console.print(note)
+    warnings = refuse_unusable(console, recording, arm)
+    in_motion = moves and model.dynamics is not None
+    validation = validate_motion(model, recording) if in_motion else validate(model, recording, measured)
+    # Before anything is printed: whoever reads the output may close it (head).
+    if options.save:
+        summary = ValidationSummary(source, sha256, dict(validation.verdicts))
+        replace(model, validation=summary).save(options.model)
+    failed = [] if options.require is None else unfit(validation.verdicts, options.require)
+    if isinstance(validation, DynamicValidation):
+        show_motion_validation(options, validation, model, source, plots)
+    else:
+        _show_validation(options, validation, model, recording, plots)
+        if note:
+            console.print(note)
+    for warning in warnings:
+        console.print(warning, style="yellow", markup=False, soft_wrap=True)
+    if options.save:
+        console.print(f"verdicts saved: {options.model}")
+    if same:
+        print(
+            f"dvrk-drake: warning: {source}: the model was identified from this recording, so these are errors of the "
+            "fit; validate with another one",
+            file=sys.stderr,
+        )
+    if failed:
+        raise ModelError(
+            f"{options.model}: not {options.require} on {source}: {', '.join(failed)}; identify from a recording with "
+            "more varied poses, or recalibrate"
+        )
+
+
+def _show_validation(
+    options: argparse.Namespace,
+    validation: Validation,
+    model: IdentifiedModel,
+    recording: Recording,
+    plots: Path | None,
+) -> None:
+    """Writes the JSON of a model compared with poses, prints verdicts and errors, writes the plots."""
+    from dvrk_drake.analysis.plots import plot_validation
+    from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
+    from dvrk_drake.models.atomic_file import atomic_write
+
+    console, arm = make_console(), model.load_arm()
+    if options.json is not None:
+        with atomic_write(options.json) as stream:
+            json.dump(validation.as_dict(), stream, indent=2)
+            stream.write("\n")
+    print_validation(console, validation)
     if motion := recording.motion(arm):
         console.print(
             f"the arm moves in this recording ({motion}): the model holds poses, and "
@@ -150,13 +221,7 @@ def _validate(options: argparse.Namespace) -> None:
             style="yellow",
             soft_wrap=True,
         )
-    validation = validate(model, recording, measured)
     print_doubts(console, validation.doubts)
-    print_validation(console, validation)
-    if options.json is not None:
-        with atomic_write(options.json) as stream:
-            json.dump(validation.as_dict(), stream, indent=2)
-            stream.write("\n")
     if plots is not None:
         plot_validation(plots, model, validation, recording.in_joint_coordinates(arm))
         console.print(f"plots: {options.plots}")
@@ -200,6 +265,7 @@ def _convert(options: argparse.Namespace) -> None:
         options.input,
         options.output,
         format=options.format,
+        coordinates=options.coordinates,
         variable=options.variable,
         rate=options.rate,
         arm=None if options.arm is None else load_arm(options.arm),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from dvrk_drake.cli.support import add_gravity, mounted, quiet_drake
 
 if TYPE_CHECKING:
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm_schema import Gains
     from dvrk_drake.processes.arm_controller import ArmController
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
@@ -222,6 +223,8 @@ def ready_controller(
     model = IdentifiedModel.from_arm(arm) if options.model is None else IdentifiedModel.load(options.model)
     if model.load_arm().name != arm.name:
         raise ModelError(f"{options.model}: is of {model.load_arm().name}, not of {arm.name}")
+    if options.model is not None and (warning := model_warning(options.model, model)):
+        _warn(warning)
     url = open_lcm(options.lcm_url).get_lcm_url()
     with closing(ArmLink(arm, url)) as link:
         if reset:
@@ -235,6 +238,22 @@ def ready_controller(
             _warn(warning)
     settle_memory()
     return controller, url, period
+
+
+def model_warning(path: str, model: IdentifiedModel) -> str:
+    """The joints of a model that did not pass validation, or that nothing but cross-validation judged; or ""."""
+    from dvrk_drake.analysis.verdict import cross_validated_verdicts, unfit
+
+    if model.validation is None:
+        bad = unfit(cross_validated_verdicts(model), "usable")
+        found = f"; cross-validated: {', '.join(bad)}" if bad else ""
+        command = f"dvrk-drake validate {path} OTHER.csv --save"
+        return f"{path}: no other recording has validated this model{found}; run: {command}"
+    verdicts = model.validation.verdicts
+    if not (bad := unfit({joint.name: verdicts[joint.name] for joint in model.joints}, "usable")):
+        return ""
+    where = model.validation.recording
+    return f"{path}: did not pass validation on {where}: {', '.join(bad)}; their torque may be worse than none"
 
 
 def _warn(text: str) -> None:

@@ -72,12 +72,25 @@ class Provenance:
 
 
 @dataclass
+class ValidationSummary:
+    """Verdict on each joint by `validate` on a recording that the model was not identified from.
+
+    `sha256` is of the recording's bytes.
+    """
+
+    recording: str = ""
+    sha256: str = ""
+    verdicts: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
 class IdentifiedModel:
     """What holds an arm: tau = trust o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
 
     `gravity` [m/s^2] is the gravity vector in the base frame that the base parameters were identified with. `effects`
     are those of a model identified from poses, of position alone. One identified from a motion has `dynamics`, with
-    effects of all kinds; its base parameters are those of the links there.
+    effects of all kinds; its base parameters are those of the links there. `validation` is what `validate --save`
+    stored.
     """
 
     format: str = "dvrk_drake identified model 2"
@@ -88,6 +101,7 @@ class IdentifiedModel:
     joints: list[JointStatistics] = field(default_factory=list)
     provenance: Provenance = field(default_factory=Provenance)
     dynamics: DynamicSection | None = None
+    validation: ValidationSummary | None = None
 
     @classmethod
     def from_arm(cls, arm: Arm, effects: Sequence[DriveEffect] = ()) -> "IdentifiedModel":
@@ -151,6 +165,8 @@ class IdentifiedModel:
         for i, effect in enumerate(self.effects):
             if fault := effect_fault(arm, effect.effect, POSITION_KINDS):
                 raise ModelError(f"effects[{i}]: {fault}")
+        if self.validation is not None and set(self.validation.verdicts) != set(arm.joint_names):
+            raise ModelError(f"validation.verdicts must name these joints: {', '.join(arm.joint_names)}")
         if not np.all(np.isfinite(self.theta)) or not np.all((self.trust >= 0) & (self.trust <= 1)):
             raise ModelError("parameters must be finite numbers and trust between 0 and 1")
         if self.dynamics is not None:

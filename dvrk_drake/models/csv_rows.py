@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 
@@ -62,6 +63,11 @@ def listed(numbers: Iterable[int]) -> str:
     """The first ten of them, in words."""
     texts = list(map(str, numbers))
     return ", ".join(texts if len(texts) <= 10 else [*texts[:10], "..."])
+
+
+def skipped_note(skipped: NDArray[np.int_], count: int) -> str:
+    """The note on the lines that were left out of `count` rows."""
+    return f"{len(skipped)} of {count} rows skipped (NaN or infinite): lines {listed(skipped)}"
 
 
 def is_number(cell: str) -> bool:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.atomic_file import atomic_write
-from dvrk_drake.models.csv_rows import is_number, parse_finite, read_rows
+from dvrk_drake.models.csv_rows import is_number, parse_finite, parse_number, read_rows, skipped_note
 from dvrk_drake.models.lcm_log import is_lcm_log
 from dvrk_drake.models.status_log import read_status_log
 
@@ -173,7 +173,9 @@ class Recording:
             )
 
 
-def read_recording(path: str | Path, arm: Arm | None = None, coordinates: Coordinates = "joint") -> Recording:
+def read_recording(
+    path: str | Path, arm: Arm | None = None, coordinates: Coordinates = "joint", *, skip_invalid: bool = False
+) -> Recording:
     """Reads a CSV, or an LCM log with the DVRK_STATUS messages of an arm; the file's first bytes tell which.
 
     A CSV has a header: q1..qn, optionally t, qd1..qdn and tau1..taun, in any order; others are ignored. What is read of
@@ -184,6 +186,7 @@ def read_recording(path: str | Path, arm: Arm | None = None, coordinates: Coordi
         arm: whose joints are counted and named in messages, and whose statuses are read of a log; without it a CSV has
             7 joints, as all arms have so far, and a log statuses of one arm only.
         coordinates: what q, qd and tau are of; a log's are of the joints.
+        skip_invalid: leave out rows of a CSV with a NaN or an infinity, and note them, instead of refusing the file.
 
     Raises:
         RecordingError: names the file, the line and the column of what is wrong.
@@ -196,10 +199,10 @@ def read_recording(path: str | Path, arm: Arm | None = None, coordinates: Coordi
             raise RecordingError(f"{path}: an LCM log is in joint coordinates, not {coordinates}")
         log = read_status_log(path, arm)
         return Recording(log.q, log.tau, log.qd, log.t, "joint", str(path), log.events, log.sha256, log.notes)
-    return _read_csv(path, arm, coordinates)
+    return _read_csv(path, arm, coordinates, skip_invalid)
 
 
-def _read_csv(path: Path, arm: Arm | None, coordinates: Coordinates) -> Recording:
+def _read_csv(path: Path, arm: Arm | None, coordinates: Coordinates, skip_invalid: bool) -> Recording:
     num_joints = arm.num_joints if arm else 7
     numbered, sha256 = read_rows(path)
     if not numbered:
@@ -234,12 +237,20 @@ def _read_csv(path: Path, arm: Arm | None, coordinates: Coordinates) -> Recordin
     wanted = [column for block in blocks.values() for column in block]
     if "t" in header:
         wanted.append(header.index("t"))
-    values = np.empty((len(numbered) - 1, len(header)))
+    parse = parse_number if skip_invalid else parse_finite
+    values = np.zeros((len(numbered) - 1, len(header)))
     for row, (line, cells) in enumerate(numbered[1:]):
         if len(cells) != len(header):
             raise RecordingError(f"{path}:{line}: has {len(cells)} cells, the header names {len(header)} columns")
         for column in wanted:
-            values[row, column] = parse_finite(cells[column], f"{path}:{line}: {header[column]}")
+            values[row, column] = parse(cells[column], f"{path}:{line}: {header[column]}")
+    lines, valid = np.array([line for line, _ in numbered[1:]]), np.all(np.isfinite(values), axis=1)
+    notes: tuple[str, ...] = ()
+    if not np.all(valid):
+        notes = (skipped_note(lines[~valid], len(lines)),)
+        values, lines = values[valid], lines[valid]
+    if not len(values):
+        raise RecordingError(f"{path}: has no row of finite numbers")
     return Recording(
         q=values[:, blocks["q"]],
         tau=values[:, blocks["tau"]] if "tau" in blocks else None,
@@ -247,8 +258,9 @@ def _read_csv(path: Path, arm: Arm | None, coordinates: Coordinates) -> Recordin
         t=values[:, header.index("t")] if "t" in header else None,
         coordinates=coordinates,
         source=str(path),
-        lines=np.array([line for line, _ in numbered[1:]]),
+        lines=lines,
         sha256=sha256,
+        notes=notes,
     )
 
 

@@ -10,10 +10,11 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.csv_rows import is_number, listed, parse_finite, parse_number, read_rows
+from dvrk_drake.models.csv_rows import is_number, parse_finite, parse_number, read_rows, skipped_note
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.recording import Recording
 
@@ -28,58 +29,63 @@ _WPI_COLUMNS = [f"{prefix}{i + 1}" for prefix in ("q", "qd", "tau") for i in ran
 _WPI_LAYOUT = "21 numbers a row: q1..q7, qd1..qd7, tau1..tau7"
 
 
-def read_wpi_csv(path: str | Path, rate: float = WPI_RATE, *, skip_invalid: bool = False) -> Recording:
+def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: bool = False) -> Recording:
     """A motion from a CSV without a header: q1..q7, qd1..qd7, tau1..tau7, in actuator coordinates.
 
     Units are rad, rad/s and N m. Of a PSM, axis 3 is in m, m/s and N, and axis 7 is the jaw. The file has
-    no time stamps: t = row / rate.
+    no time stamps: t = row / rate. The CSV that `convert` wrote without an arm (header t, q1.., qd1.., tau1..) is
+    read as well. It keeps its time stamps.
 
     Format: https://github.com/WPI-AIM/dvrk_dynamics_identification, files
     `data/*/measured_trajectory/*_results.csv`.
 
     Args:
         path: the CSV file.
-        rate: samples a second [Hz].
+        rate: samples a second [Hz]; default: `WPI_RATE`.
         skip_invalid: leave out rows with a NaN or an infinity instead of refusing the file; the other rows
             keep their t.
 
     Raises:
-        RecordingError: not such a file, fewer than two rows, or a cell that is no finite number.
+        RecordingError: not such a file, fewer than two rows, a cell that is no finite number, or a rate for a file that
+            has time stamps.
     """
-    if not (np.isfinite(rate) and rate > 0):
-        raise RecordingError(f"rate must be a positive number of Hz, not {rate}")
     path = Path(path)
     rows, sha256 = read_rows(path)
     if not rows:
         raise RecordingError(f"{path}: is empty; needs {_WPI_LAYOUT}")
     first_line, first = rows[0]
-    if [cell.strip() for cell in first] == ["t", *_WPI_COLUMNS]:
-        # Ours already, from an earlier conversion: its times are made anew.
-        rows = [(line, cells[1:]) for line, cells in rows[1:]]
+    timed = first == ["t", *_WPI_COLUMNS]
+    names = ["t", *_WPI_COLUMNS] if timed else _WPI_COLUMNS
+    if timed:
+        refuse_rate(path, rate)
+        rows = rows[1:]
     elif not any(is_number(cell) for cell in first):
         raise RecordingError(
             f"{path}:{first_line}: has a header, which wpi-csv has not ({_WPI_LAYOUT}); "
             "a CSV whose header names q1..q7 needs no conversion"
         )
-    values = np.empty((len(rows), len(_WPI_COLUMNS)))
+    values = np.empty((len(rows), len(names)))
     parse = parse_number if skip_invalid else parse_finite
     for row, (line, cells) in enumerate(rows):
-        if len(cells) != len(_WPI_COLUMNS):
-            raise RecordingError(f"{path}:{line}: has {len(cells)} cells; wpi-csv has {_WPI_LAYOUT}")
+        if len(cells) != len(names):
+            layout = f"its header names {len(names)} columns" if timed else f"wpi-csv has {_WPI_LAYOUT}"
+            raise RecordingError(f"{path}:{line}: has {len(cells)} cells; {layout}")
         for column, cell in enumerate(cells):
-            values[row, column] = parse(cell, f"{path}:{line}: {_WPI_COLUMNS[column]} (column {column + 1})")
+            values[row, column] = parse(cell, f"{path}:{line}: {names[column]} (column {column + 1})")
     valid = np.all(np.isfinite(values), axis=1)
     lines = np.array([line for line, _ in rows])
     kept = values[valid]
     if len(kept) < 2:
         raise RecordingError(f"{path}: has {len(kept)} valid row{'s' * (len(kept) != 1)}; a motion needs at least 2")
-    repeats = int(np.sum(np.all(np.diff(kept, axis=0) == 0, axis=1)))
-    notes = [
-        f"{len(kept)} samples; the file has no time stamps, so t = row / {rate:g} Hz",
-    ]
+    if timed:
+        t, kept = kept[:, 0], kept[:, 1:]
+        notes = time_notes(t, lines[valid])
+    else:
+        t, note = made_times(np.flatnonzero(valid), WPI_RATE if rate is None else rate)
+        notes = [note]
     if len(kept) < len(values):
-        skipped = listed(lines[~valid])
-        notes.append(f"{len(values) - len(kept)} of {len(values)} rows skipped (NaN or infinite): lines {skipped}")
+        notes.append(skipped_note(lines[~valid], len(values)))
+    repeats = int(np.sum(np.all(np.diff(kept, axis=0) == 0, axis=1)))
     if repeats:
         notes.append(f"{repeats} of {len(kept)} rows repeat the row before them (polled too fast); they are kept")
     q, qd, tau = np.split(kept, 3, axis=1)
@@ -87,13 +93,45 @@ def read_wpi_csv(path: str | Path, rate: float = WPI_RATE, *, skip_invalid: bool
         q=q,
         tau=tau,
         qd=qd,
-        t=np.flatnonzero(valid) / rate,
+        t=t,
         coordinates="actuator",
         source=str(path),
         lines=lines[valid],
         notes=tuple(notes),
         sha256=sha256,
     )
+
+
+def refuse_rate(path: Path, rate: float | None) -> None:
+    """Raises RecordingError if a rate is given for a file that has time stamps."""
+    if rate is not None:
+        raise RecordingError(f"{path}: --rate does not apply: the file has time stamps (column t), which are kept")
+
+
+def made_times(rows: NDArray[np.intp], rate: float) -> tuple[NDArray[np.float64], str]:
+    """Times [s] for the numbers of rows of a file without time stamps, and the note that says so.
+
+    Raises:
+        RecordingError: the rate is no positive number.
+    """
+    if not (np.isfinite(rate) and rate > 0):
+        raise RecordingError(f"rate must be a positive number of Hz, not {rate}")
+    return rows / rate, f"{len(rows)} samples; the file has no time stamps, so t = row / {rate:g} Hz"
+
+
+def time_notes(t: NDArray[np.float64], lines: NDArray[np.int_]) -> list[str]:
+    """What a user must know of time stamps (m,) that are kept; `lines` (m,) are those of the file."""
+    steps = np.diff(t)
+    interval = f", median interval {1e3 * np.median(steps):.4g} ms" if len(steps) else ""
+    notes = [f"{len(t)} rows, t from {t[0]:g} to {t[-1]:g} s as in the file{interval}"]
+    if np.any(steps <= 0):
+        repeated, back = int(np.sum(steps == 0)), int(np.sum(steps < 0))
+        notes.append(
+            f"t does not always increase: {repeated} row{'s repeat' if repeated != 1 else ' repeats'} the t before "
+            f"{'them' if repeated != 1 else 'it'}, {back} go{'es' * (back == 1)} back, first at line "
+            f"{lines[1:][steps <= 0][0]}; kept, but a motion with such times is refused by identify"
+        )
+    return notes
 
 
 def wpi_in_joint_coordinates(recording: Recording, arm: Arm) -> Recording:

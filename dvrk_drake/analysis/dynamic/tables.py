@@ -11,7 +11,7 @@ from rich.markup import escape
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification
 from dvrk_drake.analysis.dynamic.estimates import DRY_KINDS, LEAST_TOLD
 from dvrk_drake.analysis.dynamic.validation import DynamicValidation
-from dvrk_drake.analysis.tables import make_table
+from dvrk_drake.analysis.tables import VERDICT_STYLES, make_table, print_rule, print_verdict
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS
 from dvrk_drake.dynamics.dynamic_section import (
     ActuatorEffectEstimate,
@@ -61,24 +61,24 @@ def print_dynamics(console: Console, result: DynamicIdentification, full: bool =
 
 
 def print_dynamic_validation(console: Console, validation: DynamicValidation) -> None:
-    """Errors on a motion and of what kind they are."""
-    title = f"Efforts of the actuators behind {validation.cut_off:g} Hz [N m; N]"
-    kinds = ("bias", "friction-like", "position", "other")
-    table = make_table(title, "", "measured RMS", "error", "%", "floor %", *kinds)
+    """Verdicts, errors on a motion and of what kind they are."""
+    print_verdict(console, validation.verdicts)
+    title = f"RMS effort error of the actuators behind {validation.cut_off:g} Hz [N m; N]"
+    table = make_table(title, "", "measured RMS", "error", "ratio %", "floor %", "verdict")
+    table.columns[-1].justify = "left"
     for a in validation.actuators:
-        relative = "" if a.relative_error is None else f"{100 * a.relative_error:.1f}"
-        floor = "" if a.repeatability is None else f"{100 * a.repeatability:.1f}"
-        shares = (a.bias, a.friction_like, a.position_dependent, a.other)
-        table.add_row(
-            a.name, f"{a.rms_effort:.4f}", f"{a.rms_error:.4f}", relative, floor, *(f"{s:.0%}" for s in shares)
-        )
-    table.add_row("mean", "", "", f"{100 * validation.mean_relative_error:.1f}", "", *[""] * len(kinds))
+        numbers = ("" if x is None else f"{100 * x:.1f}" for x in (a.relative_error, a.repeatability))
+        style = VERDICT_STYLES.get(a.verdict, "")
+        table.add_row(a.name, f"{a.rms_effort:.4f}", f"{a.rms_error:.4f}", *numbers, a.verdict, style=style)
+    table.add_row("mean", "", "", f"{100 * validation.mean_relative_error:.1f}", "", "")
     console.print(table)
-    console.print(
-        "bias ... other: shares of the squared error. Much bias or friction: recalibrate; much position: cables\n",
-        style="dim",
-        soft_wrap=True,
-    )
+    print_rule(console, in_motion=True)
+    table = make_table("Shares of the squared error", "", "bias", "friction-like", "position", "other")
+    for a in validation.actuators:
+        shares = (a.bias, a.friction_like, a.position_dependent, a.other)
+        table.add_row(a.name, *(f"{s:.0%}" for s in shares))
+    console.print(table)
+    console.print("Much bias or friction: recalibrate; much position: cables\n", style="dim", soft_wrap=True)
 
 
 _COLUMNS = ("", "value", "+-", "unit")

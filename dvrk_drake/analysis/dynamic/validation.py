@@ -11,6 +11,7 @@ from dvrk_drake.analysis.signals.low_pass import low_pass
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
 from dvrk_drake.analysis.signals.phase_folds import period_of
 from dvrk_drake.analysis.signals.repetition import repeatability_floor
+from dvrk_drake.analysis.verdict import Verdict, judge, rule_text, worst
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.recording import Recording
 
@@ -28,6 +29,7 @@ class ActuatorError:
     shares: `bias` is its mean, `friction_like` what viscous and Coulomb friction in the actuator would explain of it
     then, `position_dependent` what two harmonics over its travel would explain of what is left, `other` the remainder.
     `repeatability`: what differs from period to period, relative; None where the motion does not repeat.
+    `verdict`: see `judge`.
     """
 
     name: str
@@ -39,6 +41,7 @@ class ActuatorError:
     position_dependent: float
     other: float
     repeatability: float | None
+    verdict: Verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +70,16 @@ class DynamicValidation:
         errors = [a.relative_error for a in self.actuators if a.relative_error is not None]
         return float(np.mean(errors)) if errors else float("nan")
 
+    @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """Verdict on each actuator."""
+        return {actuator.name: actuator.verdict for actuator in self.actuators}
+
     def as_dict(self) -> dict:
         """What `validate --json` writes."""
         return {
+            "verdict": worst(self.verdicts)[0],
+            "rule": rule_text(in_motion=True),
             "coordinates": "actuator",
             "cut_off_hz": self.cut_off,
             "mean_relative_error": self.mean_relative_error,
@@ -112,7 +122,7 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
         floors = repeatability_floor(tau, grid.rate, period, grid.settings.effort_cut_off)
         floor = [float(x) if np.isfinite(x) else None for x in floors]
     actuators = [
-        _actuator_error(name, measured[:, i], predicted[:, i], a[:, i], v[:, i], floor[i])
+        _actuator_error(name, measured[:, i], predicted[:, i], a[:, i], v[:, i], floor[i], float(arm.effort_limits[i]))
         for i, name in enumerate(arm.joint_names)
     ]
     t = grid.row_times[grid.inner]
@@ -130,6 +140,7 @@ def _actuator_error(
     q: NDArray[np.float64],
     v: NDArray[np.float64],
     repeatability: float | None,
+    effort_limit: float,
 ) -> ActuatorError:
     error = measured - predicted
     effort, size = float(np.sqrt(np.mean(measured**2))), float(np.sqrt(np.mean(error**2)))
@@ -151,4 +162,5 @@ def _actuator_error(
         left = rest
     bias, friction, position = shares
     relative = size / effort if effort > 0 else None
-    return ActuatorError(name, effort, size, relative, bias, friction, position, left / whole, repeatability)
+    verdict = judge(effort, size, effort_limit, in_motion=True)
+    return ActuatorError(name, effort, size, relative, bias, friction, position, left / whole, repeatability, verdict)

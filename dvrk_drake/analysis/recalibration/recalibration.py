@@ -242,4 +242,4 @@ def _with_section(model: IdentifiedModel, section: DynamicSection, recording: Re
     provenance = replace(
         model.provenance, method=f"{model.provenance.method}, recalibrated on {recording.source or 'a recording'}"
     )
-    return replace(model, dynamics=section, provenance=provenance)
+    return replace(model, dynamics=section, provenance=provenance, validation=None)

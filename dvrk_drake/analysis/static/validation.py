@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.static.doubts import Doubt, check_effort_unit, find_doubts, usable_measurements
 from dvrk_drake.analysis.static.linear_fit import rms
+from dvrk_drake.analysis.verdict import Verdict, judge, rule_text, worst
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
@@ -20,7 +21,8 @@ class JointError:
 
     `rms_torque` is what commanding zero torque would err by; `relative_error` = rms_error / rms_torque, None where
     nothing was measured. `_undoubted`
-    leaves out `num_doubted` measurements of poses that rest on a stop or exceed the effort limit.
+    leaves out `num_doubted` measurements of poses that rest on a stop or exceed the effort limit. `verdict` judges what
+    is left, see `judge`.
     """
 
     name: str
@@ -29,7 +31,9 @@ class JointError:
     relative_error: float | None
     rms_torque_undoubted: float
     rms_error_undoubted: float
+    relative_error_undoubted: float | None
     num_doubted: int
+    verdict: Verdict
 
 
 @dataclass(frozen=True)
@@ -45,9 +49,16 @@ class Validation:
     doubts: list[Doubt]
     measured: NDArray[np.bool_]
 
+    @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """Verdict on each joint."""
+        return {joint.name: joint.verdict for joint in self.joints}
+
     def as_dict(self) -> dict:
         """What `validate --json` writes."""
         return {
+            "verdict": worst(self.verdicts)[0],
+            "rule": rule_text(in_motion=False),
             "joints": [asdict(joint) for joint in self.joints],
             "poses": self.poses,
             "doubted": [{"where": doubt.where, "reason": doubt.reason} for doubt in self.doubts],
@@ -84,7 +95,8 @@ def validate(
     """
     arm = model.load_arm()
     measured = recording.measured_effort()
-    residuals = measured - predict(model, recording)
+    predicted = predict(model, recording)
+    residuals = measured - predicted
     in_joints = recording.in_joint_coordinates(arm)
     if measured_joints is None:
         measured_joints = np.ones(measured.shape, dtype=bool)
@@ -94,7 +106,8 @@ def validate(
     if recording.coordinates == "actuator":
         # A doubt about a joint touches every actuator that drives it.
         usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
-    errors = _joint_errors(arm, measured, residuals, measured_joints, usable)
+    commanded = np.any(predicted != 0, axis=0)
+    errors = _joint_errors(arm, measured, residuals, measured_joints, usable, commanded)
     return Validation(errors, len(recording), residuals, doubts, measured_joints)
 
 
@@ -104,20 +117,25 @@ def _joint_errors(
     residuals: NDArray[np.float64],
     measured_joints: NDArray[np.bool_],
     usable: NDArray[np.bool_],
+    commanded: NDArray[np.bool_],
 ) -> list[JointError]:
     errors = []
     for j, name in enumerate(arm.joint_names):
         every, use = measured_joints[:, j], usable[:, j]
         torque, error = rms(measured[every, j]), rms(residuals[every, j])
+        torque_used, error_used = rms(measured[use, j]), rms(residuals[use, j])
+        limit = float(arm.effort_limits[j])
         errors.append(
             JointError(
                 name,
                 torque,
                 error,
                 error / torque if torque > 0 else None,
-                rms(measured[use, j]),
-                rms(residuals[use, j]),
+                torque_used,
+                error_used,
+                error_used / torque_used if torque_used > 0 else None,
                 int(np.sum(every & ~use)),
+                judge(torque_used, error_used, limit, in_motion=False, commanded=bool(commanded[j])),
             )
         )
     return errors

@@ -66,7 +66,7 @@ def test_wpi_csv_errors_name_file_line_and_column(tmp_path, case):
     text, match = WPI_ERRORS[case]
     path = write_text(tmp_path, text)
     assert_refused(match, read_wpi_csv, path)
-    assert_refused(match, convert, path, tmp_path / "out.csv")
+    assert_refused(match, convert, path, tmp_path / "out.csv", format="wpi-csv")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["motion.csv"]
 
 

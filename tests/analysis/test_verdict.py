@@ -1,0 +1,269 @@
+"""The verdict on each joint of a model: the rule, its evidence, and where `validate` and `run` take it from."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dvrk_drake.analysis.static.static_identification import LEAST_TORQUE
+from dvrk_drake.analysis.static.validation import validate
+from dvrk_drake.analysis.verdict import (
+    GOOD_RATIO,
+    SMALL_ERROR,
+    USABLE_RATIO_AT_REST,
+    USABLE_RATIO_IN_MOTION,
+    cross_validated_verdicts,
+    judge,
+    rule_text,
+    unfit,
+    worst,
+)
+from dvrk_drake.cli import main
+from dvrk_drake.cli.lcm import model_warning
+from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics, DynamicSection
+from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary
+from dvrk_drake.errors import ModelError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.recording import Recording, read_recording, write_recording
+
+
+@pytest.mark.parametrize(
+    ("effort", "error", "at_rest", "in_motion"),
+    [
+        (1.0, 0.34, "good", "good"),
+        (1.0, 0.36, "usable", "usable"),
+        (1.0, 0.51, "usable", "do not use"),
+        (1.0, 0.99, "usable", "do not use"),
+        (1.0, 1.01, "do not use", "do not use"),
+        # The limit is 10: up to 0.2 is small, whatever the ratio.
+        (0.01, 0.19, "usable", "usable"),
+        (0.01, 0.21, "do not use", "do not use"),
+        (0.01, 0.003, "good", "good"),
+        (0.0, 0.1, "not judged", "not judged"),
+        (1.0, float("nan"), "not judged", "not judged"),
+    ],
+)
+def test_the_rule(effort, error, at_rest, in_motion):
+    assert judge(effort, error, 10.0, in_motion=False) == at_rest
+    assert judge(effort, error, 10.0, in_motion=True) == in_motion
+    assert judge(effort, error, 10.0, in_motion=False, commanded=False) == "off"
+
+
+def test_the_printed_rule_has_the_numbers_of_the_rule():
+    for number in (f"{GOOD_RATIO:g}", f"{USABLE_RATIO_AT_REST:g}", f"{100 * SMALL_ERROR:g} %"):
+        assert f"up to {number}" in rule_text(in_motion=False)
+    for ratio in (GOOD_RATIO, USABLE_RATIO_IN_MOTION, SMALL_ERROR):
+        assert f"up to {100 * ratio:g} %" in rule_text(in_motion=True)
+
+
+def test_the_worst_verdict_and_the_joints_that_fail():
+    verdicts = {"a": "off", "b": "good", "c": "usable", "d": "good"}
+    assert worst(verdicts) == ("usable", ["c"])
+    assert worst({"a": "off", "b": "good"}) == ("good", ["b"])
+    assert worst({**verdicts, "e": "not judged"}) == ("not judged", ["e"])
+    assert worst({**verdicts, "e": "not judged", "f": "do not use"}) == ("do not use", ["f"])
+    assert unfit(verdicts, "usable") == []
+    assert unfit(verdicts, "good") == ["c (usable)"]
+    assert unfit({"a": "do not use", "b": "not judged"}, "usable") == ["a (do not use)", "b (not judged)"]
+
+
+@pytest.mark.parametrize("name", ["mtmr", "psm"])
+def test_a_small_error_is_noise_or_held_by_friction(name):
+    """Below the dry friction of each joint but the PSM's roll, ten times above the noise of measured efforts."""
+    arm = load_arm(name)
+    friction = dict.fromkeys(arm.joint_names, 0.0)
+    for effect in arm.effects.friction:
+        joint = effect.coordinate.split(".")[-1]
+        if effect.kind == "presliding" and joint in friction:
+            friction[joint] += effect.coefficient
+    for joint, limit in zip(arm.joint_names, arm.effort_limits, strict=True):
+        assert arm.effects.effort.noise[joint] < 0.1 * SMALL_ERROR * limit
+        assert (friction[joint] > SMALL_ERROR * limit) == (joint != "roll")
+    assert SMALL_ERROR == LEAST_TORQUE
+
+
+ARM = load_arm("mtmr")
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return IdentifiedModel.from_arm(ARM)
+
+
+def poses(truth, seed=0, count=20):
+    q = ARM.sample_poses(count, np.random.default_rng(seed), margin=0.05)
+    return Recording(q=q, tau=truth.holding_torque(q) + 0.05 * ARM.effort_limits)
+
+
+def wrong_model(truth):
+    """Joints 1 and 7 are off, all others are exact."""
+    joints = [dataclasses.replace(j, trust=0.0) if i in (0, 6) else j for i, j in enumerate(truth.joints)]
+    return dataclasses.replace(truth, joints=joints)
+
+
+def test_a_switched_off_joint_is_off_and_a_wrong_one_fails(truth):
+    recording = poses(truth)
+    tau = truth.holding_torque(recording.q)
+    tau[:, 1] *= 0.3
+    model = wrong_model(truth)
+    verdicts = validate(model, dataclasses.replace(recording, tau=tau)).verdicts
+    assert verdicts == {
+        "outer_yaw": "off",
+        "shoulder_pitch": "do not use",
+        "elbow_pitch": "good",
+        "wrist_platform": "good",
+        "wrist_pitch": "good",
+        "wrist_yaw": "good",
+        "wrist_roll": "off",
+    }
+    tau[:, 4] = 0.0
+    assert validate(model, dataclasses.replace(recording, tau=tau)).verdicts["wrist_pitch"] == "not judged"
+
+
+def test_measurements_at_a_stop_do_not_count(truth):
+    """One pose presses on the shoulder's stop with ten times its weight: no model predicts that."""
+    recording = poses(truth)
+    q = recording.q.copy()
+    q[3, 1] = ARM.position_lower[1]
+    q[3, 2] = 0.3
+    tau = truth.holding_torque(q)
+    tau[3, 1] = -3.0
+    validation = validate(truth, Recording(q=q, tau=tau))
+    shoulder = validation.joints[1]
+    assert shoulder.num_doubted >= 1
+    assert shoulder.relative_error > GOOD_RATIO > shoulder.relative_error_undoubted
+    assert shoulder.verdict == "good"
+
+
+def test_actuators_that_off_joints_do_not_drive_are_judged(truth):
+    recording = poses(truth)
+    tau = truth.holding_torque(recording.q)
+    given = Recording(q=recording.q, tau=tau).in_actuator_coordinates(ARM)
+    verdicts = validate(wrong_model(truth), given).verdicts
+    assert [name for name, verdict in verdicts.items() if verdict == "off"] == ["outer_yaw", "wrist_roll"]
+    assert verdicts["shoulder_pitch"] == verdicts["elbow_pitch"] == "good"
+
+
+@pytest.fixture
+def files(tmp_path, truth):
+    """A model, a recording that it passes, and one that has 0.3 of its torque at joint 2."""
+    model, good, bad = (str(tmp_path / name) for name in ("model.yaml", "good.csv", "bad.csv"))
+    wrong_model(truth).save(model)
+    recording = poses(truth)
+    tau = truth.holding_torque(recording.q)
+    write_recording(Recording(q=recording.q, tau=tau), good)
+    tau[:, 1] *= 0.3
+    write_recording(Recording(q=recording.q, tau=tau), bad)
+    return model, good, bad
+
+
+def test_require_sets_the_exit_code_and_names_the_joints(files, tmp_path, capsys):
+    model, good, bad = files
+    for required in ([], ["--require", "usable"], ["--require", "good"]):
+        assert main(["validate", model, good, *required]) == 0
+    capsys.readouterr()
+    report = tmp_path / "errors.json"
+    assert main(["validate", model, bad]) == 0
+    assert capsys.readouterr().out.startswith("verdict: do not use (shoulder_pitch)\n")
+    for required in ("usable", "good"):
+        assert main(["validate", model, bad, "--require", required, "--json", str(report)]) == 2
+        said = capsys.readouterr()
+        assert said.err.count("\n") == 1
+        assert f"not {required} on {bad}: shoulder_pitch (do not use)" in said.err
+        assert said.out.startswith("verdict: do not use (shoulder_pitch)\n")
+        found = json.loads(report.read_text())
+        assert found["verdict"] == "do not use" and found["rule"] == rule_text(in_motion=False)
+        assert [j["verdict"] for j in found["joints"]] == ["off", "do not use", "good", "good", "good", "good", "off"]
+
+
+def test_a_closed_pipe_neither_passes_nor_loses_the_verdicts(files):
+    """`validate ... | head -1` with pipefail: the pipe is closed before anything is written."""
+    model, _, bad = files
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "dvrk_drake.cli", "validate", model, bad, "--require", "usable", "--save"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert done.returncode != 0 and "Traceback" not in done.stderr
+    assert IdentifiedModel.load(model).validation.verdicts["shoulder_pitch"] == "do not use"
+
+
+def test_the_tables_fit_80_columns(files, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    model, _, bad = files
+    assert main(["validate", model, bad]) == 0
+    said = capsys.readouterr().out
+    assert "do not use" in said and "ratio: error" in said
+    assert max(len(line.rstrip()) for line in said.split("\n\n")[0].splitlines()) <= 80
+
+
+def test_the_recording_of_the_identification_validates_nothing(files, tmp_path, capsys):
+    model, good, _ = files
+    loaded = IdentifiedModel.load(model)
+    provenance = dataclasses.replace(loaded.provenance, sha256=read_recording(good).sha256)
+    dataclasses.replace(loaded, provenance=provenance).save(model)
+    before = (tmp_path / "model.yaml").read_bytes()
+    assert main(["validate", model, good]) == 0
+    assert "the model was identified from this recording" in capsys.readouterr().err
+    assert main(["validate", model, good, "--save"]) == 2
+    assert "--save needs a recording that the model was not identified from" in capsys.readouterr().err
+    assert (tmp_path / "model.yaml").read_bytes() == before
+
+
+def test_saved_verdicts_are_those_that_run_warns_of(files, capsys):
+    model, good, bad = files
+    loaded = IdentifiedModel.load(model)
+    assert "no other recording has validated this model; cross-validated: " in model_warning(model, loaded)
+    assert main(["validate", model, bad, "--save"]) == 0
+    saved = IdentifiedModel.load(model)
+    assert dataclasses.replace(saved, validation=None) == loaded
+    warning = model_warning(model, saved)
+    assert f"did not pass validation on {bad}: shoulder_pitch (do not use);" in warning and "\n" not in warning
+    assert main(["validate", model, good, "--save"]) == 0
+    assert model_warning(model, IdentifiedModel.load(model)) == ""
+
+
+def test_saved_verdicts_are_of_all_joints(truth, tmp_path):
+    with pytest.raises(ModelError, match=r"validation\.verdicts must name these joints: outer_yaw"):
+        dataclasses.replace(truth, validation=ValidationSummary("a.csv", "", {"outer_yaw": "good"})).check()
+
+
+def test_run_warns_before_it_looks_for_the_arm(files, monkeypatch, capsys):
+    """`ready_controller`, which run and collect share, up to where it would open the network."""
+    from dvrk_drake.cli import lcm
+
+    def stop(_):
+        raise ModelError("no network here")
+
+    monkeypatch.setattr("dvrk_drake.processes.lcm_network.open_lcm", stop)
+    model, _, bad = files
+    assert main(["validate", model, bad, "--save"]) == 0
+    capsys.readouterr()
+    for path, warnings in ((model, 1), (None, 0)):
+        with pytest.raises(ModelError, match="no network"):
+            lcm.ready_controller(SimpleNamespace(arm="mtmr", model=path, lcm_url="", realtime=False), "gravity")
+        assert capsys.readouterr().err.count("shoulder_pitch (do not use)") == warnings
+
+
+def test_cross_validation_gives_verdicts_by_the_same_rule(truth):
+    def statistics(j, effort, error, trust):
+        changes = {"rms_zero_torque_undoubted": effort, "rms_cross_validation_undoubted": error, "trust": trust}
+        return dataclasses.replace(j, **changes)
+
+    pairs = [(1.0, 0.1, 1.0), (1.0, 0.9, 1.0), (1.0, 2.0, 1.0), (1.0, 2.0, 0.0), (0.0, 0.0, 1.0)]
+    pairs += [(1.0, float("nan"), 1.0), (1.0, 0.1, 0.5)]
+    expected = ["good", "usable", "do not use", "off", "not judged", "not judged", "good"]
+    model = dataclasses.replace(
+        truth, joints=[statistics(j, *numbers) for j, numbers in zip(truth.joints, pairs, strict=True)]
+    )
+    assert list(cross_validated_verdicts(model).values()) == expected
+    of_motion = [ActuatorStatistics(n, 1.0, 0.0, e, 0.0) for n, e in zip(ARM.joint_names, [0.1, 0.9] * 4, strict=False)]
+    model = dataclasses.replace(truth, dynamics=DynamicSection(actuators=of_motion))
+    assert list(cross_validated_verdicts(model).values()) == (["good", "do not use"] * 4)[:7]
