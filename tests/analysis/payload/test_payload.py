@@ -10,7 +10,7 @@ from pydrake.multibody.tree import MultibodyForces
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.payload.payload import as_good, estimate_payload
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
-from dvrk_drake.analysis.payload.tables import print_payload
+from dvrk_drake.analysis.payload.tables import describe_better_links, print_payload
 from dvrk_drake.analysis.tables import make_console
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -123,6 +123,41 @@ def test_what_is_not_found_is_said_with_how_much_it_may_be(capsys):
     assert mass < some.largest_at_com < 4 * mass
 
 
+def assert_end_link_explains(estimates, capsys):
+    """A payload on the end link is not denied, and not attributed to another link without a warning."""
+    by_link = {payload.link: payload for payload in estimates}
+    wrong = [by_link["insertion_link"], by_link["bottom_bar_link"]]
+    for payload in wrong:
+        warning = describe_better_links(payload, estimates)
+        assert warning.startswith(f"{payload.link} does not explain the change best") and "on end_link" in warning
+        assert "\n" not in warning and "--link end_link" in warning
+        assert payload.as_dict(estimates)["better_links"] == ["end_link"]
+        print_payload(make_console(), payload, estimates)
+        printed = capsys.readouterr().out
+        assert "below" not in printed
+        assert payload.found or "A payload on end_link explains the change" in printed
+    assert not wrong[0].found and wrong[0].as_dict(estimates)["largest_at_com"] is None
+    end = by_link["end_link"]
+    assert describe_better_links(end, estimates) is None and end.as_dict(estimates)["better_links"] == []
+
+
+LINKS = ["insertion_link", "bottom_bar_link", "end_link"]
+
+
+def test_a_payload_on_another_link_is_reported(capsys):
+    name, link, mass, place = CASES["end"]
+    model, reference, loaded = two_days(name, link, mass, place, 0)
+    assert_end_link_explains(estimate_payload(reference, loaded, model, LINKS), capsys)
+
+
+def test_without_payload_no_link_is_better():
+    model, reference, other = two_days("psm", "end_link", 0.0, [0.0, 0.0, 0.0], 0)
+    estimates = estimate_payload(reference, other, model, LINKS)
+    for payload in estimates:
+        assert describe_better_links(payload, estimates) is None
+        assert payload.as_dict(estimates)["largest_at_com"] > 0
+
+
 def test_a_reference_that_begins_later_is_aligned():
     name, link, mass, place = CASES["end"]
     model, reference, loaded = two_days(name, link, mass, place, 0)
@@ -157,6 +192,12 @@ def test_from_the_command_line(tmp_path, capsys):
     assert abs(payload["mass"] - mass) < reach
     printed = capsys.readouterr().out
     assert f"Payload on {link}" in printed and "mass [kg]" in printed and "x [m]" in printed
+    # Another link is compared with all, too.
+    assert main(["payload", *paths, "--arm", name, "--link", "insertion_link"]) == 0
+    said = capsys.readouterr()
+    assert "warning: insertion_link does not explain the change best" in said.err
+    assert "on end_link" in said.err.replace("front_crank_link", "end_link").replace("back_crank_link", "end_link")
+    assert "Where the payload may be" in said.out and "below" not in said.out
     assert main(["payload", *paths, "--arm", name, "--link", "nose"]) == 2
     assert main(["payload", *paths, "--arm", name, "--json", paths[0]]) == 2
     assert main(["payload", paths[0], str(tmp_path / "none.csv"), "--arm", name]) == 2
@@ -191,3 +232,9 @@ def test_known_weights_on_a_real_arm(unloaded, file, link, mass, height):
     assert abs(payload.place_in_base[2] - height) < payload.quantile * payload.place_error[2]
     assert abs(payload.body.mass / mass - 1) < 0.15
     assert payload.found
+
+
+def test_a_real_payload_on_another_link_is_reported(unloaded, capsys):
+    folder, reference, model = unloaded
+    loaded = read_recording(folder / "psm_one_205g_insertion.csv", model.arm, "actuator")
+    assert_end_link_explains(estimate_payload(reference, loaded, model, LINKS), capsys)
