@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dvrk_drake.cli.support import check_output
+from dvrk_drake.cli.support import add_overwrite, check_output
 from dvrk_drake.errors import DvrkDrakeError
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--diff", action="store_true", help="print what differs from the arm's own SDF, line by line")
     verb.add_argument("--dvrk-gc", metavar="OUT.json", help="the controller's gravity compensation of an MTM")
     verb.add_argument("--dvrk-kinematic-gc", metavar="OUT.json", help="the controller's gravity compensation of a PSM")
+    add_overwrite(verb)
     _add_gc_options(verb.add_argument_group("options of --dvrk-gc (the first also of --dvrk-kinematic-gc)"))
     verb.set_defaults(run=_export)
 
@@ -40,6 +41,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--model", required=True, metavar="MODEL", help=_model_help)
     verb.add_argument("--plot", metavar="OUT.png", help="draw both over the joint box")
     verb.add_argument("--json", metavar="FILE", help="write the table as JSON")
+    add_overwrite(verb)
     verb.set_defaults(run=_compare)
 
 
@@ -62,7 +64,7 @@ def _export(options: argparse.Namespace) -> None:
         raise DvrkDrakeError(f"nothing to write; name {' or '.join('--' + name.replace('_', '-') for name in writers)}")
     model = _load_model(options.model)
     for path in outputs.values():
-        check_output(path, options.model)
+        check_output(path, options.model, overwrite=options.overwrite)
     for name, path in outputs.items():
         writers[name](model, path, options)
     if options.diff:
@@ -147,7 +149,7 @@ def _compare(options: argparse.Namespace) -> None:
 
     for path in (options.plot, options.json):
         if path is not None:
-            check_output(path, options.file, options.model)
+            check_output(path, options.file, options.model, overwrite=options.overwrite)
     file = GravityCompensationFile.load(options.file)
     comparison = compare_compensation(file, _load_model(options.model))
     console = make_console()

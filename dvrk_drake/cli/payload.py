@@ -7,7 +7,7 @@ import json
 import sys
 
 from dvrk_drake.cli.dynamics import refuse_unusable
-from dvrk_drake.cli.support import ProgressBar, add_gravity, check_output, mounted, print_notes
+from dvrk_drake.cli.support import ProgressBar, add_gravity, add_overwrite, check_output, mounted, print_notes
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -25,6 +25,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
         "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
     )
     verb.add_argument("--json", metavar="FILE", help="write the estimates as JSON")
+    add_overwrite(verb)
     add_gravity(verb)
     verb.set_defaults(run=_payload)
 
@@ -47,7 +48,7 @@ def _payload(options: argparse.Namespace) -> None:
     arm = mounted(load_arm(options.arm), options.gravity) if model is None else model.load_arm()
     check_links(DynamicRegressor(arm), [] if options.link is None else [options.link])
     if options.json is not None:
-        check_output(options.json, options.reference, options.loaded)
+        check_output(options.json, options.reference, options.loaded, overwrite=options.overwrite)
     console = make_console()
     recordings = []
     for path in (options.reference, options.loaded):
