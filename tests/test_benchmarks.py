@@ -17,7 +17,7 @@ def benchmark():
 
 
 def test_a_recording_that_is_not_there_is_one_line(benchmark, tmp_path):
-    with pytest.raises(SystemExit, match="none.csv: no such file"):
+    with pytest.raises(SystemExit, match=r"none\.csv: no such file"):
         benchmark.read_public(tmp_path / "none.csv", load_arm("mtmr"))
 
 

@@ -190,9 +190,7 @@ def test_an_existing_output_is_not_replaced_unasked(command, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.txt").write_text("mine")
     error = fails(capsys, *command.split(), "mine.txt")
-    assert error == (
-        "dvrk-drake: error: mine.txt: exists already; name another file, or replace it with --overwrite\n"
-    )
+    assert error == ("dvrk-drake: error: mine.txt: exists already; name another file, or replace it with --overwrite\n")
     if "none" in command:
         assert "none" in fails(capsys, *command.split(), "mine.txt", "--overwrite")
     assert (tmp_path / "mine.txt").read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
