@@ -23,7 +23,9 @@ def result(tmp_path_factory):
     shorter.setattr(demo, "POSES", 20)
     shorter.setattr(demo, "FRESH_POSES", 6)
     stages, plot = [], demo.plot_positions
-    shorter.setattr(demo, "plot_positions", lambda path, *rest: (TITLES.update({path.name: rest[-1]}), plot(path, *rest)))
+    shorter.setattr(
+        demo, "plot_positions", lambda path, *rest: (TITLES.update({path.name: rest[-1]}), plot(path, *rest))
+    )
     yield folder, demo.run_demo(folder, progress=lambda what, share: stages.append((what, share))), stages
     shorter.undo()
 
