@@ -186,8 +186,8 @@ def run_demo(
         arm,
         t,
         {"identified model": released, "model as drawn (SDF)": with_nominal},
-        f"{arm.name} (simulated without dry friction): held until {HELD_UNTIL} s, released under gravity compensation until "
-        f"{RELEASED_UNTIL} s, then driven home\n{NO_DRY_FRICTION}",
+        f"{arm.name} (simulated without dry friction): held until {HELD_UNTIL} s, released under gravity compensation "
+        f"until {RELEASED_UNTIL} s, then driven home\n{NO_DRY_FRICTION}",
     )
     plot_positions(
         output / "step.png",
