@@ -89,7 +89,7 @@ def test_compare_gc_refuses_a_file_that_names_another_arm(tmp_path, capsys):
     assert not capsys.readouterr().err
 
 
-def test_a_file_without_a_name_is_of_the_arm_in_its_file_name(tmp_path):
+def test_a_file_without_arm_is_of_that_in_its_file_name(tmp_path):
     file = compensation_from_model(stock("mtml"), CompensationOptions(tolerance=0.01))
     for name, arm in (("gc-MTML-12345.json", "MTML"), ("gc-mtmr.json", "MTMR"), ("gc.json", "")):
         file.save(tmp_path / name, "", "test")
