@@ -1,9 +1,9 @@
 """Our identification of the full dynamics beside the published one, on the public recordings of a real MTM and PSM.
 
-    python benchmarks/dynamic_recordings.py FOLDER [--coordinates actuator]
+    python benchmarks/dynamic_recordings.py FOLDER
 
-FOLDER holds mtm_one.csv, psm_one.csv and, if it is to be judged, psm_one_no_weight.csv, as `dvrk-drake convert` writes
-them (docs/public_recordings.md) or in the actuators' coordinates with `--coordinates actuator`.
+FOLDER holds mtm_one.csv, psm_one.csv and, if it is to be judged, psm_one_no_weight.csv: the public recordings in their
+own coordinates, those of the actuators, with a header and times (docs/public_recordings.md says how to obtain them).
 
 Errors are |tau - tau_hat| / |tau| of the actuators, both behind a zero-phase Butterworth low-pass of order 6 (5.65 Hz
 for the MTM, 16.96 Hz for the PSM), without the ends. "Published" are those of Wang et al., "A Convex Optimization-based
@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import resource
+import sys
 import time
 from pathlib import Path
 
@@ -25,11 +26,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.recalibration.recalibration import predict_other_phases
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
+from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.recording import Recording, read_recording
 
@@ -44,7 +47,6 @@ def main() -> None:
     """One table an arm."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--coordinates", choices=("joint", "actuator"), default="joint")
     parser.add_argument("--poses", type=int, default=2000, help="random poses at which M(q) is looked at")
     options = parser.parse_args()
     for name, file, others in (
@@ -53,11 +55,8 @@ def main() -> None:
     ):
         arm = load_arm(name)
 
-        def read(file: str, arm: Arm = arm) -> Recording:
-            return read_recording(options.folder / file, arm, options.coordinates)
-
         begin = time.perf_counter()
-        model = identify_dynamic(read(file), arm).model
+        model = identify_dynamic(read_public(options.folder / file, arm), arm).model
         seconds = time.perf_counter() - begin
         dynamics = model.dynamics
         assert dynamics is not None
@@ -74,7 +73,7 @@ def main() -> None:
         }
         for other in others:
             if (options.folder / other).is_file():
-                recording = read(other)
+                recording = read_public(options.folder / other, arm)
                 errors = validate_motion(model, recording).actuators
                 rows[f"ours on {other}"] = [100 * (e.relative_error or 0.0) for e in errors]
                 rows[f"{other}, friction from other phases"] = 100 * predict_other_phases(model, recording, 2)[1]
@@ -86,6 +85,21 @@ def main() -> None:
         print(f"least eigenvalue of M(q) at {len(q)} poses of the joint box {least:.1e}")
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(f"identified in {seconds:.1f} s; peak memory of this process so far {peak:.0f} MB\n")
+
+
+def read_public(path: Path, arm: Arm) -> Recording:
+    """Reads a recording in actuator coordinates; ends the program if it cannot be one."""
+    try:
+        recording = read_recording(path, arm, "actuator")
+    except RecordingError as error:
+        sys.exit(str(error))
+    refusals = [f for f in check_recording(recording, arm).findings if f.severity == "refusal"]
+    if refusals:
+        sys.exit(
+            f"{path}: {refusals[0].where}: {refusals[0].what}. This benchmark reads actuator coordinates: convert the "
+            "public file without --arm"
+        )
+    return recording
 
 
 def print_table(title: str, arm: Arm, rows: dict) -> None:

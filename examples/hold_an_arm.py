@@ -1,5 +1,7 @@
 """Hold a simulated master arm at a pose: gravity feedforward + PID, in Meshcat."""
 
+import sys
+
 import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -23,4 +25,6 @@ simulator = Simulator(builder.Build())
 context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
 station.set_positions(context, [0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5])  # held where it is put
 simulator.AdvanceTo(2.0)
-print(meshcat.web_url(), "holds", np.round(station.get_positions(context), 4))
+print("holds", np.round(station.get_positions(context), 4))
+if sys.stdin.isatty():  # the page ends with this script
+    input(f"{meshcat.web_url()} shows the arm; press Enter to end ")

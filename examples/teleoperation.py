@@ -1,5 +1,7 @@
 """A hand pulls the handle of a master arm that carries its own weight; the patient side arm follows, at a third."""
 
+import sys
+
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
@@ -24,6 +26,7 @@ for t in np.arange(0.1, 3.0, 0.01):  # the hand moves the handle up by 6 cm
     arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(target))
     simulator.AdvanceTo(t)
 
-print(meshcat.web_url())
 print("handle moved [mm]", np.round(1e3 * (arms.X_MG(context).translation() - X_MG0.translation()), 2))
 print("tip moved    [mm]", np.round(1e3 * (arms.X_FT(context).translation() - X_FT0.translation()), 2))
+if sys.stdin.isatty():  # the page ends with this script
+    input(f"{meshcat.web_url()} shows both arms; press Enter to end ")

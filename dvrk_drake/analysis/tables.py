@@ -14,7 +14,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from dvrk_drake.analysis.demo.demo import DemoResult
+from dvrk_drake.analysis.demo.demo import NO_DRY_FRICTION, DemoResult
 from dvrk_drake.analysis.demo.teleoperation import TeleoperationResult
 from dvrk_drake.analysis.simulation.simulation import Simulation
 from dvrk_drake.analysis.static.doubts import Doubt
@@ -176,7 +176,7 @@ def print_demo(console: Console, result: DemoResult, folder: str) -> None:
         table.add_row(ours.name, f"{ours.rms_torque:.4f}", f"{ours.rms_error:.4f}", f"{paper.rms_error:.4f}")
     console.print(table)
     table = make_table(
-        "Released for 4 s, then a step home [rad; m if prismatic]",
+        "Released for 4 s without dry friction, then a step home [rad; m if prismatic]",
         "",
         *(f"drift, {k}" for k in result.drift),
         "step error",
@@ -185,6 +185,7 @@ def print_demo(console: Console, result: DemoResult, folder: str) -> None:
         drifts = [f"{values[i]:.4f}" for values in result.drift.values()]
         table.add_row(ours.name, *drifts, f"{result.step_error[i]:.5f}")
     console.print(table)
+    console.print(NO_DRY_FRICTION, style="dim", soft_wrap=True)
     console.print(f"written to {folder}: {', '.join(path.name for path in result.files)}", soft_wrap=True)
     if load_arm(result.identification.model.arm).coupled_limits:
         console.print(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from dvrk_drake.cli.support import add_recording, check_output, made_folder
+from dvrk_drake.cli.support import add_overwrite, add_recording, check_output, made_folder
 from dvrk_drake.errors import RecordingError
 
 
@@ -18,6 +18,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     add_recording(verb)
     verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, psm, or a YAML file")
     verb.add_argument("--json", metavar="FILE", help="write the findings and numbers as JSON")
+    add_overwrite(verb)
     verb.add_argument("--plots", metavar="DIR", help="of a motion: write spectra of its efforts into this folder")
     verb.set_defaults(run=_check)
 
@@ -33,7 +34,7 @@ def _check(options: argparse.Namespace) -> None:
 
     arm = load_arm(options.arm)
     if options.json is not None:
-        check_output(options.json, options.recording)
+        check_output(options.json, options.recording, overwrite=options.overwrite)
     plots = None if options.plots is None else made_folder(options.plots)
     recording = read_recording(options.recording, arm, options.coordinates)
     report = check_for_identification(recording, arm)

@@ -41,7 +41,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _collect(options: argparse.Namespace) -> None:
-    check_output(options.poses)
+    check_output(options.poses, overwrite=True)
     if options.random is not None:
         _add_random_poses(options)
     elif options.teach:
@@ -109,7 +109,7 @@ def _visit(options: argparse.Namespace) -> None:
     settings = CollectionSettings(options.traverse_time, options.both_sides)
     arm = load_arm(options.arm)
     poses = load_poses(options.poses, arm)
-    check_output(options.output, options.poses, options.model or "")
+    check_output(options.output, options.poses, options.model or "", overwrite=True)
     output = CollectionFile(options.output, arm, options.both_sides)
     num_done = output.finished(poses).sum()
     if num_done == len(poses):

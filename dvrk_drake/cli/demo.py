@@ -6,6 +6,7 @@ import argparse
 
 from dvrk_drake.cli.support import (
     ProgressBar,
+    add_overwrite,
     check_output,
     made_folder,
     quiet_drake,
@@ -27,6 +28,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--html", metavar="FILE", help="play a hand, write the recording and say how well the PSM followed"
     )
+    add_overwrite(verb)
     verb.add_argument("--port", type=int, help="of the page; default: a free one")
     verb.set_defaults(run=_teleop)
 
@@ -62,7 +64,7 @@ def _teleop(options: argparse.Namespace) -> None:
         )
         run_live_teleoperation(meshcat)
         return
-    check_output(options.html)
+    check_output(options.html, overwrite=options.overwrite)
     meshcat = start_scene(options.port)
     with ProgressBar("playing") as (progress, task):
         result = play_teleoperation(meshcat, progress=lambda share: progress.update(task, completed=100 * share))

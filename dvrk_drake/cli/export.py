@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dvrk_drake.cli.support import check_output
-from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.cli.support import add_overwrite, check_output
+from dvrk_drake.errors import DvrkDrakeError, ModelError
 
 if TYPE_CHECKING:
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -26,8 +26,9 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument("--urdf", metavar="OUT.urdf", help="the same as URDF, the linkage as mimic joints")
     verb.add_argument("--diff", action="store_true", help="print what differs from the arm's own SDF, line by line")
-    verb.add_argument("--dvrk-gc", metavar="OUT.json", help="the controller's gravity compensation of an MTM")
+    verb.add_argument("--dvrk-gc", metavar="OUT.json", help=_gc_help)
     verb.add_argument("--dvrk-kinematic-gc", metavar="OUT.json", help="the controller's gravity compensation of a PSM")
+    add_overwrite(verb)
     _add_gc_options(verb.add_argument_group("options of --dvrk-gc (the first also of --dvrk-kinematic-gc)"))
     verb.set_defaults(run=_export)
 
@@ -40,6 +41,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--model", required=True, metavar="MODEL", help=_model_help)
     verb.add_argument("--plot", metavar="OUT.png", help="draw both over the joint box")
     verb.add_argument("--json", metavar="FILE", help="write the table as JSON")
+    add_overwrite(verb)
     verb.set_defaults(run=_compare)
 
 
@@ -62,7 +64,7 @@ def _export(options: argparse.Namespace) -> None:
         raise DvrkDrakeError(f"nothing to write; name {' or '.join('--' + name.replace('_', '-') for name in writers)}")
     model = _load_model(options.model)
     for path in outputs.values():
-        check_output(path, options.model)
+        check_output(path, options.model, overwrite=options.overwrite)
     for name, path in outputs.items():
         writers[name](model, path, options)
     if options.diff:
@@ -147,11 +149,22 @@ def _compare(options: argparse.Namespace) -> None:
 
     for path in (options.plot, options.json):
         if path is not None:
-            check_output(path, options.file, options.model)
+            check_output(path, options.file, options.model, overwrite=options.overwrite)
     file = GravityCompensationFile.load(options.file)
-    comparison = compare_compensation(file, _load_model(options.model))
+    model = _load_model(options.model)
+    try:
+        comparison = compare_compensation(file, model)
+    except ModelError as error:
+        raise ModelError(f"{options.file}: {error}") from error
     console = make_console()
     print_comparison(console, options.file, options.model, comparison)
+    if comparison.other_side:
+        print(
+            f"dvrk-drake: warning: {options.file}: the mirror image of the model fits better: the file is probably one "
+            f"of the other side's arm, not of {model.load_arm().name}. Check ARM_NAME and the serial number",
+            file=sys.stderr,
+            flush=True,
+        )
     if options.plot is not None:
         plot_compensation(options.plot, comparison, f"{options.file} and {options.model} over the joint box, at rest")
         console.print(f"plot: {options.plot}", soft_wrap=True)
@@ -181,4 +194,8 @@ def _is_arm_file(name: str) -> bool:
 
 _export_help = "Writes a model for other programs; several files at once if several are named."
 _model_help = "MODEL.yaml, from identify; or mtml, mtmr, psm, an arm's YAML file: what the SDF of that arm states"
+_gc_help = (
+    "the controller's gravity compensation of an MTM; from mtml or mtmr, whose masses are estimates, only with "
+    "--gc-tolerance: identify your arm first"
+)
 _tolerance_help = "error [N m] to accept where the file cannot hold what the model says; default: 1e-6"

@@ -13,6 +13,7 @@ from dvrk_drake.cli.dynamics import identify_motion, refuse_unusable, show_motio
 from dvrk_drake.cli.support import (
     ProgressBar,
     add_gravity,
+    add_overwrite,
     add_recording,
     check_output,
     made_folder,
@@ -39,6 +40,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="for poses; default: robust")
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.add_argument("--tables", metavar="FILE.txt", help="write all parameters with their standard errors as text")
+    add_overwrite(verb)
     verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
     add_gravity(verb)
     verb.set_defaults(run=_identify)
@@ -53,6 +55,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     )
     verb.add_argument("--save", action="store_true", help="store the verdicts in MODEL.yaml, where run looks for them")
     verb.add_argument("--json", metavar="FILE", help="write verdicts and errors as JSON")
+    add_overwrite(verb)
     verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.set_defaults(run=_validate)
@@ -64,6 +67,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("model", metavar="MODEL.yaml")
     add_recording(verb)
     verb.add_argument("--output", required=True, metavar="FILE.csv", help="columns tau1.., one row a row")
+    add_overwrite(verb)
     verb.set_defaults(run=_predict)
 
     verb = verbs.add_parser("convert", help="turn a recording (CSV, LCM log, team .mat, WPI CSV) into our CSV")
@@ -86,6 +90,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
         "--arm", help="e.g. psm; CSV, WPI: write its joint coordinates, not the actuators'; LCM log: which arm"
     )
     verb.add_argument("--skip-invalid", action="store_true", help="leave out rows that are not numbers, and count them")
+    add_overwrite(verb)
     verb.set_defaults(run=_convert)
 
 
@@ -97,12 +102,12 @@ def _identify(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.recording import read_recording
 
+    check_output(options.output, options.recording, overwrite=options.overwrite)
+    if options.tables is not None:
+        check_output(options.tables, options.recording, options.output, overwrite=options.overwrite)
     arm = mounted(load_arm(options.arm), options.gravity)
     recording = read_recording(options.recording, arm, options.coordinates)
     print_notes(options.recording, recording.notes)
-    check_output(options.output, options.recording)
-    if options.tables is not None:
-        check_output(options.tables, options.recording, options.output)
     plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
     recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
@@ -150,18 +155,18 @@ def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.errors import ModelError
     from dvrk_drake.models.recording import read_recording
 
+    if options.json is not None:
+        check_output(options.json, options.recording, options.model, overwrite=options.overwrite)
     model = IdentifiedModel.load(options.model)
     arm = model.load_arm()
     recording = read_recording(options.recording, arm, options.coordinates)
     print_notes(options.recording, recording.notes)
-    if options.json is not None:
-        check_output(options.json, options.recording, options.model)
     plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
     sha256, source = recording.sha256, recording.source
     same = bool(sha256) and sha256 == model.provenance.sha256
     if options.save:
-        check_output(options.model, options.recording)
+        check_output(options.model, options.recording, overwrite=True)
         if same:
             raise ModelError(f"{source}: --save needs a recording that the model was not identified from")
     recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
@@ -237,7 +242,7 @@ def _predict(options: argparse.Namespace) -> None:
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.recording import read_recording, write_csv
 
-    check_output(options.output, options.recording, options.model)
+    check_output(options.output, options.recording, options.model, overwrite=options.overwrite)
     model = IdentifiedModel.load(options.model)
     arm = model.load_arm()
     recording = read_recording(options.recording, arm, options.coordinates)
@@ -260,6 +265,7 @@ def _convert(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.models.arm import load_arm
 
+    check_output(options.output, options.input, overwrite=options.overwrite)
     console = make_console()
     recording = convert(
         options.input,

@@ -7,6 +7,7 @@ import sys
 
 from dvrk_drake.cli.support import (
     add_gravity,
+    add_overwrite,
     check_output,
     mounted,
     quiet_drake,
@@ -25,6 +26,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--frames", default="dh", help="link frames of the parameters: dh (dVRK) or paper (Table I)")
     verb.add_argument("--serial", action="store_true", help="leave out the links of the linkage, as the paper does")
     verb.add_argument("--output", metavar="FILE", help="write to a file instead of standard output")
+    add_overwrite(verb)
     add_gravity(verb)
     verb.set_defaults(run=_model)
 
@@ -47,7 +49,7 @@ def _model(options: argparse.Namespace) -> None:
     if options.output is not None:
         if options.format is None:
             raise DvrkDrakeError("--output needs to know what to write: --latex, --python or --c")
-        check_output(options.output)
+        check_output(options.output, overwrite=options.overwrite)
     arm = mounted(load_arm(options.arm), options.gravity)
     gravity = derive_gravity(arm, options.frames, options.serial)
     writers = {

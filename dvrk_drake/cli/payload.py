@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 
 from dvrk_drake.cli.dynamics import refuse_unusable
-from dvrk_drake.cli.support import ProgressBar, add_gravity, check_output, mounted, print_notes
+from dvrk_drake.cli.support import ProgressBar, add_gravity, add_overwrite, check_output, mounted, print_notes
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -19,11 +20,12 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
         "--arm", help="the arm: mtml, mtmr, psm, or a YAML file; its model is identified from REFERENCE"
     )
     source.add_argument("--model", metavar="MODEL.yaml", help="its model, identified from a motion")
-    verb.add_argument("--link", help="the link of the SDF that carries it; default: tries all")
+    verb.add_argument("--link", help="link of the SDF that carries it, compared with all others; default: the best")
     verb.add_argument(
         "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
     )
     verb.add_argument("--json", metavar="FILE", help="write the estimates as JSON")
+    add_overwrite(verb)
     add_gravity(verb)
     verb.set_defaults(run=_payload)
 
@@ -31,7 +33,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 def _payload(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
     from dvrk_drake.analysis.payload.payload import check_links, estimate_payload
-    from dvrk_drake.analysis.payload.tables import print_links, print_payload
+    from dvrk_drake.analysis.payload.tables import describe_better_links, print_links, print_payload
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -44,10 +46,9 @@ def _payload(options: argparse.Namespace) -> None:
     if model is not None and options.gravity is not None:
         raise ModelError(f"{options.model}: states its gravity; --gravity is for --arm")
     arm = mounted(load_arm(options.arm), options.gravity) if model is None else model.load_arm()
-    links = None if options.link is None else [options.link]
-    check_links(DynamicRegressor(arm), links or [])
+    check_links(DynamicRegressor(arm), [] if options.link is None else [options.link])
     if options.json is not None:
-        check_output(options.json, options.reference, options.loaded)
+        check_output(options.json, options.reference, options.loaded, overwrite=options.overwrite)
     console = make_console()
     recordings = []
     for path in (options.reference, options.loaded):
@@ -65,13 +66,16 @@ def _payload(options: argparse.Namespace) -> None:
             reference,
             loaded,
             model.dynamic_model,
-            links,
-            lambda done: progress.update(task, completed=share + (100 - share) * done),
+            progress=lambda done: progress.update(task, completed=share + (100 - share) * done),
         )
-    if options.link is None:
+    chosen = estimates if options.link is None else [p for p in estimates if p.link == options.link]
+    warning = describe_better_links(chosen[0], estimates)
+    if options.link is None or warning is not None:
         print_links(console, estimates)
-    print_payload(console, estimates[0])
+    if warning is not None:
+        print(f"dvrk-drake: warning: {warning}", file=sys.stderr, flush=True)
+    print_payload(console, chosen[0], estimates)
     if options.json is not None:
         with atomic_write(options.json) as stream:
-            json.dump([payload.as_dict() for payload in estimates], stream, indent=2)
+            json.dump([payload.as_dict(estimates) for payload in chosen], stream, indent=2)
             stream.write("\n")

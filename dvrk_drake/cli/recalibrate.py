@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from dvrk_drake.cli.dynamics import refuse_unusable
-from dvrk_drake.cli.support import add_recording, check_output, print_notes
+from dvrk_drake.cli.support import add_overwrite, add_recording, check_output, print_notes
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -19,6 +19,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("model", metavar="MODEL.yaml", help="a model that was identified from a motion")
     add_recording(verb)
     verb.add_argument("--output", required=True, metavar="NEW.yaml", help="the model file to write")
+    add_overwrite(verb)
     verb.set_defaults(run=_recalibrate)
 
 
@@ -29,10 +30,10 @@ def _recalibrate(options: argparse.Namespace) -> None:
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.recording import read_recording
 
+    check_output(options.output, options.recording, options.model, overwrite=options.overwrite)
     model = IdentifiedModel.load(options.model)
     recording = read_recording(options.recording, model.load_arm(), options.coordinates)
     print_notes(options.recording, recording.notes)
-    check_output(options.output, options.recording, options.model)
     console = make_console()
     refuse_unusable(console, recording, model.load_arm())
     result = recalibrate(model, recording)

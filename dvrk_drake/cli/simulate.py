@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from dvrk_drake.cli.support import ProgressBar, check_output, made_folder, quiet_drake, until_stopped
+from dvrk_drake.cli.support import ProgressBar, add_overwrite, check_output, made_folder, quiet_drake, until_stopped
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,6 +26,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
         help="changes the scenario, e.g. controller.mode=gravity; again for more",
     )
     verb.add_argument("--output", metavar="RECORDING.csv", help="write t, q, qd and tau")
+    add_overwrite(verb)
     verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
     verb.add_argument("--meshcat", action="store_true", help="show it in a browser, in real time")
     verb.set_defaults(run=_simulate)
@@ -43,7 +44,7 @@ def _simulate(options: argparse.Namespace) -> None:
     scenario = load_scenario(options.scenario, options.set)
     plots = None if options.plots is None else made_folder(options.plots)
     if options.output is not None:
-        check_output(options.output, options.scenario, scenario.controller.model)
+        check_output(options.output, options.scenario, scenario.controller.model, overwrite=options.overwrite)
     meshcat = start_meshcat(*framing(scenario.mounted_arm)) if options.meshcat else None
     if meshcat is not None:
         print(f"{scenario.mounted_arm.name} at {meshcat.web_url()}", flush=True)

@@ -51,7 +51,7 @@ def _study(options: argparse.Namespace) -> None:
     study = load_study(options.study, options.set)
     if not options.output.endswith((".csv", ".parquet")):
         raise StudyError(f"{options.output}: must end in .csv or .parquet")
-    check_output(options.output)
+    check_output(options.output, overwrite=True)
     plots = None if options.plots is None else made_folder(options.plots)
     if options.scheduler is None:
         with _progress() as progress:

@@ -55,8 +55,19 @@ def quiet_drake() -> None:
     logging.getLogger("drake").setLevel(logging.WARNING)
 
 
-def check_output(path: str, *inputs: str) -> None:
-    """Refuses, before work begins, an output that cannot be written or that is one of the inputs."""
+def add_overwrite(verb: argparse.ArgumentParser) -> None:
+    """Adds the option --overwrite, for `check_output`."""
+    verb.add_argument("--overwrite", action="store_true", help="replace output files that exist; default: refuse")
+
+
+def check_output(path: str, *inputs: str, overwrite: bool) -> None:
+    """Refuses, before work begins, an output that cannot be written, is one of the inputs, or exists already.
+
+    Args:
+        path: of the output.
+        inputs: paths that are read.
+        overwrite: an existing file is replaced: the user said so, or the command goes on with its own output.
+    """
     target = Path(path).resolve()
     if not target.parent.is_dir():
         raise DvrkDrakeError(f"{path}: cannot be written: its folder does not exist")
@@ -72,6 +83,8 @@ def check_output(path: str, *inputs: str) -> None:
     for given in inputs:
         if target == Path(given).resolve():
             raise DvrkDrakeError(f"{path}: is an input; name another file to write")
+    if target.exists() and not overwrite:
+        raise DvrkDrakeError(f"{path}: exists already; name another file, or replace it with --overwrite")
 
 
 #: Folders that were made, each before the one that it is in.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from dvrk_drake.cli.support import ProgressBar, check_output, made_folder, quiet_drake
+from dvrk_drake.cli.support import ProgressBar, add_overwrite, check_output, made_folder, quiet_drake
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -18,6 +18,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
         help="paper: Kp up until it oscillates, Kv, Ki; model: from inertia, friction and delay; default: both",
     )
     verb.add_argument("--output", metavar="GAINS.yaml", help="write the gains found; of both methods the better ones")
+    add_overwrite(verb)
     verb.add_argument("--plots", metavar="DIR", help="write step responses into this folder")
     verb.set_defaults(run=_tune)
 
@@ -33,7 +34,7 @@ def _tune(options: argparse.Namespace) -> None:
     quiet_drake()
     arm = load_arm(options.arm)
     if options.output is not None:
-        check_output(options.output, options.arm)
+        check_output(options.output, options.arm, overwrite=options.overwrite)
     plots = None if options.plots is None else made_folder(options.plots)
     methods: list[Method] = ["paper", "model"] if options.method == "both" else [options.method]
     with ProgressBar(f"tuning {arm.name}") as (progress, task):

@@ -255,16 +255,30 @@ def _refuse_errors(
     off = ", ".join(f"{name} {e:.2g}" for name, e in zip(MTM_JOINTS, error, strict=True) if e > least)
     down = model.load_arm().gravity
     lean = float(np.rad2deg(np.arccos(np.clip(-down[2] / np.linalg.norm(down), -1.0, 1.0))))
+    limits = ["a last link balanced about its roll axis"]
+    if lean > 0.05:
+        limits.append(f"an upright base, which here leans by {lean:.1f} deg")
+    if np.any((model.trust != 0) & (model.trust != 1)):
+        limits.append("trust only where it is 1")
     reasons = {
-        f"gravity {gravity_off.max():.2g} (the file knows an upright base, which here leans by {lean:.1f} deg, a last "
-        "link balanced about its roll axis, and trust only where it is 1)": gravity_off.max(),
+        f"gravity {gravity_off.max():.2g} (the file knows {', '.join(limits)})": gravity_off.max(),
         f"effects {effects_off.max():.2g} (it knows polynomials of order 4 in a joint's own position, nothing at "
         "joint 7)": effects_off.max(),
     }
     raise ModelError(
         "the controller's file cannot hold this model: over the joint box it would be off by up to "
         f"{off} N m. Of that: {', '.join(reason for reason, size in reasons.items() if size > least)}. "
-        f"To accept it: --gc-tolerance {round_up(error.max()):g}"
+        f"{_estimates_note(model)}To accept it, repeat the command with --gc-tolerance {round_up(error.max()):g}"
+    )
+
+
+def _estimates_note(model: IdentifiedModel) -> str:
+    """Returns a sentence for a model that nobody identified, which moves a real arm by estimated masses."""
+    if model.provenance.method != "nominal":
+        return ""
+    return (
+        "The masses are estimates of the SDF, not of your arm: better identify it first (dvrk-drake identify) and "
+        "export that model. "
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import ModelError
+from dvrk_drake.models.arm import known_arms
 from dvrk_drake.models.atomic_file import atomic_write
 
 VERSION = "2.0"
@@ -17,6 +18,8 @@ NUM_JOINTS = 7
 #: Ten terms of gravity, then 1, q, q^2, q^3, q^4 of each of the first six joints.
 NUM_PARAMETERS = 40
 _CONTROLLER = "GC_controller"
+#: For people: the controller does not read it.
+_ARM_NAME = "ARM_NAME"
 #: Our names -> the file's, one of which is misspelled in the controller's source.
 _KEYS = {
     "positive": "gc_dynamic_params_pos",
@@ -43,6 +46,7 @@ class GravityCompensationFile:
         saturation: (7,) speed [rad/s] from which they differ by the full `friction_ratio`.
         friction_ratio: (7,) share 0..1 of the friction that is compensated in motion.
         sweep: (2, 7) lower and upper joint positions [rad] between which the file's data were collected, if it says so.
+        arm_name: the arm that the file states (ARM_NAME), or else that its file name contains; "" if neither names one.
     """
 
     positive: NDArray[np.float64]
@@ -53,6 +57,7 @@ class GravityCompensationFile:
     saturation: NDArray[np.float64]
     friction_ratio: NDArray[np.float64]
     sweep: NDArray[np.float64] | None = None
+    arm_name: str = ""
 
     def check(self) -> None:
         """What the controller does not check before it commands motors: lengths, finite numbers, order.
@@ -92,7 +97,11 @@ class GravityCompensationFile:
             raise ModelError(f'{path}: version is {content.get("version")!r}, this reads "{VERSION}"')
         if missing := [key for key in _KEYS.values() if key not in controller]:
             raise ModelError(f"{path}: {_CONTROLLER} lacks {', '.join(missing)}")
-        file = cls(**{name: _numbers(controller[key]) for name, key in _KEYS.items()}, sweep=_sweep(controller))
+        file = cls(
+            **{name: _numbers(controller[key]) for name, key in _KEYS.items()},
+            sweep=_sweep(controller),
+            arm_name=_arm_name(content.get(_ARM_NAME), Path(path).name),
+        )
         try:
             file.check()
         except ModelError as error:
@@ -114,7 +123,7 @@ class GravityCompensationFile:
         lines = [f'    "{key}": {json.dumps(getattr(self, name).tolist())}' for name, key in _KEYS.items()]
         with atomic_write(path) as stream:
             stream.write(
-                f'{{\n  "version": "{VERSION}",\n  "ARM_NAME": {json.dumps(arm_name)},\n'
+                f'{{\n  "version": "{VERSION}",\n  "{_ARM_NAME}": {json.dumps(arm_name)},\n'
                 f'  "origin": {json.dumps(origin)},\n  "{_CONTROLLER}": {{\n' + ",\n".join(lines) + "\n  }\n}\n"
             )
 
@@ -124,6 +133,13 @@ def _numbers(value: object) -> NDArray[np.float64]:
         return np.atleast_1d(np.array(value, dtype=np.float64))
     except (TypeError, ValueError):
         return np.empty(0)  # refused by check(), which names the field
+
+
+def _arm_name(stated: object, file_name: str) -> str:
+    """Returns the stated name, or that of an arm of this project in the name of the file."""
+    if isinstance(stated, str) and stated:
+        return stated
+    return next((name.upper() for name in known_arms() if name in file_name.lower()), "")
 
 
 def _sweep(controller: dict) -> NDArray[np.float64] | None:

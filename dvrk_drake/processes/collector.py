@@ -15,7 +15,7 @@ from dvrk_drake.models.collection_file import CollectionFile
 from dvrk_drake.models.nearby_pose import beside
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.leg import Leg
-from dvrk_drake.processes.live_status import takeover_reason
+from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
 from dvrk_drake.processes.rest_detector import RestDetector
 
 #: The way goes on by no more than this between two statuses [s]: after a pause of the computer it does not jump.
@@ -100,7 +100,8 @@ class Collector:
         span = arm.position_upper - arm.position_lower
         self._speed, self._astray = span / settings.traverse_time, _ASTRAY * span
         self._approach = _APPROACH * arm.effort_limits / np.asarray(arm.gains.kp)
-        self._time, self._heard, self._num_expired = 0.0, 0.0, 0
+        self._time, self._heard = 0.0, 0.0
+        self._answers, self._obeyed = AnswerTimes(), lcmt_dvrk_status()
         self._q = self._tau = np.zeros(arm.num_joints)
         self._desired = np.zeros(2 * arm.num_joints)
         self._leg_end = 0.0
@@ -115,6 +116,10 @@ class Collector:
         measured = 1e-6 * status.utime
         self._time += min(max(measured - self._heard, 0.0), _LONGEST_STEP)
         self._heard = measured
+        self._answers.add(time)
+        # Not controller.acting, which tells of the status before: this one may say already what went wrong.
+        if (status.guard_state, status.command_sender_id) == (status.STATE_EFFORT, self._controller.sender_id):
+            self._obeyed = status
         self._q, self._tau = np.array(status.position), np.array(status.effort_measured)
         if self.finished:
             return self._desired
@@ -142,8 +147,8 @@ class Collector:
 
     def _check(self, status: lcmt_dvrk_status) -> None:
         if not self._controller.acting:
-            raise CollectionError(f"{self._arm.name} took over and holds: {takeover_reason(status, self._num_expired)}")
-        self._num_expired = status.num_expired
+            why = takeover_reason(status, self._obeyed, self._answers)
+            raise CollectionError(f"{self._arm.name} took over and holds: {why}")
         n = self._arm.num_joints
         away = np.abs(self._q - self._desired[:n]) / self._astray
         if away.max() > 1:
@@ -168,7 +173,10 @@ class Collector:
         began = self._time
         while not self._controller.acting:
             if self._time - began > _START:
-                raise CollectionError(f"{self._arm.name} did not let efforts act within {_START:.0f} s")
+                late = self._answers.lateness()
+                raise CollectionError(
+                    f"{self._arm.name} did not let efforts act within {_START:.0f} s" + (late and f": {late}")
+                )
             self._desired = np.concatenate([self._q, np.zeros_like(self._q)])
             yield
         self._led = True

@@ -16,7 +16,6 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import (
     command_channel,
     decode,
-    describe_refusal,
     describe_state,
     is_old,
     is_status_of,
@@ -24,7 +23,7 @@ from dvrk_drake.models.lcm_messages import (
 )
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.lcm_network import handle_message
-from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
+from dvrk_drake.processes.live_status import AnswerTimes, LiveStatus, LiveStatusMaker, takeover_reason
 from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
 
 #: Without a status for this long there is no arm [s]; at first it may have to be started.
@@ -206,17 +205,19 @@ def control(
     """
     start = link.now()
     first = link.next_status(_SILENCE)
-    live, tell_at, acted = LiveStatusMaker(controller.sender_id, first), _TELL, 0.0
+    live, tell_at, acted, before = LiveStatusMaker(controller.sender_id, first), _TELL, 0.0, first
+    answers = AnswerTimes()
     while not stopped():
         status = link.next_status(_SILENCE)
         _check(status, link.arm.name, first.session_id)
         now = link.now() - start
         link.send(controller.answer(status, now, lead(status, now)))
         live.answer(status, now)
+        answers.add(now)
         if controller.acting:
-            acted = now
+            acted, before = now, status
         elif now > acted + _PATIENCE:
-            why = f"the last refusal is: {describe_refusal(status.refusal_code)}"
+            why = takeover_reason(status, before, answers)
             if status.gravity_compensation:
                 why += "; it adds gravity compensation of its own: switch that off"
             raise ControllerError(f"{link.arm.name} lets no command act for {_PATIENCE:g} s; {why}")

@@ -10,6 +10,15 @@ import numpy as np
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.lcm_messages import describe_refusal, describe_state
 
+#: Answers are counted over the last second [s]; an interval above this may be too late for the arm's guard [s].
+_WINDOW, _LATE = 1.0, 0.02
+#: What a guard refuses if the sender or the arm itself is slow.
+_REFUSED_IF_LATE = (
+    lcmt_dvrk_status.REFUSAL_STALE,
+    lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER,
+    lcmt_dvrk_status.REFUSAL_CLOCK_JUMP,
+)
+
 
 @dataclass(frozen=True)
 class LiveStatus:
@@ -58,10 +67,43 @@ class LiveStatusMaker:
         return LiveStatus(describe_state(status.guard_state), pace, ", ".join(problem))
 
 
-def takeover_reason(status: lcmt_dvrk_status, num_expired: int) -> str:
-    """Why an arm obeys no longer, if `num_expired` commands had expired while it did."""
-    if status.num_expired > num_expired:
+class AnswerTimes:
+    """When a controller answered in the last second: how often, and with which longest interval."""
+
+    def __init__(self) -> None:
+        self._times: deque[float] = deque()
+
+    def add(self, time: float) -> None:
+        """Takes an answer at `time` [s] of the controller's own clock."""
+        self._times.append(time)
+        while time - self._times[0] > _WINDOW and len(self._times) > 2:
+            self._times.popleft()
+
+    def lateness(self) -> str:
+        """Returns rate and longest interval in words where answers came too seldom, else ""."""
+        intervals = np.diff(np.array(self._times))
+        if not len(intervals) or intervals.max() <= _LATE:
+            return ""
+        return (
+            f"this computer, or that of the arm, is too slow: {1 / intervals.mean():.0f} answers per second, and "
+            f"{1e3 * intervals.max():.0f} ms between two of them. End other programs, or use --realtime"
+        )
+
+
+def takeover_reason(status: lcmt_dvrk_status, before: lcmt_dvrk_status, answers: AnswerTimes) -> str:
+    """Returns why an arm obeys no longer.
+
+    Args:
+        status: in which it does not.
+        before: the last status in which it did; a refusal code of an earlier time explains nothing.
+        answers: to its statuses.
+    """
+    expired, refused = status.num_expired > before.num_expired, status.num_refused > before.num_refused
+    late = answers.lateness()
+    if late and (expired or not refused or status.refusal_code in _REFUSED_IF_LATE):
+        return late
+    if expired:
         return "commands came too late for it (use --realtime)"
-    if status.refusal_code != lcmt_dvrk_status.REFUSAL_NONE:
-        return f"its last refusal is {describe_refusal(status.refusal_code)}"
+    if refused:
+        return f"the last refusal is: {describe_refusal(status.refusal_code)}"
     return f"its state is {describe_state(status.guard_state)}"

@@ -77,13 +77,13 @@ def test_validate_writes_json(folder, capsys):
 
 
 @pytest.mark.parametrize("coordinates", ["joint", "actuator"])
-def test_predict_writes_one_row_a_row_in_the_recordings_coordinates(folder, coordinates):
+def test_predict_writes_one_row_a_row_in_the_recordings_coordinates(folder, tmp_path, coordinates):
     arm = load_arm("mtmr")
     q = read_recording(folder / "other.csv").q
     recorded = q if coordinates == "joint" else arm.transmission.position(q)
-    write_recording(Recording(q=recorded), folder / "only_q.csv")
-    out = folder / "predicted.csv"
-    command = ["predict", f"{folder}/model.yaml", f"{folder}/only_q.csv", "--output", str(out)]
+    write_recording(Recording(q=recorded), tmp_path / "only_q.csv")
+    out = tmp_path / "predicted.csv"
+    command = ["predict", f"{folder}/model.yaml", f"{tmp_path}/only_q.csv", "--output", str(out)]
     assert main([*command, "--coordinates", coordinates]) == 0
     rows = np.loadtxt(out, delimiter=",", skiprows=1)
     assert out.read_text().splitlines()[0] == "tau1,tau2,tau3,tau4,tau5,tau6,tau7"
@@ -160,6 +160,47 @@ def test_an_input_is_never_replaced(folder, capsys):
     assert "not a regular file" in fails(capsys, "predict", model, poses, "--output", folder)
     assert "--latex, --python or --c" in fails(capsys, "model", "mtml", "--output", folder / "x.txt")
     assert (poses.read_bytes(), model.read_bytes()) == before
+
+
+#: Commands that write a file, without its name; inputs need not exist, as the output is looked at first.
+WRITERS = [
+    "identify none.csv --arm mtml --output",
+    "identify none.csv --arm mtml --output none.yaml --tables",
+    "validate none.yaml none.csv --json",
+    "predict none.yaml none.csv --output",
+    "convert none.csv",
+    "recalibrate none.yaml none.csv --output",
+    "check none.csv --arm mtml --json",
+    "payload none.csv none.csv --arm psm --json",
+    "compare-gc none.json --model mtml --json",
+    "compare-gc none.json --model mtml --plot",
+    "export mtml --sdf",
+    "export mtml --urdf",
+    "export mtml --dvrk-gc",
+    "export psm --dvrk-kinematic-gc",
+    "model mtml --c --output",
+    "simulate mtml --output",
+    "tune --arm mtml --output",
+    "teleop --html",
+]
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_an_existing_output_is_not_replaced_unasked(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.txt").write_text("mine")
+    error = fails(capsys, *command.split(), "mine.txt")
+    assert error == ("dvrk-drake: error: mine.txt: exists already; name another file, or replace it with --overwrite\n")
+    if "none" in command:
+        assert "none" in fails(capsys, *command.split(), "mine.txt", "--overwrite")
+    assert (tmp_path / "mine.txt").read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_an_existing_output_is_replaced_on_request(tmp_path):
+    out = tmp_path / "g.c"
+    out.write_text("mine")
+    assert main(["model", "mtml", "--c", "--output", str(out), "--overwrite"]) == 0
+    assert "mtml_gravity_torque" in out.read_text()
 
 
 def test_an_arm_file_of_ones_own_serves_all_verbs(folder, tmp_path, capsys):

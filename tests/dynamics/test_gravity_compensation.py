@@ -191,6 +191,9 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
     eccentric = IdentifiedModel.from_arm(load_arm("mtml"))
     with pytest.raises(ModelError, match=r"wrist_roll 0\.0021 N m\..*gravity 0\.00.*--gc-tolerance 0\.00"):
         compensation_from_model(eccentric)
+    with pytest.raises(ModelError, match=r"masses are estimates of the SDF.*dvrk-drake identify") as refusal:
+        compensation_from_model(eccentric)
+    assert "leans" not in str(refusal.value) and "trust" not in str(refusal.value)
     # The line names a tolerance that is enough.
     compensation_from_model(eccentric, CompensationOptions(tolerance=0.0025))
     spring = balanced()
@@ -308,7 +311,12 @@ def test_command_line(tmp_path, capsys):
     assert [j["clipped"] for j in joints] == [0.0] * 7 and joints[0]["rms_inside"] is None
     out.unlink()
     assert main(["export", "mtml", "--dvrk-gc", str(out)]) == 2
-    assert capsys.readouterr().err.count("\n") == 1 and not out.exists()
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and not out.exists()
+    # What the line tells to type is accepted.
+    asked = error.split("repeat the command with ")[1].split()
+    assert main(["export", "mtml", "--dvrk-gc", str(out), *asked]) == 0 and out.exists()
+    capsys.readouterr()
     assert main(["export", str(model)]) == 2
     assert "--dvrk-gc" in capsys.readouterr().err
     assert main(["export", str(model), "--dvrk-gc", str(model)]) == 2

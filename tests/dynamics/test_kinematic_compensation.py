@@ -106,5 +106,5 @@ def test_command_line(tmp_path, capsys):
     out = tmp_path / "psm.json"
     assert main(["export", "psm", "--dvrk-kinematic-gc", str(out)]) == 0
     assert "pitch" in capsys.readouterr().out and out.is_file()
-    assert main(["export", "mtml", "--dvrk-kinematic-gc", str(out)]) == 2
+    assert main(["export", "mtml", "--dvrk-kinematic-gc", str(tmp_path / "mtml.json")]) == 2
     assert capsys.readouterr().err.count("\n") == 1

@@ -6,13 +6,14 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
+from dvrk_drake.analysis.export.compensation_comparison import compare_compensation
 from dvrk_drake.analysis.reproduction.recordings import PAPER_ARM
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.analysis.static.validation import validate
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.gravity_compensation import CompensationOptions, compensation_from_model, controller_torque
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import ArmError
+from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.mirrored_links import mirror_links
@@ -81,6 +82,54 @@ def test_a_file_of_a_real_right_arm_mirrored_predicts_real_left_arms(shared_data
         as_it_is = np.sqrt(np.mean((controller_torque(right, q) - tau) ** 2, axis=0))
         mirrored = np.sqrt(np.mean((MIRROR * controller_torque(right, MIRROR * q) - tau) ** 2, axis=0))
         assert np.all(mirrored[1:3] < 0.5 * as_it_is[1:3]) and mirrored[3] < as_it_is[3], (as_it_is, mirrored)
+
+
+def stock(name):
+    return IdentifiedModel.from_arm(load_arm(name))
+
+
+def test_compare_gc_refuses_a_file_that_names_another_arm(tmp_path, capsys):
+    path = tmp_path / "gc.json"
+    file = compensation_from_model(stock("mtml"), CompensationOptions(tolerance=0.01))
+    file.save(path, "MTML", "test")
+    assert main(["compare-gc", str(path), "--model", "mtmr"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"dvrk-drake: error: {path}: the file is of MTML") and "model is of MTMR" in error
+    assert error.count("\n") == 1
+    # With a wrong name it is compared, and the numbers tell that it is wrong.
+    file.save(path, "MTMR", "test")
+    assert main(["compare-gc", str(path), "--model", "mtmr"]) == 0
+    warning = capsys.readouterr().err
+    assert "the mirror image of the model fits better" in warning and warning.count("\n") == 1
+    file.save(path, "MTML", "test")
+    assert main(["compare-gc", str(path), "--model", "mtml"]) == 0
+    assert not capsys.readouterr().err
+
+
+def test_a_file_without_arm_is_of_that_in_its_file_name(tmp_path):
+    file = compensation_from_model(stock("mtml"), CompensationOptions(tolerance=0.01))
+    for name, arm in (("gc-MTML-12345.json", "MTML"), ("gc-mtmr.json", "MTMR"), ("gc.json", "")):
+        file.save(tmp_path / name, "", "test")
+        assert GravityCompensationFile.load(tmp_path / name).arm_name == arm
+    with pytest.raises(ModelError, match="the file is of MTMR"):
+        compare_compensation(GravityCompensationFile.load(tmp_path / "gc-mtmr.json"), stock("mtml"))
+
+
+#: The last one calls itself MTMR: docs/identification.md, Left and right.
+REAL_FILES = [("MTML-22723", "mtml"), ("MTML-34863", "mtml"), ("MTMR-32336", "mtmr"), ("MTMR-22403", "mtml")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("serial", "side"), REAL_FILES)
+def test_the_numbers_of_a_real_file_tell_its_side(shared_data, serial, side):
+    path = shared_data / "gc_json" / f"gc-{serial}.json"
+    if not path.is_file():
+        pytest.skip(f"needs {path}")
+    file = GravityCompensationFile.load(path)
+    assert file.arm_name == serial.split("-")[0]
+    for name in ("mtml", "mtmr"):
+        comparison = compare_compensation(dataclasses.replace(file, arm_name=""), stock(name))
+        assert comparison.other_side == (name != side)
 
 
 def test_twice_mirrored_is_as_before_and_shapes_follow():

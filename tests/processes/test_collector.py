@@ -4,12 +4,14 @@ import threading
 
 import numpy as np
 import pytest
-from sticky_arm import PERIOD, Disk, lead, make_collector, make_quick, near_poses, random_poses
+from sticky_arm import PERIOD, Disk, GuardedArm, lead, make_collector, make_quick, near_poses, random_poses
 
 from dvrk_drake.errors import CollectionError, RecordingError
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.recording import read_recording
 from dvrk_drake.processes.collector import CollectionSettings
+from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
 
 FRICTION = 0.08 * load_arm("mtml").effort_limits
 
@@ -171,3 +173,67 @@ def test_an_arm_whose_computer_is_slow_is_not_hurried(tmp_path):
     collector.close()
     assert collector.problem is None
     assert collector.done.all()
+
+
+def lead_until_obeyed(tmp_path):
+    """A collector that leads an arm behind a guard, until it has measured a pose; with an old refusal in the status."""
+    made = make_collector(tmp_path / "o.csv", near_poses(), np.zeros(7), both_sides=False, arm_type=GuardedArm)
+    collector, controller, arm = made
+    stranger = controller.answer(arm.status(), 0.0)
+    stranger.arm_name = "PSM1"
+    arm.step(stranger)
+    assert arm.guard.refusal_code == Status.REFUSAL_WRONG_ARM
+    lead(collector, controller, arm, 10.0, collector.done.any)
+    assert collector.done.any() and arm.guard.state == Status.STATE_EFFORT
+    return made
+
+
+def problem_after(made, pause):
+    """What the collector says if its own clock goes on by `pause` [s] and it then answers as ever."""
+    collector, controller, arm = made
+    start = PERIOD * arm.ticks + pause
+    for tick in range(5):
+        status, time = arm.status(), start + PERIOD * tick
+        arm.step(controller.answer(status, time, collector.lead(status, time)))
+    collector.close()
+    assert collector.finished
+    return str(collector.problem)
+
+
+def test_a_pause_of_this_computer_is_named_as_the_cause(tmp_path):
+    made = lead_until_obeyed(tmp_path)
+    for _ in range(80):
+        made[2].step()
+    problem = problem_after(made, 0.0)
+    assert made[2].guard.counts.expired == 1
+    assert "too slow" in problem and "81 ms between two of them" in problem and "answers per second" in problem
+    assert "refusal" not in problem
+
+
+def test_a_pause_of_the_arms_computer_is_not_a_clock_jump(tmp_path):
+    """The arm's clock stood still meanwhile, so that the guard refuses a jump of the sender's clock."""
+    made = lead_until_obeyed(tmp_path)
+    problem = problem_after(made, 0.08)
+    assert made[2].guard.refusal_code == Status.REFUSAL_CLOCK_JUMP
+    assert "too slow" in problem and "81 ms between two of them" in problem and "jump" not in problem
+
+
+def test_a_refusal_without_a_pause_is_named(tmp_path):
+    made = lead_until_obeyed(tmp_path)
+    collector, controller, arm = made
+    status, time = arm.status(), PERIOD * arm.ticks
+    command = controller.answer(status, time, collector.lead(status, time))
+    command.utime -= 10**6
+    arm.step(command)
+    problem = problem_after(made, 0.0)
+    assert "the last refusal is: after a jump of the sender's clock" in problem
+
+
+def test_a_refusal_of_an_earlier_time_is_not_named():
+    before, status = Status(), Status()
+    for of in (before, status):
+        of.num_refused, of.refusal_code = 3, Status.REFUSAL_OTHER_SENDER
+    status.guard_state = Status.STATE_HOLD
+    assert takeover_reason(status, before, AnswerTimes()) == "its state is hold"
+    status.num_refused += 1
+    assert takeover_reason(status, before, AnswerTimes()) == "the last refusal is: from a second sender"

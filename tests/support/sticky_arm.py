@@ -10,6 +10,8 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.collection_file import CollectionFile
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.collector import CollectionSettings, Collector
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
 
 PERIOD = 1e-3
 
@@ -65,9 +67,12 @@ class StickyArm:
     def step(self, command):
         self.ticks += 1
         self.sender_id, self.acts = command.sender_id, self.ticks > 250 and not self.off
-        if not self.acts:
-            return
-        self.effort = np.array(command.effort)
+        if self.acts:
+            self.move(command.effort)
+
+    def move(self, effort):
+        """Moves as the effort makes it, for a period."""
+        self.effort = np.array(effort)
         drive = self.effort - self.model.holding_torque(self.q)
         dv = PERIOD / self.inertia
         moved = self.v + dv * drive
@@ -76,11 +81,39 @@ class StickyArm:
         self.q = self.q + PERIOD * self.v
 
 
-def make_collector(path, poses, friction, both_sides=True, **options):
+class GuardedArm(StickyArm):
+    """A StickyArm behind the guard that a driver has; its clock goes on by a period with every step."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.guard = CommandGuard(self.arm, 7)
+        self._step_guard()
+
+    def status(self):
+        status = super().status()
+        status.accepted_modes = self.guard.accepted_modes
+        fill_in_guard(status, self.guard)
+        return status
+
+    def step(self, command=None):
+        """Goes on by a period, in which a command may arrive."""
+        if command is not None:
+            self.guard.receive(command, 1000 * self.ticks)
+        self.acts = self.guard.state == Status.STATE_EFFORT
+        if self.acts:
+            self.move(self.guard.output.effort)
+        self.ticks += 1
+        self._step_guard()
+
+    def _step_guard(self):
+        self.guard.step(1000 * self.ticks, 1000 * self.ticks, self.q, self.v, self.effort)
+
+
+def make_collector(path, poses, friction, both_sides=True, *, arm_type=StickyArm, **options):
     arm = load_arm("mtml")
     model = IdentifiedModel.from_arm(arm)
     controller = ArmController(arm, model, "hold", PERIOD)
-    sticky = StickyArm(arm, model, friction, poses[0] * 0.9)
+    sticky = arm_type(arm, model, friction, poses[0] * 0.9)
     output = CollectionFile(path, arm, both_sides)
     settings = CollectionSettings(1.0, both_sides)
     return Collector(poses, controller, output, settings, **{"writer": Disk()} | options), controller, sticky

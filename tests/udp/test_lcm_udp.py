@@ -59,9 +59,10 @@ def arm(running_arm):
     return name, process, observer
 
 
-def drift(name, *statuses):
-    """The farthest from where it started [rad, m]."""
-    return np.abs(np.array([status.position for status in statuses]) - POSES[name]).max()
+def drift(*statuses):
+    """The farthest from the position of the first status [rad, m]."""
+    positions = np.array([status.position for status in statuses])
+    return np.abs(positions - positions[0]).max()
 
 
 def send(network, status, sequence, sender_id, **fields):
@@ -106,7 +107,7 @@ def test_command_and_status_go_round(arm):
     assert all(map(holds, heard))
     assert heard[-1].num_refused == heard[0].num_refused
     assert heard[-1].command_sequence > 2000
-    assert drift(name, *heard) < 1e-4
+    assert drift(*heard) < 1e-4
 
 
 @inside
@@ -126,7 +127,7 @@ def test_a_killed_controller_is_followed_by_a_hold(name):
         first = len(observer.heard)
         held = observer.until(holds, "hold")
         last_command = max(k for k in range(held) if observer.heard[k].num_accepted < observer.heard[held].num_accepted)
-        worst = drift(name, *observer.heard[first:], *observer.during(2.0))
+        worst = drift(*observer.heard[first:], *observer.during(2.0))
     finally:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # processes started later would inherit it
         print(controller.end(), arm.end(signal.SIGINT))
@@ -162,7 +163,7 @@ def test_run_starts_ramps_in_and_leaves_the_arm_to_its_hold(arm, mode):
     assert np.all(np.abs(np.diff(efforts, axis=0)) < 0.01 * steps * load_arm(name).effort_limits)
     held = observer.heard[observer.until(holds, "hold", begun)]
     assert held.num_expired == expired  # it was told to hold, it did not have to notice
-    assert drift(name, *observer.during(0.1)) < 1e-3
+    assert drift(*observer.during(0.1)) < 1e-3
     assert "holds by itself" in said
     assert "effort; " in said and " Hz, round trip " in said
     print(f"{name} {mode}: {said.splitlines()[-2].strip()}")
@@ -194,7 +195,7 @@ def test_run_stops_when_the_arm_faults_and_refuses_one_that_has_a_fault(arm):
         said = meant.end(signal.SIGINT)
     assert meant.wait() == 0, said
     assert f"{name.upper()} has a fault, which is reset now: senders" in said
-    assert drift(name, *observer.during(0.1)) < 1e-3
+    assert drift(*observer.during(0.1)) < 1e-3
 
 
 @inside
@@ -223,7 +224,7 @@ def test_garbage_neither_stops_nor_moves_the_arm(arm):
     heard = observer.heard[first:]
     check_clock(heard)
     assert all(map(holds, heard))
-    assert drift(name, *heard) < 1e-4
+    assert drift(*heard) < 1e-4
 
 
 @inside
@@ -241,7 +242,7 @@ def test_a_jump_of_the_controllers_clock_is_followed_by_a_hold_and_a_new_start(a
         observer.during(0.2)
     finally:
         controller.end()
-    assert drift(name, *observer.heard[first:]) < 1e-3
+    assert drift(*observer.heard[first:]) < 1e-3
 
 
 class Logged:
@@ -296,7 +297,7 @@ def test_commands_that_are_played_again_from_a_log_are_refused(arm, tmp_path):
     assert all(map(holds, heard))
     assert heard[-1].num_accepted == before.num_accepted
     assert heard[-1].refusal_code == Status.REFUSAL_STALE
-    assert drift(name, *heard) < 1e-3
+    assert drift(*heard) < 1e-3
 
 
 @inside
@@ -325,7 +326,7 @@ def test_an_arm_that_is_killed_and_restarted_hears_nothing_from_run_nor_from_a_l
     assert all(map(holds, heard))
     assert heard[-1].num_accepted == 0
     assert heard[-1].refusal_code == Status.REFUSAL_WRONG_SESSION
-    assert drift("mtml", *heard) < 1e-3
+    assert drift(*heard) < 1e-3
 
 
 class ScriptedArm:
@@ -400,4 +401,4 @@ def test_two_controllers_are_noticed_and_a_reset_must_be_meant(arm):
         second.end()
     assert {status.guard_state for status in observer.heard[fault:]} == {Status.STATE_FAULT}
     reset(name, observer)
-    assert drift(name, *observer.during(0.1)) < 1e-3
+    assert drift(*observer.during(0.1)) < 1e-3

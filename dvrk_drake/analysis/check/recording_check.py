@@ -130,6 +130,7 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str
         advice = "the motors were off or are not recorded"
         return [Finding("refusal", "no effort", "efforts", "all of them are always 0", advice)]
     findings = []
+    least_range = arm.per_joint(*LEAST_RANGE)
     for j, name in enumerate(arm.joint_names):
         if not np.any(tau[:, j]):
             advice = "its motor was off or is not recorded; nothing of it can be identified"
@@ -148,13 +149,17 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str
                     "no motor of this arm does that; mend or remove the spikes, or correct the limit in the arm's file"
                 )
             findings.append(Finding(severity, "above effort limit", name, what, advice, (j,), most))
+        # A joint that stands needs a constant effort: that is no saturation.
+        if np.ptp(actuators.q[:, j]) < least_range[j]:
+            continue
         measured = actuators.measured_effort()[:, j]
-        for extreme in (np.max(measured), np.min(measured)):
-            share = _flat_share(measured, float(extreme))
-            if share > FLAT_SHARE:
-                what = f"effort stays at its extreme of {extreme:.4g} in {share:.1%} of the rows"
-                advice = "it was saturated: what the joint did there is not what tau says; record a gentler motion"
-                findings.append(Finding("warning", "saturated effort", name, what, advice, (j,), share))
+        shares = {extreme: _flat_share(measured, extreme) for extreme in (float(measured.max()), float(measured.min()))}
+        flat = {extreme: share for extreme, share in shares.items() if share > FLAT_SHARE}
+        if flat:
+            at = " and at ".join(f"{extreme:.4g} in {share:.1%} of the rows" for extreme, share in flat.items())
+            what = f"effort stays at its extreme: at {at}"
+            advice = "it was saturated: what the joint did there is not what tau says; record a gentler motion"
+            findings.append(Finding("warning", "saturated effort", name, what, advice, (j,), max(flat.values())))
     return findings
 
 

@@ -37,6 +37,11 @@ EFFORT_NOISE = 0.01
 #: Release: pose held, then let go, then driven home; phases end at these times [s].
 HELD_UNTIL, RELEASED_UNTIL, HOME_UNTIL = 0.5, 4.5, 7.5
 STEP_DURATION = 4.0
+#: What a reader of the drift must know.
+NO_DRY_FRICTION = (
+    "Dry friction is not simulated here: every error of the model moves the released arm. On a real arm dry friction "
+    "resists this drift."
+)
 
 
 @dataclass(frozen=True)
@@ -181,7 +186,8 @@ def run_demo(
         arm,
         t,
         {"identified model": released, "model as drawn (SDF)": with_nominal},
-        f"Held until {HELD_UNTIL} s, released under gravity compensation until {RELEASED_UNTIL} s, then driven home",
+        f"{arm.name} (simulated without dry friction): held until {HELD_UNTIL} s, released under gravity compensation "
+        f"until {RELEASED_UNTIL} s, then driven home\n{NO_DRY_FRICTION}",
     )
     plot_positions(
         output / "step.png",

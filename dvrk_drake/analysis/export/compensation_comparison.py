@@ -16,8 +16,17 @@ from dvrk_drake.dynamics.gravity_compensation import (
 )
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
+from dvrk_drake.models.arm import known_arms
 from dvrk_drake.models.gravity_compensation_file import NUM_JOINTS, GravityCompensationFile
 
+#: Signs of the joints, and of their torques, in the mirror image of an arm: a left MTM's wrist is a right one's.
+_MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
+#: Joints whose torque tells the side: shoulder_pitch, elbow_pitch and wrist_platform carry the wrist's brackets.
+_TELLS_SIDE = slice(1, 4)
+#: The mirror image fits clearly better if its error is below this share; of the four public files the wrong
+#: side has 1.8 to 2.1 times the error of the right one.
+_CLEARLY_BETTER = 0.8
+_LEAST_POSES = 200
 #: A torque below this share of the model's largest on that joint has no sign that matters.
 SIGN_SHARE = 0.1
 POSES = 20000
@@ -68,6 +77,7 @@ class CompensationComparison:
         model_torque, file_torque, clipped_torque: (m, 7) [N m] at rest; `file_torque` before the clip.
         clipped, opposed, runaway: (m, 7) True where `JointComparison` counts the pose.
         in_sweep: (m,) True where all of the first six joints are inside the file's sweep.
+        other_side: the mirror image of the model fits the file clearly better: the file is one of the other side's arm.
     """
 
     file: GravityCompensationFile
@@ -81,22 +91,34 @@ class CompensationComparison:
     opposed: NDArray[np.bool_]
     runaway: NDArray[np.bool_]
     in_sweep: NDArray[np.bool_]
+    other_side: bool
 
     def as_dict(self) -> dict:
         """For JSON; NaN becomes None."""
         joints = [{k: None if v != v else v for k, v in asdict(j).items()} for j in self.joints]
-        return {"poses": len(self.q), "share_in_sweep": float(self.in_sweep.mean()), "joints": joints}
+        return {
+            "poses": len(self.q),
+            "other_side": self.other_side,
+            "share_in_sweep": float(self.in_sweep.mean()),
+            "joints": joints,
+        }
 
 
 def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) -> CompensationComparison:
     """Compares at random poses, uniform in the joint box and inside the coupled limits.
 
     Raises:
-        ModelError: the model is not of an MTM.
+        ModelError: the model is not of an MTM, or the file is named as one of another arm of this project.
     """
     arm = model.load_arm()
     if arm.joint_names != MTM_JOINTS:
         raise ModelError(f"{arm.name}: a gravity-compensation file of the dVRK is one of an MTM; joints differ")
+    known = [name.upper() for name in known_arms()]
+    if file.arm_name.upper() != arm.name.upper() and {file.arm_name.upper(), arm.name.upper()} <= set(known):
+        raise ModelError(
+            f"the file is of {file.arm_name}, by its ARM_NAME or its file name, but the model is of {arm.name}, and "
+            f"their torques differ. Use a model of {file.arm_name}; if the name is wrong, correct it in the file"
+        )
     q = arm.sample_poses(POSES, np.random.default_rng(0))
     tau_model, tau_raw, tau_clipped = model.holding_torque(q), unclipped_torque(file, q), controller_torque(file, q)
     half_range = 0.5 * np.ptp(tau_model, axis=0)
@@ -134,8 +156,35 @@ def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) 
         for j, name in enumerate(arm.joint_names)
     ]
     return CompensationComparison(
-        file, model, joints, q, tau_model, tau_raw, tau_clipped, clipped, opposed, runaway, in_sweep
+        file,
+        model,
+        joints,
+        q,
+        tau_model,
+        tau_raw,
+        tau_clipped,
+        clipped,
+        opposed,
+        runaway,
+        in_sweep,
+        other_side=_is_of_other_side(model, q, tau_clipped, in_sweep),
     )
+
+
+def _is_of_other_side(
+    model: IdentifiedModel, q: NDArray[np.float64], tau_file: NDArray[np.float64], in_sweep: NDArray[np.bool_]
+) -> bool:
+    """Whether the mirror image of the model fits a file's torque clearly better, where the file has data if it says."""
+    if np.count_nonzero(in_sweep) >= _LEAST_POSES:
+        q, tau_file = q[in_sweep], tau_file[in_sweep]
+    own, mirrored = model.holding_torque(q), _MIRROR * model.holding_torque(_MIRROR * q)
+    return _side_error(tau_file, mirrored) < _CLEARLY_BETTER * _side_error(tau_file, own)
+
+
+def _side_error(tau_file: NDArray[np.float64], tau_model: NDArray[np.float64]) -> float:
+    """RMS error over the joints that tell the side, each as a share of the RMS of the file's torque."""
+    size = np.sqrt(np.mean(tau_file[:, _TELLS_SIDE] ** 2, axis=0)) + 1e-12
+    return _rms((tau_file - tau_model)[:, _TELLS_SIDE] / size)
 
 
 def _polynomial_torque(file: GravityCompensationFile, q: NDArray[np.float64]) -> NDArray[np.float64]:

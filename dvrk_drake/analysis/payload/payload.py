@@ -87,9 +87,14 @@ class Payload:
         """Whether the interval of the mass excludes 0."""
         return self.body.mass > self.quantile * self.mass_error
 
-    def as_dict(self) -> dict:
-        """What `payload --json` writes; coordinates that are not determined are null."""
+    def as_dict(self, estimates: Sequence[Payload] = ()) -> dict:
+        """Returns the entry of `payload --json`; coordinates that are not determined are null.
+
+        Args:
+            estimates: of all links, for a comparison. No bound of the mass is stated where another link shows one.
+        """
         known = self.body.determined
+        elsewhere = shown_elsewhere(self, estimates)
 
         def numbers(values: NDArray[np.float64]) -> list[float | None]:
             return [float(v) if ok else None for v, ok in zip(values, known, strict=True)]
@@ -97,7 +102,7 @@ class Payload:
         return {
             "link": self.link,
             "found": self.found,
-            "largest_at_com": self.largest_at_com,
+            "largest_at_com": None if elsewhere and not self.found else self.largest_at_com,
             "mass": self.body.mass,
             "mass_standard_error": self.mass_error,
             "place_in_link": numbers(self.body.place),
@@ -105,6 +110,7 @@ class Payload:
             "confidence": CONFIDENCE,
             "quantile": self.quantile,
             "left_out_error": self.left_out,
+            "better_links": [payload.link for payload in better_links(self, estimates)],
             "shift": self.shift,
             "actuators": [asdict(actuator) for actuator in self.actuators],
         }
@@ -171,6 +177,22 @@ def check_links(regressor: DynamicRegressor, links: Sequence[str]) -> None:
 def as_good(estimates: Sequence[Payload]) -> list[Payload]:
     """The links that the recording cannot tell from the best one."""
     return [payload for payload in estimates if payload.left_out <= SAME_ERROR * estimates[0].left_out]
+
+
+def better_links(payload: Payload, estimates: Sequence[Payload]) -> list[Payload]:
+    """Returns the links that explain the change clearly better than `payload` does, best first."""
+    return [other for other in estimates if SAME_ERROR * other.left_out < payload.left_out]
+
+
+def shown_elsewhere(payload: Payload, estimates: Sequence[Payload]) -> list[Payload]:
+    """Returns the links that contradict "no payload" on the link of `payload`, best first.
+
+    These explain the change clearly better, or a mass was found on them that predicts phases not used for its fit.
+    """
+    better = better_links(payload, estimates)
+    return [
+        other for other in estimates if other in better or (other is not payload and other.found and other.left_out < 1)
+    ]
 
 
 def _estimate(link: LinkInertia, columns: NDArray[np.float64], difference: MotionDifference) -> Payload:

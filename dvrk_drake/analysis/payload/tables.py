@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.markup import escape
 
-from dvrk_drake.analysis.payload.payload import CONFIDENCE, Payload, as_good
+from dvrk_drake.analysis.payload.payload import CONFIDENCE, Payload, as_good, better_links, shown_elsewhere
 from dvrk_drake.analysis.payload.point_mass import LARGEST_MASS
 from dvrk_drake.analysis.tables import make_table
 
@@ -36,10 +36,31 @@ def print_links(console: Console, estimates: Sequence[Payload]) -> None:
         )
 
 
-def print_payload(console: Console, payload: Payload) -> None:
-    """Mass and place with their intervals, then what is explained; or that there is none to be found."""
+def describe_better_links(payload: Payload, estimates: Sequence[Payload]) -> str | None:
+    """Returns one line that names the links that explain the change better than that of `payload`; None if none do."""
+    better = better_links(payload, estimates)
+    if not better:
+        return None
+    first = better[0]
+    same = [other.link for other in as_good(estimates)]
+    mass = f", {first.body.mass:.3g} +- {first.mass_error:.2g} kg" if first.found else ""
+    return (
+        f"{payload.link} does not explain the change best: left-out error {payload.left_out:.1%}, but "
+        f"{first.left_out:.1%} with a payload on {' or '.join(same)}{mass}. Use this result only if the payload is "
+        f"certainly on {payload.link}; else repeat with --link {first.link}"
+    )
+
+
+def print_payload(console: Console, payload: Payload, estimates: Sequence[Payload] = ()) -> None:
+    """Prints mass and place with their intervals and what is explained, or that no payload was found.
+
+    Args:
+        console: to print to.
+        payload: to print.
+        estimates: of all links; an upper bound of the mass is printed only where none of them shows a payload.
+    """
     if not payload.found:
-        console.print(_none_found(payload), soft_wrap=True)
+        console.print(_none_found(payload, shown_elsewhere(payload, estimates)), soft_wrap=True)
         return
     table = make_table(
         f"Payload on {payload.link}",
@@ -70,9 +91,12 @@ def print_payload(console: Console, payload: Payload) -> None:
     console.print("* by the payload and by what changed in the drives: offsets, friction\n", style="dim")
 
 
-def _none_found(payload: Payload) -> str:
-    """One line with what would have been found."""
+def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
+    """Returns one line with the largest mass that would not show, unless another link shows a payload."""
     said = f"No payload found on {payload.link}: the interval of its mass includes 0. "
+    if elsewhere:
+        first = elsewhere[0]
+        return said + f"A payload on {first.link} explains the change (left-out error {first.left_out:.1%})."
     if payload.largest_at_com > LARGEST_MASS:
         return said + "A mass at the link's centre of mass would not show in this motion."
     return said + f"At the link's centre of mass it is below {1e3 * payload.largest_at_com:.3g} g ({CONFIDENCE:.0%})."

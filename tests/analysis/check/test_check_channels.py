@@ -84,6 +84,24 @@ def test_saturated_effort():
     assert finding.size == pytest.approx(0.05, abs=0.015)
 
 
+def test_effort_saturated_both_ways_is_one_finding():
+    whole = clean_motion()
+    limit = np.quantile(np.abs(whole.tau[:, 0]), 0.8)
+    (finding,) = found(changed(whole, "tau", 0, lambda x: np.clip(x, -limit, limit)))["saturated effort"]
+    assert f"at {limit:.4g} in" in finding.what and f"at {-limit:.4g} in" in finding.what
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-3])
+def test_a_standing_arm_is_not_saturated(step):
+    """Its efforts are constant, or change between two steps of a converter."""
+    whole, arm = clean_motion(), load_arm("psm")
+    tau = np.tile(0.05 * arm.effort_limits, (len(whole), 1))
+    tau[::7] += step
+    standing = replace(whole, q=0 * whole.q + whole.q[0], qd=0 * whole.qd, tau=tau)
+    kinds = found(standing)
+    assert len(kinds["never moves"]) == arm.num_joints and "saturated effort" not in kinds
+
+
 def test_efforts_in_another_unit_are_refused():
     assert found(changed(clean_motion(), "tau", 1, lambda x: 1000 * x))["unusable"][0].severity == "refusal"
 

@@ -1,11 +1,15 @@
 """The demo as a user runs it, on fewer poses: it must find the arm that it hid, and hold it."""
 
+import io
+
 import numpy as np
 import pytest
+from rich.console import Console
 
 from dvrk_drake.analysis.collection import visiting_trajectory
 from dvrk_drake.analysis.demo import demo
 from dvrk_drake.analysis.demo.true_arm import make_true_arm
+from dvrk_drake.analysis.tables import print_demo
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.models.arm import load_arm
@@ -19,9 +23,16 @@ def result(tmp_path_factory):
     shorter = pytest.MonkeyPatch()
     shorter.setattr(demo, "POSES", 20)
     shorter.setattr(demo, "FRESH_POSES", 6)
-    stages = []
+    stages, plot = [], demo.plot_positions
+    shorter.setattr(
+        demo, "plot_positions", lambda path, *rest: (TITLES.update({path.name: rest[-1]}), plot(path, *rest))
+    )
     yield folder, demo.run_demo(folder, progress=lambda what, share: stages.append((what, share))), stages
     shorter.undo()
+
+
+#: Of the plots of positions, by the name of the file.
+TITLES: dict[str, str] = {}
 
 
 def test_demo_writes_everything(result):
@@ -64,6 +75,15 @@ def test_demo_drifts_less_than_with_the_nominal_model_and_comes_to_rest(result):
     _, outcome, _ = result
     assert outcome.drift["identified"].max() < 0.3 * outcome.drift["as drawn"].max()
     assert outcome.step_error.max() < 1e-3
+
+
+def test_drift_is_shown_as_that_of_an_arm_without_friction(result):
+    folder, outcome, _ = result
+    assert "without dry friction" in TITLES["release.png"] and demo.NO_DRY_FRICTION in TITLES["release.png"]
+    console = Console(record=True, width=120, file=io.StringIO())
+    print_demo(console, outcome, str(folder))
+    printed = " ".join(console.export_text().split())
+    assert demo.NO_DRY_FRICTION in printed and "without dry friction" in printed
 
 
 def test_true_arm_is_possible_and_differs():

@@ -1,5 +1,6 @@
 """A payload from two recordings of one motion: identities, recovery on simulated arms and on a real one, refusals."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -10,10 +11,11 @@ from pydrake.multibody.tree import MultibodyForces
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.payload.payload import as_good, estimate_payload
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
-from dvrk_drake.analysis.payload.tables import print_payload
+from dvrk_drake.analysis.payload.tables import describe_better_links, print_payload
 from dvrk_drake.analysis.tables import make_console
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, pseudo_inertia
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
@@ -123,6 +125,41 @@ def test_what_is_not_found_is_said_with_how_much_it_may_be(capsys):
     assert mass < some.largest_at_com < 4 * mass
 
 
+def assert_end_link_explains(estimates, capsys):
+    """A payload on the end link is not denied, and not attributed to another link without a warning."""
+    by_link = {payload.link: payload for payload in estimates}
+    wrong = [by_link["insertion_link"], by_link["bottom_bar_link"]]
+    for payload in wrong:
+        warning = describe_better_links(payload, estimates)
+        assert warning.startswith(f"{payload.link} does not explain the change best") and "on end_link" in warning
+        assert "\n" not in warning and "--link end_link" in warning
+        assert payload.as_dict(estimates)["better_links"][0] == "end_link"
+        print_payload(make_console(), payload, estimates)
+        printed = capsys.readouterr().out
+        assert "below" not in printed
+        assert payload.found or "A payload on end_link explains the change" in printed
+    assert not wrong[0].found and wrong[0].as_dict(estimates)["largest_at_com"] is None
+    end = by_link["end_link"]
+    assert describe_better_links(end, estimates) is None and end.as_dict(estimates)["better_links"] == []
+
+
+LINKS = ["insertion_link", "bottom_bar_link", "end_link"]
+
+
+def test_a_payload_on_another_link_is_reported(capsys):
+    name, link, mass, place = CASES["end"]
+    model, reference, loaded = two_days(name, link, mass, place, 0)
+    assert_end_link_explains(estimate_payload(reference, loaded, model, LINKS), capsys)
+
+
+def test_without_payload_no_link_is_better():
+    model, reference, other = two_days("psm", "end_link", 0.0, [0.0, 0.0, 0.0], 0)
+    estimates = estimate_payload(reference, other, model, LINKS)
+    for payload in estimates:
+        assert describe_better_links(payload, estimates) is None
+        assert payload.as_dict(estimates)["largest_at_com"] > 0
+
+
 def test_a_reference_that_begins_later_is_aligned():
     name, link, mass, place = CASES["end"]
     model, reference, loaded = two_days(name, link, mass, place, 0)
@@ -164,6 +201,25 @@ def test_from_the_command_line(tmp_path, capsys):
     assert len(errors) == 3 and 'unknown link "nose"' in errors[0] and "is an input" in errors[1]
 
 
+def test_a_named_link_is_compared_with_all_others(tmp_path, capsys):
+    name, link, mass, place = CASES["end"]
+    model, reference, loaded = two_days(name, link, mass, place, 0)
+    paths = [str(tmp_path / f"{which}.csv") for which in ("reference", "loaded")]
+    for recording, path in zip((reference, loaded), paths, strict=True):
+        write_recording(recording, path)
+    known = dataclasses.replace(IdentifiedModel.from_arm(model.arm), dynamics=model.section)
+    known.save(tmp_path / "model.yaml")
+    command = ["payload", *paths, "--model", str(tmp_path / "model.yaml"), "--link"]
+    assert main([*command, "insertion_link"]) == 0
+    said = capsys.readouterr()
+    assert said.err.startswith("dvrk-drake: warning: insertion_link does not explain the change best")
+    assert said.err.count("\n") == 1 and "end_link" in said.err
+    assert "Where the payload may be" in said.out and "below" not in said.out
+    assert main([*command, link]) == 0
+    said = capsys.readouterr()
+    assert not said.err and f"Payload on {link}" in said.out and "Where" not in said.out
+
+
 #: File, link, mass [kg], height above the remote centre [m]: its README, and docs/payload.md for how places are read.
 WEIGHTS = [
     ("psm_one_105g_parallel.csv", "bottom_bar_link", 0.105, 0.200),
@@ -191,3 +247,9 @@ def test_known_weights_on_a_real_arm(unloaded, file, link, mass, height):
     assert abs(payload.place_in_base[2] - height) < payload.quantile * payload.place_error[2]
     assert abs(payload.body.mass / mass - 1) < 0.15
     assert payload.found
+
+
+def test_a_real_payload_on_another_link_is_reported(unloaded, capsys):
+    folder, reference, model = unloaded
+    loaded = read_recording(folder / "psm_one_205g_insertion.csv", model.arm, "actuator")
+    assert_end_link_explains(estimate_payload(reference, loaded, model, LINKS), capsys)

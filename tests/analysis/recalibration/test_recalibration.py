@@ -176,12 +176,13 @@ def test_from_the_command_line(tmp_path, capsys):
     assert IdentifiedModel.load(paths["new.yaml"]).provenance.method.endswith(f"recalibrated on {paths['short.csv']}")
     table = capsys.readouterr().out
     assert all(name in table for name in ("before", "refit", "wrist_yaw", "kept", "motions like the recalibration"))
-    assert main(["recalibrate", paths["static.yaml"], paths["short.csv"], "--output", paths["new.yaml"]]) == 2
+    again = ["--output", paths["new.yaml"], "--overwrite"]
+    assert main(["recalibrate", paths["static.yaml"], paths["short.csv"], *again]) == 2
     assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], "--output", paths["model.yaml"]]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2 and "has no dynamics" in lines[0] and "is an input" in lines[1]
     spiked = read_recording(paths["short.csv"], load_arm("psm"))
     spiked.tau[500, 1] = 500.0
     write_recording(spiked, paths["short.csv"])
-    assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], "--output", paths["new.yaml"]]) == 2
+    assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], *again]) == 2
     assert "above its limit" in capsys.readouterr().out

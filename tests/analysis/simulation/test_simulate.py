@@ -11,6 +11,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ScenarioError
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.models.recording import read_recording
 
 EXAMPLE = ROOT / "examples" / "psm_reach.yaml"
@@ -36,6 +37,31 @@ def test_reaches_its_targets_at_their_times_and_rests_there():
     assert np.abs(recording.qd[-1]).max() < 1e-3
     gravity = IdentifiedModel.from_arm(PSM).holding_torque(recording.q[-1])
     assert recording.tau[-1, 2] - gravity[2] == pytest.approx(0.8, abs=0.02)
+
+
+@pytest.mark.slow
+def test_the_led_handle_arrives_while_joint_4_sticks():
+    """What examples/real_arm.yaml says of joint 4: the handle's pose is six numbers, and joints 6 and 7 do its part."""
+    example = str(ROOT / "examples" / "real_arm.yaml")
+    with_friction, without = (
+        simulate(load_scenario(example, ["duration=3", *settings])).state_true[-1, :7]
+        for settings in ([], ["real_arm=[cables, springs, stops, saturation, encoder, effort, delay]"])
+    )
+    arm = load_arm("mtml")
+    led = np.array(load_scenario(example, []).hand.path[-1].pose)
+    assert abs(led[3]) == 0.3 and abs(with_friction[3]) < 0.01
+    # Without friction joint 4 moves: the handle does not determine it.
+    assert abs(without[3]) > 0.05
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    poses = []
+    for q in (led, with_friction):
+        set_arm_positions(plant, context, arm, q)
+        poses.append(plant.GetFrameByName("dh_7").CalcPoseInWorld(context))
+    apart = poses[0].inverse() @ poses[1]
+    assert np.linalg.norm(apart.translation()) < 2e-3 and apart.rotation().ToAngleAxis().angle() < 0.02
+    # Joint 4 where it was led, and the others where they are, is another pose of the handle.
+    assert np.abs(with_friction - led)[4:].max() > 0.1
 
 
 def test_same_scenario_same_bytes_and_the_seed_is_of_the_noise(tmp_path):

@@ -1,0 +1,92 @@
+"""Every script of examples/ runs, writes only where it is told to, and names no page that is gone."""
+
+import os
+import pty
+import re
+import subprocess
+import sys
+import urllib.request
+
+import numpy as np
+import pytest
+from repository import ROOT
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.static_model import compile_static_model
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.recording import Recording, write_recording
+
+EXAMPLES = ROOT / "examples"
+SHOWS_A_PAGE = ["hold_an_arm.py", "teleoperation.py"]
+
+
+def run(folder, *command):
+    return subprocess.run(
+        [sys.executable, EXAMPLES / command[0], *command[1:]],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_every_script_is_tested():
+    assert {path.name for path in EXAMPLES.glob("*.py")} == {
+        *SHOWS_A_PAGE,
+        "real_recording.py",
+        "regressor_in_numpy.py",
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", [*SHOWS_A_PAGE, "regressor_in_numpy.py"])
+def test_a_script_writes_nothing_and_names_no_dead_page(script, tmp_path):
+    done = run(tmp_path, script)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout and "http" not in done.stdout
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_page_lives_until_enter_on_a_terminal(tmp_path):
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, EXAMPLES / "hold_an_arm.py"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,  # Python writes the prompt of input() there
+    )
+    os.close(theirs)
+    printed = b""
+    while b"press Enter" not in printed:
+        printed += os.read(ours, 1000)
+    address = re.search(rb"http://\S+", printed).group().decode()
+    with urllib.request.urlopen(address) as page:
+        assert page.status == 200
+    assert process.poll() is None
+    os.write(ours, b"\n")
+    assert process.wait() == 0
+    os.close(ours)
+
+
+@pytest.mark.slow
+def test_the_model_is_written_where_the_user_says(tmp_path):
+    arm, generator = load_arm("mtmr"), np.random.default_rng(0)
+    model = compile_static_model(arm)
+    q = arm.sample_poses(40, generator, margin=0.05)
+    tau = model.torque(q, model.gravity.base_values)
+    tau += 0.003 * arm.effort_limits * generator.normal(size=q.shape)
+    poses = tmp_path / "poses.csv"
+    write_recording(Recording(q=q, tau=tau), poses)
+    assert run(tmp_path, "real_recording.py", "poses.csv").returncode == 0
+    assert list(tmp_path.iterdir()) == [poses]
+    assert run(tmp_path, "real_recording.py", "poses.csv", "own.yaml").returncode == 0
+    before = (tmp_path / "own.yaml").read_bytes()
+    assert IdentifiedModel.load(tmp_path / "own.yaml").load_arm().name == arm.name
+    again = run(tmp_path, "real_recording.py", "poses.csv", "own.yaml")
+    assert again.returncode == 1 and "exists already" in again.stderr
+    assert (tmp_path / "own.yaml").read_bytes() == before
