@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
+from dvrk_drake.cli import leave
 from dvrk_drake.errors import DvrkDrakeError
 
 if TYPE_CHECKING:
@@ -38,10 +39,6 @@ def import_interruptibly() -> None:
     if threading.current_thread() is not threading.main_thread() or sys.modules.keys() >= set(modules):
         return
 
-    def leave(*_: object) -> None:
-        os.write(2, b"dvrk-drake: interrupted\n")
-        os._exit(130)
-
     before = signal.signal(signal.SIGINT, leave)
     try:
         for module in modules:
@@ -57,20 +54,20 @@ def quiet_drake() -> None:
 
 def check_output(path: str, *inputs: str) -> None:
     """Refuses, before work begins, an output that cannot be written or that is one of the inputs."""
-    target = Path(path).resolve()
+    target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
         raise DvrkDrakeError(f"{path}: cannot be written: its folder does not exist")
-    if target.exists() and not target.is_file():
+    if os.path.exists(target) and not target.is_file():
         raise DvrkDrakeError(f"{path}: is not a regular file, so it cannot be replaced; name a file")
     try:
-        if target.exists():
+        if os.path.exists(target):
             os.close(os.open(target, os.O_WRONLY))
         with tempfile.TemporaryFile(dir=target.parent):
             pass
     except OSError as error:
         raise DvrkDrakeError(f"{path}: cannot be written: {error.strerror}") from error
     for given in inputs:
-        if target == Path(given).resolve():
+        if str(target) == os.path.realpath(given):
             raise DvrkDrakeError(f"{path}: is an input; name another file to write")
 
 
@@ -81,7 +78,7 @@ _made: list[Path] = []
 def made_folder(path: str) -> Path:
     """The folder at `path`, made if it was not there."""
     folder = Path(path).absolute()
-    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    missing = [place for place in (folder, *folder.parents) if not os.path.exists(place)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -163,13 +163,15 @@ def load_arm(name: str) -> Arm:
     Raises:
         ArmError: no such arm, or its files contradict each other.
     """
+    if "\0" in name:
+        raise ArmError(f"{name!r}: is not the name of a file")
     return _load_arm(os.path.realpath(name) if name.endswith((".yaml", ".yml")) else name.lower())
 
 
 @cache
 def _load_arm(name: str) -> Arm:
     path = Path(name)
-    if path.suffix not in (".yaml", ".yml"):
+    if not path.is_absolute():
         if name not in known_arms():
             raise ArmError(f'unknown arm "{name}"; known arms: {", ".join(known_arms())}')
         path = MODELS_FOLDER / "arms" / f"{name}.yaml"
@@ -192,6 +194,8 @@ def _load_arm(name: str) -> Arm:
 def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part:
     what = f"an arm's {kind}"
     if name.endswith((".yaml", ".yml")):
+        if "\0" in name:
+            raise ArmError(f"{arm_path}: {kind} {name!r} is not the name of a file")
         path = Path(os.path.realpath(arm_path.parent / name))
         if not os.path.lexists(path):
             raise ArmError(f"{arm_path}: {kind} {path}: no such file")
@@ -345,7 +349,9 @@ def _transmission(path: Path, joints: list[str], mechanism: Mechanism, instrumen
     """J with a = J q: the mechanism's rows, and the inverse of the instrument's coupling."""
     J: NDArray[np.float64] = np.eye(len(joints))
     for joint, terms in instrument.joint_from_actuator.items():
-        J[_index(path, "joint_from_actuator", joint, joints)] = _row(path, f"joint_from_actuator.{joint}", terms, joints)
+        J[_index(path, "joint_from_actuator", joint, joints)] = _row(
+            path, f"joint_from_actuator.{joint}", terms, joints
+        )
     J = _inverted(path, "joint_from_actuator", J)
     for actuator, terms in mechanism.transmission.items():
         J[_index(path, "transmission", actuator, joints)] = _row(path, f"transmission.{actuator}", terms, joints)

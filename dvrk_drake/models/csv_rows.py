@@ -88,7 +88,7 @@ class CsvReader:
     def _lines(self) -> Iterator[str]:
         size = max(1, os.fstat(self._file.fileno()).st_size)
         decoder = codecs.getincrementaldecoder("utf-8")()
-        num_read, rest = 0, ""
+        num_read, rest, is_start = 0, "", True
         while True:
             try:
                 block = self._file.read(_BLOCK)
@@ -103,7 +103,9 @@ class CsvReader:
                 raise RecordingError(
                     f"{self._path}: not a CSV text file in UTF-8: {error.reason} at byte {at}"
                 ) from error
-            text = rest + (text if num_read else text.removeprefix("\ufeff"))
+            if is_start and text:
+                text, is_start = text.removeprefix("\ufeff"), False
+            text = rest + text
             num_read += len(block)
             # Whole lines; a CR at the end may be half of a CRLF.
             end = max(text.rfind("\n"), text.rfind("\r", 0, -1)) + 1 if block else len(text)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 import stat
+from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from dvrk_drake.errors import DvrkDrakeError
 
@@ -24,7 +25,7 @@ _KINDS = {
 }
 
 
-def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | None = None) -> BinaryIO:
+def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | None = None) -> FileIO:
     """Opens a regular file for reading, unbuffered.
 
     A FIFO or a device is refused without waiting for it.

@@ -53,7 +53,10 @@ class LcmLogReader:
 
     def __iter__(self) -> Iterator[LcmEvent]:
         self.notes.clear()
-        with open_input(self.path, RecordingError) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        with (
+            open_input(self.path, RecordingError) as file,
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
+        ):
             position = 0
             while position < len(content):
                 end = _end_of_event(content, position)

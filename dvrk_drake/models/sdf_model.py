@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.input_file import LARGEST_TEXT, read_input
@@ -25,6 +26,8 @@ _NUMBERS = _LIMITS | {
     *("scale", "radius", "length", "size", f"{DRAKE}rotor_inertia", f"{DRAKE}gear_ratio"),
 }
 ElementTree.register_namespace("drake", DRAKE.strip("{}"))
+#: How many numbers an element holds that holds several; a pose has 7 with a quaternion.
+_COUNTS = {"pose": (6, 7), "xyz": (3,), "scale": (3,), "size": (3,)}
 
 
 @dataclass(frozen=True)
@@ -130,9 +133,10 @@ def _read(path: Path) -> ElementTree.Element:
 
 
 def _parse(content: bytes) -> ElementTree.Element:
-    parser = ElementTree.XMLPullParser(("start", "end"))
+    parser: Any = ElementTree.XMLPullParser(("start", "end"))
     parser.feed(content)
-    depth, root = 0, None
+    depth = 0
+    root: ElementTree.Element | None = None
     for event, element in parser.read_events():
         root = element if root is None else root
         depth += 1 if event == "start" else -1
@@ -152,10 +156,12 @@ def _check_numbers(path: Path, root: ElementTree.Element) -> None:
             if element.tag == f"{DRAKE}mimic":
                 texts = [(name, element.get(name, "0")) for name in ("multiplier", "offset")]
             for what, text in texts:
-                if not all(_is_number(word, element.tag in _LIMITS) for word in (text or "none").split()):
+                words, counts = (text or "").split(), _COUNTS.get(element.tag, (1,))
+                if len(words) not in counts or not all(_is_number(word, element.tag in _LIMITS) for word in words):
+                    number = "a finite number" if counts == (1,) else f"{counts[0]} finite numbers"
                     raise ArmError(
-                        f"{path}: {part.tag} {part.get('name')}: {what.replace(DRAKE, 'drake:')} is {(text or '')[:60]!r}; "
-                        "allowed: finite numbers"
+                        f"{path}: {part.tag} {part.get('name')}: {what.replace(DRAKE, 'drake:')} is "
+                        f"{(text or '')[:60]!r}; allowed: {number}"
                     )
 
 

@@ -55,14 +55,16 @@ def load_yaml(path: str | Path, error: type[DvrkDrakeError]) -> Any:
 
 
 def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
-    """What a text says, with `where` it stands; None if it is empty. Keys that begin with "_" are left out, for anchors.
+    """What a text says, with `where` it stands; None if it is empty.
+
+    Keys that begin with "_" are left out: they may hold anchors.
 
     Raises:
         DvrkDrakeError: of the type `error`; it is no YAML.
     """
     try:
-        if problem := _excess(text):
-            raise error(f"{where}: not YAML that can be read: {problem}")
+        if excess := _excess(text):
+            raise error(f"{where}: not YAML that can be read: {excess}")
         content = yaml.load(text, Loader=_Loader)
     except DvrkDrakeError:
         raise

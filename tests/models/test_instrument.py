@@ -69,7 +69,11 @@ def test_it_is_simulated_and_touches_its_arm_as_little_as_the_arm_does(folder, n
 
 @pytest.mark.parametrize(
     ("limits", "message"),
-    [("[0.0, .nan]", r"is nan; allowed: a finite number"), ("[0.0, 240]", "must be in m, at most 2 m"), ("[0.2]", "finite")],
+    [
+        ("[0.0, .nan]", r"is nan; allowed: a finite number"),
+        ("[0.0, 240]", "must be in m, at most 2 m"),
+        ("[0.2]", "finite"),
+    ],
 )
 def test_limits_that_are_none_or_in_millimetres_are_refused(folder, limits, message):
     (folder / "bad.yaml").write_text((folder / "arm.yaml").read_text().replace("[0.0, 0.24]", limits))
