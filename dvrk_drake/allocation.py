@@ -8,6 +8,7 @@ Either must be said before a process starts.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import sysconfig
 from pathlib import Path
@@ -28,11 +29,14 @@ def allocator_environment() -> dict[str, str]:
 def restart_with_faster_allocator() -> None:
     """Starts this program again under `allocator_environment`, as the same process; at most once.
 
-    To be called before anything is done or imported that takes time. It does nothing where the program is no file:
+    To be called before anything is done or imported that takes time, by a program that unblocks SIGINT when it starts.
+    It does nothing where the program is no file:
     there is no second start of what came from a pipe.
     """
     environment = allocator_environment()
     if environment and Path(sys.argv[0]).is_file():
+        # Until the program has its own handler again, Ctrl-C waits: Python's start turns it into a traceback.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], os.environ | environment)
 
 

@@ -1,81 +1,34 @@
 """The command line: one verb a command. Bad input gives one line on stderr and exit code 2.
 
-Verbs import what they need when they run: drake and numba take seconds, `--help` should not.
+Nothing is imported here that takes time, so that Ctrl-C ends the program in order as early as possible.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
-import sys
+import signal
 from collections.abc import Sequence
-from importlib.metadata import version
-from typing import NoReturn
-
-from dvrk_drake.allocation import restart_with_faster_allocator
-from dvrk_drake.cli import (
-    check,
-    collect,
-    demo,
-    export,
-    identify,
-    lcm,
-    model,
-    payload,
-    recalibrate,
-    record,
-    reproduce,
-    simulate,
-    study,
-    transparency,
-    tune,
-)
-from dvrk_drake.cli.support import folders_only_for_results, import_interruptibly
-from dvrk_drake.errors import DvrkDrakeError
-
-# Matrices are small here: more threads of BLAS only wait for each other, for minutes where the cores are busy. Said
-# before numpy is imported, which the verbs do.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-_OF_RECORDINGS = (check, identify, recalibrate, payload, export)
-_SIMULATED = (simulate, study, tune, transparency, reproduce, demo)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one verb; returns the exit code: 0, or 2 for bad input."""
-    options = _parser().parse_args(arguments)
-    if arguments is None and options.run.__module__ in [module.__name__ for module in _SIMULATED]:
-        restart_with_faster_allocator()
+    """Runs one verb; returns the exit code: 0, or 2 for bad input.
+
+    Without `arguments` those of the process are taken, and its handling of Ctrl-C.
+    """
+    if arguments is None:
+        signal.signal(signal.SIGINT, leave)
+        # `restart_with_faster_allocator` blocks it until here.
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    from dvrk_drake.cli.program import run
+
     try:
-        import_interruptibly()
-        with folders_only_for_results():
-            options.run(options)
-    except DvrkDrakeError as error:
-        print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except BrokenPipeError:
-        # The reader (head, less) has seen enough.
-        sys.stderr.close()
-        return 0
-    except KeyboardInterrupt:
-        print("dvrk-drake: interrupted", file=sys.stderr)
-        return 130
-    return 0
+        return run(arguments)
+    finally:
+        if arguments is None:
+            signal.signal(signal.SIGINT, leave)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, as everything else here does; usage is what --help is for."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: error: {message}; see {self.prog} --help\n")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="dvrk-drake", description="Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."
-    )
-    parser.add_argument("--version", action="version", version=version("dvrk-drake"))
-    verbs = parser.add_subparsers(required=True, metavar="VERB")
-    for module in (model, *_OF_RECORDINGS, *_SIMULATED, lcm, record, collect):
-        module.add_verbs(verbs)
-    return parser
+def leave(*_: object) -> None:
+    """Handles a signal by ending the process at once: where nothing is half-written."""
+    os.write(2, b"dvrk-drake: interrupted\n")
+    os._exit(130)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from dvrk_drake.cli.support import add_overwrite, add_recording, check_output, made_folder
+from dvrk_drake.cli.support import ProgressBar, add_overwrite, add_recording, check_output, made_folder
 from dvrk_drake.errors import RecordingError
 
 
@@ -36,7 +36,10 @@ def _check(options: argparse.Namespace) -> None:
     if options.json is not None:
         check_output(options.json, options.recording, overwrite=options.overwrite)
     plots = None if options.plots is None else made_folder(options.plots)
-    recording = read_recording(options.recording, arm, options.coordinates)
+    with ProgressBar("reading") as (progress, task):
+        recording = read_recording(
+            options.recording, arm, options.coordinates, lambda share: progress.update(task, completed=100 * share)
+        )
     report = check_for_identification(recording, arm)
     print_report(make_console(), report)
     if options.json is not None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dvrk_drake.cli.support import add_overwrite, check_output
@@ -186,9 +185,11 @@ def _load_model(name: str) -> IdentifiedModel:
 
 def _is_arm_file(name: str) -> bool:
     """An arm's YAML names its mechanism; a model's has no such field."""
+    from dvrk_drake.models.input_file import read_text_input
+
     try:
-        return any(line.startswith("mechanism:") for line in Path(name).read_text(encoding="utf-8").splitlines())
-    except (OSError, UnicodeDecodeError):
+        return any(line.startswith("mechanism:") for line in read_text_input(name, DvrkDrakeError).splitlines())
+    except DvrkDrakeError:
         return False
 
 

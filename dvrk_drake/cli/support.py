@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
+from dvrk_drake.cli import leave
 from dvrk_drake.errors import DvrkDrakeError
 
 if TYPE_CHECKING:
@@ -37,10 +38,6 @@ def import_interruptibly() -> None:
     modules = ("dvrk_drake.analysis.demo.demo", "dvrk_drake.analysis.tables")
     if threading.current_thread() is not threading.main_thread() or sys.modules.keys() >= set(modules):
         return
-
-    def leave(*_: object) -> None:
-        os.write(2, b"dvrk-drake: interrupted\n")
-        os._exit(130)
 
     before = signal.signal(signal.SIGINT, leave)
     try:
@@ -68,22 +65,22 @@ def check_output(path: str, *inputs: str, overwrite: bool) -> None:
         inputs: paths that are read.
         overwrite: an existing file is replaced: the user said so, or the command goes on with its own output.
     """
-    target = Path(path).resolve()
+    target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
         raise DvrkDrakeError(f"{path}: cannot be written: its folder does not exist")
-    if target.exists() and not target.is_file():
+    if os.path.exists(target) and not target.is_file():
         raise DvrkDrakeError(f"{path}: is not a regular file, so it cannot be replaced; name a file")
     try:
-        if target.exists():
+        if os.path.exists(target):
             os.close(os.open(target, os.O_WRONLY))
         with tempfile.TemporaryFile(dir=target.parent):
             pass
     except OSError as error:
         raise DvrkDrakeError(f"{path}: cannot be written: {error.strerror}") from error
     for given in inputs:
-        if target == Path(given).resolve():
+        if str(target) == os.path.realpath(given):
             raise DvrkDrakeError(f"{path}: is an input; name another file to write")
-    if target.exists() and not overwrite:
+    if os.path.exists(target) and not overwrite:
         raise DvrkDrakeError(f"{path}: exists already; name another file, or replace it with --overwrite")
 
 
@@ -94,7 +91,7 @@ _made: list[Path] = []
 def made_folder(path: str) -> Path:
     """The folder at `path`, made if it was not there."""
     folder = Path(path).absolute()
-    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    missing = [place for place in (folder, *folder.parents) if not os.path.exists(place)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -2,13 +2,13 @@
 
 # No postponed annotations here: yaml_load_typed reads the types at run time.
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.common.yaml import yaml_dump_typed, yaml_load
+from pydrake.common.yaml import yaml_dump_typed
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, effect_fault
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
@@ -19,7 +19,8 @@ from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.models.typed_yaml import load_typed_yaml
+from dvrk_drake.models.schema_fault import INFINITE, schema_fault
+from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 
 
 @dataclass
@@ -60,14 +61,14 @@ class JointStatistics:
 
 @dataclass
 class Provenance:
-    """Where a model came from; `sha256` is of the recording's bytes."""
+    """Where a model came from; `sha256` is of the recording's bytes, `condition_number` inf without full rank."""
 
     recording: str = ""
     sha256: str = ""
     poses: int = 0
     method: str = ""
     rank: int = 0
-    condition_number: float = 0.0
+    condition_number: float = field(default=0.0, metadata={INFINITE: True})
     version: str = ""
 
 
@@ -129,13 +130,14 @@ class IdentifiedModel:
         Raises:
             ModelError: no such file, not a model, or one that does not fit its arm.
         """
-        if not Path(path).is_file():
-            raise ModelError(f"{path}: no such file")
-        try:
-            model = load_typed_yaml(cls, path, ModelError, "a model file")
-        except ModelError:
-            _check_format(path)
-            raise
+        content = load_yaml(path, ModelError)
+        # Another version has other keys, which are not worth naming.
+        version = content.get("format") if isinstance(content, dict) else None
+        if version and version != IdentifiedModel.format:
+            raise ModelError(
+                f'{path}: format is "{version}", this version reads "{IdentifiedModel.format}"; identify anew'
+            )
+        model = typed_content(cls, content, str(path), ModelError, "a model file")
         try:
             model.check()
         except (ModelError, ArmError) as error:
@@ -154,6 +156,8 @@ class IdentifiedModel:
 
     def check(self) -> None:
         """Raises ModelError unless the parameters fit the arm that the model names."""
+        if fault := schema_fault(IdentifiedModel, asdict(self), "a model"):
+            raise ModelError(fault)
         if self.format != IdentifiedModel.format:
             raise ModelError(f'format is "{self.format}", this version reads "{IdentifiedModel.format}"')
         arm = self.load_arm()
@@ -167,8 +171,8 @@ class IdentifiedModel:
                 raise ModelError(f"effects[{i}]: {fault}")
         if self.validation is not None and set(self.validation.verdicts) != set(arm.joint_names):
             raise ModelError(f"validation.verdicts must name these joints: {', '.join(arm.joint_names)}")
-        if not np.all(np.isfinite(self.theta)) or not np.all((self.trust >= 0) & (self.trust <= 1)):
-            raise ModelError("parameters must be finite numbers and trust between 0 and 1")
+        if not np.all((self.trust >= 0) & (self.trust <= 1)):
+            raise ModelError("trust must be between 0 and 1")
         if self.dynamics is not None:
             DynamicModel(arm, self.dynamics)
             if self.effects or self.dynamics.gravity != self.gravity:
@@ -219,14 +223,3 @@ class IdentifiedModel:
     def holding_torque(self, q: ArrayLike) -> NDArray[np.float64]:
         """Torque [N m, N] on the joints that holds the arm: (n,) for q (n,), (m, n) for q (m, n)."""
         return self.trust * self.static_model.torque(q, self.theta)
-
-
-def _check_format(path: str | Path) -> None:
-    """Raises ModelError if that is all that is known of the file: it is a model of another version."""
-    try:
-        content = yaml_load(filename=str(path))
-    except Exception:
-        return  # no YAML at all, which the caller says
-    version = content.get("format") if isinstance(content, dict) else None
-    if version and version != IdentifiedModel.format:
-        raise ModelError(f'{path}: format is "{version}", this version reads "{IdentifiedModel.format}"; identify anew')

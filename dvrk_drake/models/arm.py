@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -25,7 +26,7 @@ from dvrk_drake.models.arm_schema import (
 )
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, compose_sdf, read_sdf_facts
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, read_sdf_facts
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 #: A joint that slides further has its limits in another unit [m].
@@ -162,48 +163,63 @@ def load_arm(name: str) -> Arm:
     Raises:
         ArmError: no such arm, or its files contradict each other.
     """
-    return _load_arm(str(Path(name).resolve()) if name.endswith((".yaml", ".yml")) else name.lower())
+    if "\0" in name:
+        raise ArmError(f"{name!r}: is not the name of a file")
+    return _load_arm(os.path.realpath(name) if name.endswith((".yaml", ".yml")) else name.lower())
 
 
 @cache
 def _load_arm(name: str) -> Arm:
     path = Path(name)
-    if path.suffix not in (".yaml", ".yml"):
-        path = MODELS_FOLDER / "arms" / f"{name}.yaml"
-        if not path.is_file():
+    if not path.is_absolute():
+        if name not in known_arms():
             raise ArmError(f'unknown arm "{name}"; known arms: {", ".join(known_arms())}')
-    if not path.is_file():
-        raise ArmError(f"{path}: no such arm file")
+        path = MODELS_FOLDER / "arms" / f"{name}.yaml"
     description = load_typed_yaml(ArmDescription, path, ArmError, "an arm's file")
     mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)
     instrument = Instrument()
     if description.instrument:
         instrument = _load_part(Instrument, path, "instrument", description.instrument)
-    return _build_arm(name, path, description, mechanism, instrument)
+    try:
+        arm = _build_arm(name, path, description, mechanism, instrument)
+        if path.parent.parent != MODELS_FOLDER:
+            from dvrk_drake.models.plant import check_plant  # which imports this module
+
+            check_plant(arm)
+    except ArmError as error:
+        raise error if str(error).startswith(str(path)) else ArmError(f"{path}: {error}") from error
+    return arm
 
 
 def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part:
     what = f"an arm's {kind}"
     if name.endswith((".yaml", ".yml")):
-        path = (arm_path.parent / name).resolve()
-        if not path.is_file():
+        if "\0" in name:
+            raise ArmError(f"{arm_path}: {kind} {name!r} is not the name of a file")
+        path = Path(os.path.realpath(arm_path.parent / name))
+        if not os.path.lexists(path):
             raise ArmError(f"{arm_path}: {kind} {path}: no such file")
         part = load_typed_yaml(schema, path, ArmError, what)
         if part.sdf and not part.sdf.startswith(PACKAGE_URL):
             part.sdf = str(path.parent / part.sdf)
         return part
     folder = MODELS_FOLDER / f"{kind}s"
-    path = folder / f"{name}.yaml"
-    if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
-        raise ArmError(f'{arm_path}: unknown {kind} "{name}"; known {kind}s: {known}, or the path of a YAML file')
-    return load_typed_yaml(schema, path, ArmError, what)
+    known = sorted(path.stem for path in folder.glob("*.yaml"))
+    if name not in known:
+        raise ArmError(
+            f'{arm_path}: unknown {kind} "{name}"; known {kind}s: {", ".join(known)}, or the path of a YAML file'
+        )
+    return load_typed_yaml(schema, folder / f"{name}.yaml", ArmError, what)
 
 
 def _build_arm(
     source: str, path: Path, description: ArmDescription, mechanism: Mechanism, instrument: Instrument
 ) -> Arm:
     joints = [*mechanism.joints, *instrument.joints]
+    if not joints or len({*joints}) < len(joints):
+        raise ArmError(f"{path}: the joints of its mechanism and instrument must be different names, at least one")
+    if not mechanism.sdf:
+        raise ArmError(f"{path}: its mechanism names no sdf")
     sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)
     mirrored = {url: tuple(links) for url, links in description.mirrored_links.items()}
     facts = read_sdf_facts(compose_sdf(sdf, mirrored))
@@ -236,16 +252,16 @@ def _build_arm(
         mirrored_links=mirrored,
         position_lower=limits[:, 0],
         position_upper=limits[:, 1],
-        effort_limits=np.array([facts.effort_limits[j] for j in joints]),
+        effort_limits=_effort_limits(path, joints, facts),
         prismatic=np.array([j in facts.prismatic for j in joints]),
         coupled_limits=_coupled_limits(path, description, mechanism),
         linkage=LinearMap(G, c),
-        transmission=LinearMap(_transmission(joints, mechanism, instrument), np.zeros(len(joints))),
+        transmission=LinearMap(_transmission(path, joints, mechanism, instrument), np.zeros(len(joints))),
         loop_closures=tuple(mechanism.loop_closures),
         gravity=_checked_gravity(description.gravity),
         gains=gains,
         friction_coordinates={
-            name: np.array([terms.get(j, 0.0) for j in joints])
+            name: _row(path, f"friction_coordinates.{name}", terms, joints)
             for name, terms in instrument.friction_coordinates.items()
         },
         motion=motion,
@@ -285,6 +301,10 @@ def _check_limits(path: Path, joint: str, limits: list[float], prismatic: bool) 
 
 def _coupled_limits(path: Path, description: ArmDescription, mechanism: Mechanism) -> tuple[CoupledLimit, ...]:
     limits = {limit.name: limit for limit in mechanism.coupled_limits}
+    for limit in mechanism.coupled_limits:
+        _row(path, f"coupled_limits: {limit.name}", limit.coefficients, mechanism.joints)
+        if not limit.lower < limit.upper:
+            raise ArmError(f"{path}: coupled_limits: {limit.name} must have lower < upper")
     for name, bounds in description.coupled_limits.items():
         if name not in limits:
             raise ArmError(f'{path}: unknown coupled limit "{name}"; known: {", ".join(limits) or "none"}')
@@ -318,12 +338,41 @@ def _checked_gravity(gravity: Sequence[float]) -> NDArray[np.float64]:
     return vector
 
 
-def _transmission(joints: list[str], mechanism: Mechanism, instrument: Instrument) -> NDArray[np.float64]:
+def _effort_limits(path: Path, joints: list[str], facts: SdfFacts) -> NDArray[np.float64]:
+    limits = np.array([facts.effort_limits.get(joint, 0.0) for joint in joints])
+    if bad := [joint for joint, limit in zip(joints, limits, strict=True) if not limit > 0]:
+        raise ArmError(f"{path}: joint {bad[0]} of its SDF needs a positive <axis><limit><effort> [N m, N]")
+    return limits
+
+
+def _transmission(path: Path, joints: list[str], mechanism: Mechanism, instrument: Instrument) -> NDArray[np.float64]:
     """J with a = J q: the mechanism's rows, and the inverse of the instrument's coupling."""
     J: NDArray[np.float64] = np.eye(len(joints))
     for joint, terms in instrument.joint_from_actuator.items():
-        J[joints.index(joint)] = [terms.get(j, 0.0) for j in joints]
-    J = np.asarray(np.linalg.inv(J), dtype=np.float64)
+        J[_index(path, "joint_from_actuator", joint, joints)] = _row(
+            path, f"joint_from_actuator.{joint}", terms, joints
+        )
+    J = _inverted(path, "joint_from_actuator", J)
     for actuator, terms in mechanism.transmission.items():
-        J[joints.index(actuator)] = [terms.get(j, 0.0) for j in joints]
+        J[_index(path, "transmission", actuator, joints)] = _row(path, f"transmission.{actuator}", terms, joints)
+    _inverted(path, "transmission", J)
     return J
+
+
+def _index(path: Path, key: str, joint: str, joints: list[str]) -> int:
+    if joint not in joints:
+        raise ArmError(f"{path}: {key} names {joint}; allowed: {', '.join(joints)}")
+    return joints.index(joint)
+
+
+def _row(path: Path, key: str, terms: dict[str, float], joints: list[str]) -> NDArray[np.float64]:
+    row = np.zeros(len(joints))
+    for joint, coefficient in terms.items():
+        row[_index(path, key, joint, joints)] = coefficient
+    return row
+
+
+def _inverted(path: Path, key: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    if not np.linalg.cond(matrix) < 1e9:
+        raise ArmError(f"{path}: {key}: its rows depend on each other, so that positions do not follow from it")
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)

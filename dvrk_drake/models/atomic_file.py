@@ -30,7 +30,7 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO]:
         DvrkDrakeError: no such folder, the file cannot be written, or it is no regular file (/dev/null).
     """
     target = Path(os.path.realpath(path))
-    exists = target.exists()
+    exists = os.path.exists(target)
     if exists and not target.is_file():
         raise DvrkDrakeError(f"{path}: is not a regular file, so it cannot be replaced; name a file")
     if exists and not os.access(target, os.W_OK):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 
@@ -40,7 +41,7 @@ class CollectionFile:
         if both_sides:
             self._header += self._names("friction")
         self._file: GrowingFile | None = None
-        self._is_there, self._has_header = self._path.exists(), False
+        self._is_there, self._has_header = os.path.lexists(path), False
         self._rows = self._read() if self._is_there else []
 
     def finished(self, poses: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -19,8 +19,6 @@ def load_gains(path: str | Path) -> Gains:
     Raises:
         ControllerError: no such file, or not one of gains.
     """
-    if not Path(path).is_file():
-        raise ControllerError(f"{path}: no such file of gains")
     gains = load_typed_yaml(Gains, path, ControllerError, "a file of gains")
     for name, values in dataclasses.asdict(gains).items():
         if not values:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import known_arms
 from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.input_file import read_json_input
 
 VERSION = "2.0"
 NUM_JOINTS = 7
@@ -84,12 +85,7 @@ class GravityCompensationFile:
         Raises:
             ModelError: no such file, not JSON, another version, or a field that is missing or wrong.
         """
-        try:
-            content = json.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise ModelError(f"{path}: cannot be read: {error.strerror}") from error
-        except ValueError as error:
-            raise ModelError(f"{path}: not JSON: {error}") from error
+        content = read_json_input(path, ModelError)
         controller = content.get(_CONTROLLER) if isinstance(content, dict) else None
         if not isinstance(controller, dict):
             raise ModelError(f"{path}: has no {_CONTROLLER}: not a gravity-compensation file of the dVRK")
@@ -131,7 +127,7 @@ class GravityCompensationFile:
 def _numbers(value: object) -> NDArray[np.float64]:
     try:
         return np.atleast_1d(np.array(value, dtype=np.float64))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return np.empty(0)  # refused by check(), which names the field
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.input_file import open_input
 
 _MAGIC = bytes.fromhex("EDA1DA01")
 _HEADER = struct.Struct(">4sqqII")
@@ -52,7 +53,10 @@ class LcmLogReader:
 
     def __iter__(self) -> Iterator[LcmEvent]:
         self.notes.clear()
-        with open(self.path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        with (
+            open_input(self.path, RecordingError) as file,
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
+        ):
             position = 0
             while position < len(content):
                 end = _end_of_event(content, position)
@@ -64,7 +68,7 @@ class LcmLogReader:
 
     def sha256(self) -> str:
         """Of the file's bytes."""
-        with open(self.path, "rb") as file:
+        with open_input(self.path, RecordingError) as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
     def _skip(self, content: mmap.mmap, damaged: int) -> int:
@@ -83,9 +87,9 @@ class LcmLogReader:
 def is_lcm_log(path: str | Path) -> bool:
     """Whether the file begins as an LCM log does; False where there is no file to read."""
     try:
-        with open(path, "rb") as file:
+        with open_input(path, RecordingError) as file:
             return file.read(len(_MAGIC)) == _MAGIC
-    except OSError:
+    except (RecordingError, OSError):
         return False
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
+import os
 import shutil
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.input_file import LARGEST_BINARY, open_input, read_json_input
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
 
 _FILE_URL = "file://"
@@ -33,7 +34,7 @@ def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, P
         source = _local_path(uri.text or "")
         if source is None:
             continue
-        if not source.is_file():
+        if not os.path.isfile(source):
             raise ArmError(f"{source}: no such mesh")
         relative = Path(mesh_folder(model_path)) / source.parent.name / source.name
         target = model_path.parent / relative
@@ -52,13 +53,13 @@ def copy_meshes(copies: dict[Path, Path]) -> None:
         DvrkDrakeError: a file cannot be written.
     """
     for source, target in copies.items():
-        if source == target.resolve():
+        if str(source) == os.path.realpath(target):
             continue
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise DvrkDrakeError(f"{target.parent}: cannot be made a folder: {error.strerror}") from error
-        with source.open("rb") as stream, atomic_write(target, "wb") as copy:
+        with open_input(source, ArmError) as stream, atomic_write(target, "wb") as copy:
             shutil.copyfileobj(stream, copy)
 
 
@@ -74,6 +75,12 @@ def _parts_of(mesh: Path) -> list[str]:
     """Buffers and images that a glTF file keeps outside of itself."""
     if mesh.suffix != ".gltf":
         return []
-    content = json.loads(mesh.read_text(encoding="utf-8"))
-    uris = [part.get("uri", "data:") for kind in ("buffers", "images") for part in content.get(kind, [])]
-    return [uri for uri in uris if not uri.startswith("data:")]
+    content = read_json_input(mesh, ArmError, LARGEST_BINARY)
+    try:
+        uris = [part.get("uri", "data:") for kind in ("buffers", "images") for part in content.get(kind, [])]
+        names = [uri for uri in uris if not uri.startswith("data:")]
+    except (AttributeError, TypeError) as error:
+        raise ArmError(f"{mesh}: not a glTF file: its buffers and images must be lists of tables with a uri") from error
+    if outside := [name for name in names if Path(name).is_absolute() or ".." in Path(name).parts]:
+        raise ArmError(f"{mesh}: refers to {outside[0]}, which is not in its folder; move it there")
+    return names

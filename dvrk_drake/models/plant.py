@@ -36,7 +36,7 @@ def add_arm(
         collision_shapes: without them nothing can touch the arm, and a step of a plant with a scene graph is cheaper.
 
     Raises:
-        ArmError: no such closure.
+        ArmError: no such closure, or Drake refuses the arm's SDF.
     """
     if closure not in get_args(Closure):
         raise ArmError(f'unknown closure "{closure}"; known: {", ".join(get_args(Closure))}')
@@ -51,15 +51,32 @@ def add_arm(
         for link in model.iter("link"):
             for shape in link.findall("collision"):
                 link.remove(shape)
-    (instance,) = parser.AddModelsFromString(ElementTree.tostring(model, encoding="unicode"), "sdf")
-    if closure == "ball":
-        for loop in arm.loop_closures:
-            _pin(plant, instance, loop)
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link", instance))
-    plant.mutable_gravity_field().set_gravity_vector(arm.gravity)
-    for name, lower, upper in zip(arm.joint_names, arm.position_lower, arm.position_upper, strict=True):
-        plant.GetJointByName(name, instance).set_position_limits([lower], [upper])
+    try:
+        (instance,) = parser.AddModelsFromString(ElementTree.tostring(model, encoding="unicode"), "sdf")
+        if closure == "ball":
+            for loop in arm.loop_closures:
+                _pin(plant, instance, loop)
+        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link", instance))
+        plant.mutable_gravity_field().set_gravity_vector(arm.gravity)
+        for name, lower, upper in zip(arm.joint_names, arm.position_lower, arm.position_upper, strict=True):
+            plant.GetJointByName(name, instance).set_position_limits([lower], [upper])
+    except RuntimeError as error:
+        raise ArmError(f"{', '.join(arm.sdf)}: Drake refuses this model: {error}") from error
     return instance
+
+
+def check_plant(arm: Arm) -> None:
+    """Refuses an arm of which no plant can be made, whichever way its loops are closed.
+
+    Raises:
+        ArmError: Drake refuses its SDF, or the SDF lacks a frame of a loop.
+    """
+    for closure in get_args(Closure):
+        try:
+            plant = make_arm_plant(arm, closure=closure)
+            plant.CalcMassMatrix(plant.CreateDefaultContext())
+        except RuntimeError as error:
+            raise ArmError(f"{', '.join(arm.sdf)}: Drake refuses this model: {error}") from error
 
 
 def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic") -> MultibodyPlant:
@@ -143,6 +160,8 @@ def _loop_joints(root: ElementTree.Element, arm: Arm) -> set[str]:
     names = set()
     for loop in arm.loop_closures:
         for frame in (loop.frame_a, loop.frame_b):
+            if frame not in frame_link:
+                raise ArmError(f"{', '.join(arm.sdf)}: has no <frame> {frame}, which loop_closures names")
             link = frame_link[frame]
             while link in parent_joint:
                 names.add(parent_joint[link].get("name", ""))

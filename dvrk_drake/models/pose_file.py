@@ -3,6 +3,7 @@
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,7 +35,7 @@ def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
     Raises:
         CollectionError: no such file, not a file of poses, of another arm, or a pose that `check_poses` refuses.
     """
-    if not Path(path).is_file():
+    if not os.path.lexists(path):
         raise CollectionError(f"{path}: no such file of poses; --teach or --random makes one")
     content = load_typed_yaml(PoseFile, path, CollectionError, "a file of poses")
     if content.format != PoseFile.format:
@@ -96,4 +97,4 @@ def save_poses(poses: NDArray[np.float64], arm: Arm, path: str | Path) -> None:
 
 def load_poses_if_any(path: str | Path, arm: Arm) -> NDArray[np.float64]:
     """As `load_poses`, but no poses (0, n) where there is no file yet."""
-    return load_poses(path, arm) if Path(path).exists() else np.empty((0, arm.num_joints))
+    return load_poses(path, arm) if os.path.lexists(path) else np.empty((0, arm.num_joints))

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import csv
+import math
+from array import array
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -13,7 +17,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.atomic_file import atomic_write
-from dvrk_drake.models.csv_rows import is_number, parse_finite, parse_number, read_rows, skipped_note
+from dvrk_drake.models.csv_rows import CsvReader, is_number, parse_finite, parse_number, skipped_note
 from dvrk_drake.models.lcm_log import is_lcm_log
 from dvrk_drake.models.status_log import read_status_log
 
@@ -23,6 +27,8 @@ Coordinates = Literal["joint", "actuator"]
 LIMIT_TOLERANCE = 0.2, 0.02
 #: No position, speed or effort of these arms is larger, in whatever unit it may be by mistake.
 LARGEST = 1e6
+#: Most rows of a CSV; 15 min at 1 kHz. With these, `check` takes 1.5 GB.
+LARGEST_COUNT = 900_000
 #: RMS joint speed above which a recording counts as a motion [rad/s], [m/s].
 REST_SPEED = 0.05, 0.005
 #: Poses whose joints all agree this well are one pose [rad], [m].
@@ -174,7 +180,12 @@ class Recording:
 
 
 def read_recording(
-    path: str | Path, arm: Arm | None = None, coordinates: Coordinates = "joint", *, skip_invalid: bool = False
+    path: str | Path,
+    arm: Arm | None = None,
+    coordinates: Coordinates = "joint",
+    progress: Callable[[float], object] = lambda share: None,
+    *,
+    skip_invalid: bool = False,
 ) -> Recording:
     """Reads a CSV, or an LCM log with the DVRK_STATUS messages of an arm; the file's first bytes tell which.
 
@@ -186,6 +197,7 @@ def read_recording(
         arm: whose joints are counted and named in messages, and whose statuses are read of a log; without it a CSV has
             7 joints, as all arms have so far, and a log statuses of one arm only.
         coordinates: what q, qd and tau are of; a log's are of the joints.
+        progress: called with the share 0..1 of a CSV that was read.
         skip_invalid: leave out rows of a CSV with a NaN or an infinity, and note them, instead of refusing the file.
 
     Raises:
@@ -199,22 +211,47 @@ def read_recording(
             raise RecordingError(f"{path}: an LCM log is in joint coordinates, not {coordinates}")
         log = read_status_log(path, arm)
         return Recording(log.q, log.tau, log.qd, log.t, "joint", str(path), log.events, log.sha256, log.notes)
-    return _read_csv(path, arm, coordinates, skip_invalid)
+    return _read_csv(path, arm, coordinates, progress, skip_invalid)
 
 
-def _read_csv(path: Path, arm: Arm | None, coordinates: Coordinates, skip_invalid: bool) -> Recording:
+def _read_csv(
+    path: Path,
+    arm: Arm | None,
+    coordinates: Coordinates,
+    progress: Callable[[float], object],
+    skip_invalid: bool,
+) -> Recording:
     num_joints = arm.num_joints if arm else 7
-    numbered, sha256 = read_rows(path)
-    if not numbered:
-        raise RecordingError(f"{path}: is empty; needs a header with {_wanted(num_joints)}")
-    header_line, header = numbered[0]
+    with CsvReader(path, progress) as reader:
+        header_line, cells = next(iter(reader), (0, []))
+        if not cells:
+            raise RecordingError(f"{path}: is empty; needs a header with {_wanted(num_joints)}")
+        header = [cell.strip() for cell in cells]
+        blocks = _columns_of_blocks(f"{path}:{header_line}", header, arm, num_joints)
+        values, lines, skipped = _read_numbers(path, reader, header, blocks, skip_invalid)
+        sha256 = reader.sha256()
+    if not lines:
+        rows = "no row of finite numbers" if skipped else "a header but no rows"
+        raise RecordingError(f"{path}: has {rows}")
+    q, qd, tau, t = (
+        np.frombuffer(values[prefix]).reshape(len(lines), -1) if prefix in values else None
+        for prefix in ("q", "qd", "tau", "t")
+    )
+    assert q is not None
+    times = None if t is None else t[:, 0]
+    notes = (skipped_note(np.array(skipped), len(lines) + len(skipped)),) if skipped else ()
+    return Recording(q, tau, qd, times, coordinates, str(path), np.frombuffer(lines, np.int64), sha256, notes)
+
+
+def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joints: int) -> dict[str, list[int]]:
+    """Prefix -> the columns in which a header has q, qd, tau and t."""
     if all(is_number(cell) for cell in header):
         raise RecordingError(
-            f"{path}:{header_line}: has no header; the first line must name the columns, "
+            f"{where}: has no header; the first line must name the columns, "
             f"{_wanted(num_joints)} (dvrk-drake convert reads headerless public formats)"
         )
-    if twice := next((name for name in header if name and header.count(name) > 1), ""):
-        raise RecordingError(f"{path}:{header_line}: column {twice} is named twice")
+    if twice := next((name for name, count in Counter(header).items() if name and count > 1), ""):
+        raise RecordingError(f"{where}: column {twice[:30]} is named twice")
     blocks = {}
     for prefix, needed in (("q", True), ("qd", False), ("tau", False)):
         names = column_names(prefix, num_joints)
@@ -223,45 +260,52 @@ def _read_csv(path: Path, arm: Arm | None, coordinates: Coordinates, skip_invali
             continue
         if missing:
             raise RecordingError(
-                f"{path}:{header_line}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
+                f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
                 f"needs {_wanted(num_joints)}{_joint_list(arm)}"
             )
         if f"{prefix}{num_joints + 1}" in header:
             raise RecordingError(
-                f"{path}:{header_line}: has {prefix}{num_joints + 1}, but the arm has {num_joints} joints"
-                f"{_joint_list(arm)}"
+                f"{where}: has {prefix}{num_joints + 1}, but the arm has {num_joints} joints{_joint_list(arm)}"
             )
         blocks[prefix] = [header.index(name) for name in names]
-    if len(numbered) == 1:
-        raise RecordingError(f"{path}: has a header but no rows")
-    wanted = [column for block in blocks.values() for column in block]
     if "t" in header:
-        wanted.append(header.index("t"))
-    parse = parse_number if skip_invalid else parse_finite
-    values = np.zeros((len(numbered) - 1, len(header)))
-    for row, (line, cells) in enumerate(numbered[1:]):
-        if len(cells) != len(header):
-            raise RecordingError(f"{path}:{line}: has {len(cells)} cells, the header names {len(header)} columns")
-        for column in wanted:
-            values[row, column] = parse(cells[column], f"{path}:{line}: {header[column]}")
-    lines, valid = np.array([line for line, _ in numbered[1:]]), np.all(np.isfinite(values), axis=1)
-    notes: tuple[str, ...] = ()
-    if not np.all(valid):
-        notes = (skipped_note(lines[~valid], len(lines)),)
-        values, lines = values[valid], lines[valid]
-    if not len(values):
-        raise RecordingError(f"{path}: has no row of finite numbers")
-    return Recording(
-        q=values[:, blocks["q"]],
-        tau=values[:, blocks["tau"]] if "tau" in blocks else None,
-        qd=values[:, blocks["qd"]] if "qd" in blocks else None,
-        t=values[:, header.index("t")] if "t" in header else None,
-        coordinates=coordinates,
-        source=str(path),
-        lines=lines,
-        sha256=sha256,
-        notes=notes,
-    )
+        blocks["t"] = [header.index("t")]
+    return blocks
+
+
+def _read_numbers(
+    path: Path, reader: CsvReader, header: list[str], blocks: dict[str, list[int]], skip_invalid: bool
+) -> tuple[dict[str, array], array, list[int]]:
+    """Prefix -> the numbers in its columns, row by row; the line of each row; the lines that are skipped."""
+    skipped: list[int] = []
+    values, lines = {prefix: array("d") for prefix in blocks}, array("q")
+    parts = [(values[prefix], columns) for prefix, columns in blocks.items()]
+    width = len(header)
+    for line, cells in reader:
+        if len(cells) != width:
+            raise RecordingError(f"{path}:{line}: has {len(cells)} cells, the header names {width} columns")
+        if len(lines) == LARGEST_COUNT:
+            raise RecordingError(f"{path}:{line}: has more than {LARGEST_COUNT} rows; cut the recording into parts")
+        if skip_invalid and not all(
+            math.isfinite(parse_number(cells[column].strip(), f"{path}:{line}: {header[column]}"))
+            for _, columns in parts
+            for column in columns
+        ):
+            skipped.append(line)
+            continue
+        lines.append(line)
+        for part, columns in parts:
+            try:
+                numbers = [float(cells[column]) for column in columns]
+                is_good = math.isfinite(sum(numbers)) and not reader.has_underscore
+            except ValueError:
+                is_good = False
+            if not is_good:
+                numbers = [
+                    parse_finite(cells[column].strip(), f"{path}:{line}: {header[column]}") for column in columns
+                ]
+            part.extend(numbers)
+    return values, lines, skipped
 
 
 def column_names(prefix: str, num_joints: int) -> list[str]:

@@ -5,6 +5,7 @@ What was written survives a killed process; the last moments before a power fail
 
 from __future__ import annotations
 
+import os
 import tempfile
 from pathlib import Path
 from typing import Protocol
@@ -50,7 +51,7 @@ def check_stream_output(path: str | Path) -> None:
     path = Path(path)
     if path.suffix not in (".csv", ".log"):
         raise RecordingError(f"{path}: must end in .csv or .log (LCM log)")
-    if path.exists():
+    if os.path.lexists(path):
         raise RecordingError(f"{path}: exists already, and a recording is not overwritten; name another file")
     if not path.parent.is_dir():
         raise RecordingError(f"{path}: cannot be written: its folder does not exist")

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import types
 from collections.abc import Iterator
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 _ONE = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 _MANY = {bool: "true or false", int: "whole numbers", float: "numbers", str: "texts"}
+#: Key in the metadata of a field: a number that may be infinite.
+INFINITE = "may be infinite"
+#: Whole numbers are below this in size.
+_LARGEST_INT = 2**63
 #: A value is quoted up to so many letters.
 _LONGEST = 60
 
@@ -19,6 +24,7 @@ def schema_fault(schema: type, content: Any, what: str) -> str:
 
     Args:
         schema: a dataclass of dataclasses, lists, tables with texts as keys, bool, int, float, str, and None with them.
+            Numbers must be finite, except in a field with `INFINITE` in its metadata.
         content: as yaml_load gives it.
         what: it should be, e.g. "a file of gains".
     """
@@ -40,7 +46,10 @@ def _faults(schema: Any, value: Any, key: str, what: str) -> Iterator[str]:
             yield _wrong(schema, value, key)
             return
         hints = get_type_hints(schema)
+        infinite = {field.name for field in dataclasses.fields(schema) if field.metadata.get(INFINITE)}
         for name, entry in value.items():
+            if name in infinite and _is_infinite(entry):
+                continue
             if name not in hints:
                 yield f"{f'{key}: ' if key else ''}key {_quoted(name)} is unknown; {_meant(name, hints)}" + (
                     f"allowed in {what}: {_keys(schema)}"
@@ -65,20 +74,24 @@ def _faults(schema: Any, value: Any, key: str, what: str) -> Iterator[str]:
 
 
 def _fits(schema: type, value: Any) -> bool:
-    """As yaml_load_typed converts."""
-    if isinstance(value, schema) and not (schema is int and isinstance(value, bool)):
-        return True
+    """As yaml_load_typed converts, but numbers must be finite."""
     if schema is bool:
-        return value in ("true", "false")
-    if schema not in (int, float) or isinstance(value, bool) or not isinstance(value, int | float | str):
+        return isinstance(value, bool) or value in ("true", "false")
+    if schema is str:
+        return isinstance(value, str)
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
         return False
-    if schema is int and isinstance(value, float):
-        return value.is_integer()
     try:
-        schema(value)
-    except ValueError:
+        number = schema(value)
+    except (ValueError, OverflowError):
         return False
-    return True
+    if schema is int:
+        return abs(number) < _LARGEST_INT and (not isinstance(value, float) or value.is_integer())
+    return math.isfinite(number)
+
+
+def _is_infinite(value: Any) -> bool:
+    return isinstance(value, float) and math.isinf(value)
 
 
 def _wrong(schema: Any, value: Any, key: str) -> str:
@@ -87,6 +100,8 @@ def _wrong(schema: Any, value: Any, key: str) -> str:
         (inner,) = get_args(schema)
         if inner in _ONE and _fits(inner, value):
             allowed += f", e.g. [{value}]"
+    elif schema is float and isinstance(value, float):
+        allowed = "a finite number"
     return f"{key} is {_quoted(value)}; allowed: {allowed}"
 
 
@@ -110,7 +125,7 @@ def _keys(schema: Any) -> str:
 
 def _meant(name: Any, known: dict[str, Any]) -> str:
     of_lower_case = {key.lower(): key for key in known}
-    near = difflib.get_close_matches(str(name).lower(), of_lower_case, 1)
+    near = difflib.get_close_matches(str(name)[:_LONGEST].lower(), of_lower_case, 1)
     return f'did you mean "{of_lower_case[near[0]]}"? ' if near else ""
 
 

@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from dvrk_drake.errors import ArmError
+from dvrk_drake.models.input_file import LARGEST_TEXT, read_input
 from dvrk_drake.models.mirrored_links import mirror_links
 
 MODELS_FOLDER = Path(__file__).parent
 PACKAGE_URL = "package://dvrk_drake/"
 DRAKE = "{http://drake.mit.edu}"
+#: Deepest nesting of elements; an arm's SDF has 7 levels.
+_DEEPEST = 50
+#: Limits of a joint, which may be infinite.
+_LIMITS = {"lower", "upper", "velocity"}
+#: Elements that hold numbers.
+_NUMBERS = _LIMITS | {
+    *("mass", "ixx", "ixy", "ixz", "iyy", "iyz", "izz", "pose", "xyz", "effort", "damping"),
+    *("scale", "radius", "length", "size", f"{DRAKE}rotor_inertia", f"{DRAKE}gear_ratio"),
+}
 ElementTree.register_namespace("drake", DRAKE.strip("{}"))
+#: How many numbers an element holds that holds several; a pose has 7 with a quaternion.
+_COUNTS = {"pose": (6, 7), "xyz": (3,), "scale": (3,), "size": (3,)}
 
 
 @dataclass(frozen=True)
@@ -76,7 +90,7 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
     """Reads them from a composed model.
 
     Raises:
-        ArmError: a joint has `<friction>`, which Drake drops silently.
+        ArmError: a joint has `<friction>`, which Drake drops silently, or two joints have one name.
     """
     names, mimics, efforts, prismatic = [], {}, {}, set()
     for joint in root.findall("model/joint"):
@@ -85,6 +99,8 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
             continue
         if joint.find(".//friction") is not None:
             raise ArmError(f"joint {name} of the SDF has <friction>, which Drake drops silently; model it elsewhere")
+        if name in names:
+            raise ArmError(f"the SDF has two joints called {name}")
         names.append(name)
         if joint.get("type") == "prismatic":
             prismatic.add(name)
@@ -103,16 +119,58 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
 
 def _read(path: Path) -> ElementTree.Element:
     try:
-        root = ElementTree.parse(path).getroot()
-    except (OSError, ElementTree.ParseError) as error:
+        root = _parse(read_input(path, ArmError, LARGEST_TEXT))
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise ArmError(f"{path}: not a readable SDF: {error}") from error
     if len(root.findall("model")) != 1:
         raise ArmError(f"{path}: must hold one <model>")
+    _check_numbers(path, root)
     for uri in root.iter("uri"):
         # Composed, a model has no folder of its own that Drake could look in.
         if uri.text and "://" not in uri.text:
             uri.text = str(path.resolve().parent / uri.text)
     return root
+
+
+def _parse(content: bytes) -> ElementTree.Element:
+    parser: Any = ElementTree.XMLPullParser(("start", "end"))
+    parser.feed(content)
+    depth = 0
+    root: ElementTree.Element | None = None
+    for event, element in parser.read_events():
+        root = element if root is None else root
+        depth += 1 if event == "start" else -1
+        if depth > _DEEPEST:
+            raise ValueError(f"elements are nested deeper than {_DEEPEST} levels")
+    parser.close()
+    if root is None:
+        raise ValueError("it has no element")
+    return root
+
+
+def _check_numbers(path: Path, root: ElementTree.Element) -> None:
+    """Raises ArmError for a number that is none or is not finite, where Drake takes it or names no link or joint."""
+    for part in root.iterfind("model/*"):
+        for element in part.iter():
+            texts = [(f"<{element.tag}>", element.text)] if element.tag in _NUMBERS else []
+            if element.tag == f"{DRAKE}mimic":
+                texts = [(name, element.get(name, "0")) for name in ("multiplier", "offset")]
+            for what, text in texts:
+                words, counts = (text or "").split(), _COUNTS.get(element.tag, (1,))
+                if len(words) not in counts or not all(_is_number(word, element.tag in _LIMITS) for word in words):
+                    number = "a finite number" if counts == (1,) else f"{counts[0]} finite numbers"
+                    raise ArmError(
+                        f"{path}: {part.tag} {part.get('name')}: {what.replace(DRAKE, 'drake:')} is "
+                        f"{(text or '')[:60]!r}; allowed: {number}"
+                    )
+
+
+def _is_number(word: str, may_be_infinite: bool) -> bool:
+    try:
+        value = float(word)
+    except ValueError:
+        return False
+    return math.isfinite(value) or (may_be_infinite and not math.isnan(value))
 
 
 def _add_shapes(link: ElementTree.Element, again: ElementTree.Element) -> None:

@@ -243,6 +243,38 @@ def test_interrupt_while_importing_is_one_line_and_130():
     assert process.stderr == "dvrk-drake: interrupted\n"
 
 
+INTERRUPTED_IMPORT = """
+import os, signal, sys
+
+class Interruption:
+    def find_spec(self, name, path=None, target=None):
+        if name == sys.argv[0]:
+            os.kill(os.getpid(), signal.SIGINT)
+
+from dvrk_drake.cli import main
+sys.argv = {words!r}
+sys.meta_path.insert(0, Interruption())
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("module", ["dvrk_drake.cli.program", "rich.progress", "pydrake", "matplotlib"])
+def test_interrupt_at_any_import_is_one_line(module):
+    code = INTERRUPTED_IMPORT.format(words=[module, "model", "mtml"])
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert process.stderr == "dvrk-drake: interrupted\n"
+    assert process.returncode == 130
+
+
+def test_an_interrupt_of_the_restart_is_not_lost():
+    block = "import signal; signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})\n"
+    kill = "import os; os.kill(os.getpid(), signal.SIGINT)\n"
+    code = f"{block}{kill}from dvrk_drake.cli import main\nmain()\n"
+    process = subprocess.run([sys.executable, "-c", code, "model", "mtml"], capture_output=True, text=True, check=False)
+    assert process.stderr == "dvrk-drake: interrupted\n"
+    assert process.returncode == 130
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

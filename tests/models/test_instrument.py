@@ -69,11 +69,15 @@ def test_it_is_simulated_and_touches_its_arm_as_little_as_the_arm_does(folder, n
 
 @pytest.mark.parametrize(
     ("limits", "message"),
-    [("[0.0, .nan]", "finite, with lower < upper"), ("[0.0, 240]", "must be in m, at most 2 m"), ("[0.2]", "finite")],
+    [
+        ("[0.0, .nan]", r"is nan; allowed: a finite number"),
+        ("[0.0, 240]", "must be in m, at most 2 m"),
+        ("[0.2]", "finite"),
+    ],
 )
 def test_limits_that_are_none_or_in_millimetres_are_refused(folder, limits, message):
     (folder / "bad.yaml").write_text((folder / "arm.yaml").read_text().replace("[0.0, 0.24]", limits))
-    with pytest.raises(ArmError, match=f"position_limits.insertion .*{message}"):
+    with pytest.raises(ArmError, match=f"position_limits.insertion.*{message}"):
         load_arm(str(folder / "bad.yaml"))
 
 

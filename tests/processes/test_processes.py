@@ -131,7 +131,7 @@ def test_driver_file(tmp_path):
         path.write_text(text)
         with pytest.raises(StationError, match=rf"driver\.yaml: .*{message}"):
             load_driver(path)
-    with pytest.raises(StationError, match=r"nowhere\.yaml: cannot be read: No such file"):
+    with pytest.raises(StationError, match=r"nowhere\.yaml: no such file"):
         load_driver(tmp_path / "nowhere.yaml")
 
 

@@ -25,8 +25,6 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
     """
     path = Path(arm_or_file)
     if path.suffix in (".yaml", ".yml"):
-        if not path.is_file():
-            raise ScenarioError(f"{path}: no such scenario file")
         content = load_yaml(path, ScenarioError)
         if isinstance(content, dict) and "mechanism" in content:
             raise ScenarioError(f"{path}: is an arm's file, not a scenario; give an arm's name and --set arm={path}")

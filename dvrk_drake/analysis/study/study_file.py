@@ -6,6 +6,7 @@ No postponed annotations here: yaml_load_typed reads the types at run time.
 import dataclasses
 import hashlib
 import json
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -127,7 +128,7 @@ class Study:
         scenario = self.scenarios[case.variation]
         controller = scenario.controller
         if controller.model:  # workers may have another working folder
-            controller = dataclasses.replace(controller, model=str(Path(controller.model).resolve()))
+            controller = dataclasses.replace(controller, model=os.path.realpath(controller.model))
         arm = scenario.mounted_arm.source
         return dataclasses.replace(scenario, arm=arm, controller=controller, start=list(case.start), seed=case.seed)
 
@@ -188,8 +189,6 @@ def load_study(path: str | Path, settings: Sequence[str] = ()) -> Study:
     Raises:
         StudyError: the file cannot be read, has an unknown key, or asks for what makes no sense.
     """
-    if not Path(path).is_file():
-        raise StudyError(f"{path}: no such study file")
     study = load_typed_yaml(Study, path, StudyError, "a study")
     study.set = [*study.set, *settings]
     try:

@@ -37,7 +37,7 @@ def refusal(capsys, path, *options):
     ("change", "message"),
     [
         (("scenario: psm", "scenario: psm9"), 'unknown arm "psm9"; known arms: mtml, mtmr, psm'),
-        (("scenario: psm", "scenario: nothing.yaml"), "nothing.yaml: no such scenario file"),
+        (("scenario: psm", "scenario: nothing.yaml"), "nothing.yaml: no such file"),
         (("scenario: psm", "seeds: [1]"), "scenario is missing"),
         (("scenario: psm", "scenario: psm\nposes: [[0, 0, 0.1, 0, 0, 0]]"), "poses[0] has 6 numbers; PSM has 7 joints"),
         (("scenario: psm", "scenario: psm\nposes: [[9, 0, 0.1, 0, 0, 0, 0]]"), "poses[0]: yaw = 9 is outside"),
@@ -81,7 +81,7 @@ def test_nonsense_is_refused_in_one_line(change, message, study, capsys):
 
 
 def test_files_and_places_that_do_not_work_are_refused(study, tmp_path, capsys):
-    assert "no such study file" in refusal(capsys, tmp_path / "other.yaml")
+    assert "no such file" in refusal(capsys, tmp_path / "other.yaml")
     assert "--set duration: must be key=value" in refusal(capsys, study, "--set", "duration")
     assert "cannot be made a folder" in refusal(capsys, study, "--plots", str(study))
     (tmp_path / "folder.csv").mkdir()

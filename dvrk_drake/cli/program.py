@@ -1,0 +1,84 @@
+"""The program behind the command line: parses the arguments and runs a verb.
+
+Verbs import what they need when they run: drake and numba take seconds, `--help` should not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import NoReturn
+
+from dvrk_drake.allocation import restart_with_faster_allocator
+from dvrk_drake.cli import (
+    check,
+    collect,
+    demo,
+    export,
+    identify,
+    lcm,
+    model,
+    payload,
+    recalibrate,
+    record,
+    reproduce,
+    simulate,
+    study,
+    transparency,
+    tune,
+)
+from dvrk_drake.cli.support import folders_only_for_results, import_interruptibly
+from dvrk_drake.errors import DvrkDrakeError
+
+# Matrices are small here: more threads of BLAS only wait for each other, for minutes where the cores are busy. Said
+# before numpy is imported, which the verbs do.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+_OF_RECORDINGS = (check, identify, recalibrate, payload, export)
+_SIMULATED = (simulate, study, tune, transparency, reproduce, demo)
+
+
+def run(arguments: Sequence[str] | None) -> int:
+    """Runs one verb; returns the exit code. Without `arguments` those of the process, which is then the verb's own."""
+    options = _parser().parse_args(arguments)
+    if arguments is None and options.run.__module__ in [module.__name__ for module in _SIMULATED]:
+        restart_with_faster_allocator()
+    try:
+        import_interruptibly()
+        if arguments is None:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        with folders_only_for_results():
+            options.run(options)
+    except DvrkDrakeError as error:
+        print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:
+        # The reader (head, less) has seen enough.
+        sys.stderr.close()
+        return 0
+    except KeyboardInterrupt:
+        print("dvrk-drake: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, as everything else here does; usage is what --help is for."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message}; see {self.prog} --help\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="dvrk-drake", description="Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."
+    )
+    parser.add_argument("--version", action="version", version=version("dvrk-drake"))
+    verbs = parser.add_subparsers(required=True, metavar="VERB")
+    for module in (model, *_OF_RECORDINGS, *_SIMULATED, lcm, record, collect):
+        module.add_verbs(verbs)
+    return parser

@@ -1,0 +1,103 @@
+"""Opens files for reading: regular files of a bounded size. Everything else is an error of one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from io import FileIO
+from pathlib import Path
+from typing import Any
+
+from dvrk_drake.errors import DvrkDrakeError
+
+#: Largest settings or model file [bytes]; a model of a PSM with dynamics has 60 kB.
+LARGEST_TEXT = 4_000_000
+#: Largest file that is read as a whole in any other format [bytes].
+LARGEST_BINARY = 256_000_000
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | None = None) -> FileIO:
+    """Opens a regular file for reading, unbuffered.
+
+    A FIFO or a device is refused without waiting for it.
+
+    Args:
+        path: the file, or a link to it.
+        error: the type of error to raise.
+        largest: largest size that is accepted [bytes]; None for any size.
+
+    Raises:
+        DvrkDrakeError: of the type `error`; no such file, no regular file, too large, or it cannot be read.
+    """
+    try:
+        # Without O_NONBLOCK, opening a FIFO would wait for its writer.
+        file = open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb", buffering=0)  # noqa: SIM115
+    except FileNotFoundError as cause:
+        raise error(f"{path}: no such file") from cause
+    except IsADirectoryError as cause:
+        raise error(f"{path}: is not a file but a folder") from cause
+    except OSError as cause:
+        raise error(f"{path}: cannot be read: {cause.strerror}") from cause
+    except ValueError as cause:  # a null character
+        raise error(f"{str(path)!r}: is not the name of a file: {cause}") from cause
+    status = os.fstat(file.fileno())
+    if not stat.S_ISREG(status.st_mode):
+        file.close()
+        kind = _KINDS.get(stat.S_IFMT(status.st_mode), "something else")
+        raise error(f"{path}: is not a file but {kind}; write its content into a file first")
+    if largest is not None and status.st_size > largest:
+        file.close()
+        raise error(f"{path}: has {status.st_size / 1e6:.1f} MB; allowed: at most {largest / 1e6:g} MB")
+    return file
+
+
+def read_input(path: str | Path, error: type[DvrkDrakeError], largest: int = LARGEST_BINARY) -> bytes:
+    """Returns the content of a file.
+
+    Raises:
+        DvrkDrakeError: as `open_input`.
+    """
+    with open_input(path, error, largest) as file:
+        try:
+            content = file.read(largest + 1)
+        except OSError as cause:
+            raise error(f"{path}: cannot be read: {cause.strerror}") from cause
+    if len(content) > largest:  # it grew, or its size is not known before
+        raise error(f"{path}: is larger than {largest / 1e6:g} MB, which is the most that is allowed")
+    return content
+
+
+def read_text_input(path: str | Path, error: type[DvrkDrakeError], largest: int = LARGEST_TEXT) -> str:
+    """Returns the text of a file in UTF-8, with or without a byte-order mark.
+
+    Raises:
+        DvrkDrakeError: as `open_input`, or it is no such text.
+    """
+    content = read_input(path, error, largest)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as cause:
+        raise error(f"{path}: not a text file in UTF-8: {cause.reason} at byte {cause.start}") from cause
+
+
+def read_json_input(path: str | Path, error: type[DvrkDrakeError], largest: int = LARGEST_TEXT) -> Any:
+    """Returns the content of a JSON file.
+
+    Raises:
+        DvrkDrakeError: as `read_text_input`, or it is not JSON.
+    """
+    try:
+        return json.loads(read_text_input(path, error, largest))
+    except RecursionError as cause:
+        raise error(f"{path}: not JSON that can be read: its lists and tables are nested too deeply") from cause
+    except ValueError as cause:
+        raise error(f"{path}: not JSON: {cause}") from cause

@@ -1,0 +1,214 @@
+"""Files that are none, too large, too deep, or not readable: every reader gives one line and does not wait."""
+
+import math
+import os
+import tracemalloc
+
+import numpy as np
+import pytest
+from recordings import HEADER, ROW, random_recording
+
+from dvrk_drake.analysis.convert.convert import convert
+from dvrk_drake.analysis.simulation.scenario_file import load_scenario
+from dvrk_drake.analysis.study.study_file import load_study
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError, RecordingError
+from dvrk_drake.models import csv_rows, recording
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.collection_file import CollectionFile
+from dvrk_drake.models.gains_file import load_gains
+from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.models.input_file import LARGEST_TEXT
+from dvrk_drake.models.pose_file import load_poses
+from dvrk_drake.models.recording import read_recording, write_recording
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
+from dvrk_drake.models.typed_yaml import parse_yaml
+from dvrk_drake.processes.simulated_arm import load_driver
+
+ARM = load_arm("mtml")
+#: What each reader's file is called -> the reader.
+READERS = {
+    "a.yaml": load_arm,
+    "model.yaml": IdentifiedModel.load,
+    "gains.yaml": load_gains,
+    "driver.yaml": load_driver,
+    "poses.yaml": lambda path: load_poses(path, ARM),
+    "scenario.yaml": load_scenario,
+    "study.yaml": load_study,
+    "gc.json": GravityCompensationFile.load,
+    "recording.csv": lambda path: read_recording(path, ARM),
+    "collection.csv": lambda path: CollectionFile(path, ARM, both_sides=True),
+    "team.mat": lambda path: convert(path, f"{path}.out"),
+    "wpi.csv": lambda path: convert(path, f"{path}.out", format="wpi-csv"),
+    "status.log": lambda path: convert(path, f"{path}.out", format="lcm-log"),
+    "arm.sdf": lambda path: compose_sdf([path]),
+}
+#: Makes what is not a file at a path.
+NO_FILES = {
+    "FIFO": os.mkfifo,
+    "folder": os.mkdir,
+    "device": lambda path: os.symlink("/dev/zero", path),
+    "link to itself": lambda path: os.symlink(path, path),
+    "link to nothing": lambda path: os.symlink(f"{path}.gone", path),
+}
+
+
+@pytest.mark.parametrize("kind", NO_FILES)
+@pytest.mark.parametrize("name", READERS)
+def test_what_is_no_file_is_refused_in_one_line(name, kind, tmp_path):
+    path = f"{tmp_path}/{name}"
+    NO_FILES[kind](path)
+    with pytest.raises(DvrkDrakeError) as refusal:
+        READERS[name](path)
+    assert name in str(refusal.value) or kind == "device"  # which an arm's file is named by
+    assert "\n" not in str(refusal.value)
+    assert not os.path.exists(f"{path}.out")
+
+
+@pytest.mark.parametrize("name", sorted(READERS.keys() - {"collection.csv"}))
+def test_names_that_no_file_has_are_refused(name, tmp_path):
+    for stem in ("x" * 300, "a\0b"):
+        with pytest.raises(DvrkDrakeError):
+            READERS[name](f"{tmp_path}/{stem}{name}")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+@pytest.mark.parametrize("name", READERS)
+def test_a_file_that_may_not_be_read_is_refused(name, tmp_path):
+    path = tmp_path / name
+    path.write_text("")
+    path.chmod(0)
+    with pytest.raises(DvrkDrakeError):
+        READERS[name](str(path))
+
+
+@pytest.mark.parametrize("name", ["model.yaml", "gc.json", "arm.sdf"])
+def test_a_file_larger_than_any_in_use_is_refused(name, tmp_path):
+    path = tmp_path / name
+    with path.open("wb") as stream:
+        stream.truncate(LARGEST_TEXT + 1)
+    with pytest.raises(DvrkDrakeError, match=r"4\.0 MB; allowed: at most 4 MB"):
+        READERS[name](str(path))
+
+
+def test_deep_files_are_refused_where_they_get_deep(tmp_path):
+    for text in ("[" * 100_000, "{a: " * 100_000, "- " * 100):
+        with pytest.raises(ArmError, match="line 2: nested deeper than 50 levels"):
+            parse_yaml(f"# deep\n{text}", "here", ArmError)
+    path = tmp_path / "gc.json"
+    path.write_text("[" * 100_000)
+    with pytest.raises(ModelError, match="nested too deeply"):
+        GravityCompensationFile.load(path)
+    path.write_text('<sdf><model name="a">' + "<link>" * 100_000)
+    with pytest.raises(ArmError, match="nested deeper than 50 levels"):
+        compose_sdf([str(path)])
+
+
+def test_aliases_of_aliases_are_refused():
+    lines = ["a0: &a0 [1, 1]", *(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 9))]
+    with pytest.raises(ArmError, match="more than 1000000 values"):
+        parse_yaml("\n".join(lines), "here", ArmError)
+    with pytest.raises(ArmError, match="a contains itself"):
+        parse_yaml("a: &a [*a]", "here", ArmError)
+    assert parse_yaml("_t: &t [1, 2]\na: *t\nb: *t", "here", ArmError) == {"a": [1, 2], "b": [1, 2]}
+
+
+def own_arm(folder, change):
+    """An MTM as files of one's own, whose SDF has `change` (old, new) made everywhere."""
+    mechanism = (MODELS_FOLDER / "mechanisms/mtm.yaml").read_text()
+    url = next(line.split()[1] for line in mechanism.splitlines() if line.startswith("sdf:"))
+    (folder / "mechanism.yaml").write_text(mechanism.replace(url, "own.sdf"))
+    arm = (MODELS_FOLDER / "arms/mtmr.yaml").read_text().replace("mechanism: mtm", "mechanism: mechanism.yaml")
+    (folder / "own.yaml").write_text(arm)
+    sdf = (MODELS_FOLDER / "sdf/mtm.sdf").read_text()
+    assert change[0] in sdf
+    (folder / "own.sdf").write_text(sdf.replace(*change))
+    return str(folder / "own.yaml")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("effort>", "ef>"), r"joint \S+ of its SDF needs a positive <axis><limit><effort>"),
+        (("<mass>", "<mass>nan "), r"link \S+: <mass> is 'nan .*'; allowed: a finite number"),
+        (("<ixx>", "<ixx>inf"), r"link \S+: <ixx> is 'inf.*'; allowed: a finite number"),
+        (('multiplier="', 'multiplier="x'), r"joint \S+: multiplier is 'x.*'; allowed: a finite number"),
+        (("base_link", "bottom_link"), r"own\.yaml: .*own\.sdf: Drake refuses this model: .*base_link"),
+    ],
+)
+def test_an_sdf_that_makes_no_arm_is_refused(change, message, tmp_path):
+    with pytest.raises(ArmError, match=message):
+        load_arm(own_arm(tmp_path, change))
+
+
+@pytest.mark.parametrize("key", ["base_parameters[3].value", "joints[2].trust", "gravity[0]", "joints[0].rms_fit"])
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+def test_a_model_with_a_number_that_is_none_is_refused(key, number, tmp_path, capsys):
+    model = IdentifiedModel.from_arm(ARM)
+    name, _, rest = key.partition("[")
+    index, _, attribute = rest.partition("].")
+    path = tmp_path / "model.yaml"
+    model.save(path)
+    if attribute:
+        setattr(getattr(model, name)[int(index)], attribute, number)
+    else:
+        getattr(model, name)[int(index.strip("]"))] = number
+    with pytest.raises(ModelError) as refusal:
+        model.save(tmp_path / "other.yaml")
+    assert f"{key} is {number}; allowed: a finite number" in str(refusal.value)
+    from pydrake.common.yaml import yaml_dump_typed
+
+    path.write_text(yaml_dump_typed(model))
+    write_recording(random_recording(), tmp_path / "r.csv")
+    assert main(["validate", str(path), str(tmp_path / "r.csv")]) == 2
+    assert f"{path}: {key} is {number}; allowed: a finite number" in capsys.readouterr().err
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["model.yaml", "r.csv"]
+
+
+# A large CSV.
+
+
+def test_a_large_csv_needs_little_more_than_its_numbers(tmp_path, monkeypatch):
+    monkeypatch.setattr(csv_rows, "_BLOCK", 1 << 16)
+    path = tmp_path / "recording.csv"
+    path.write_text(f"{HEADER}\n" + f"{ROW}\n" * 20_000)
+    shares = []
+    read_recording(path)
+    tracemalloc.start()
+    try:
+        read = read_recording(path, progress=shares.append)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    numbers = read.q.nbytes + read.tau.nbytes + read.lines.nbytes
+    assert peak < 2 * numbers + 2_000_000
+    assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 10
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("block", [1, 7, 64])
+def test_blocks_do_not_change_what_is_read(block, end, tmp_path, monkeypatch):
+    original = random_recording(9)
+    path = tmp_path / "recording.csv"
+    write_recording(original, path)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", end.encode()))
+    monkeypatch.setattr(csv_rows, "_BLOCK", block)
+    read = read_recording(path)
+    for name in ("t", "q", "qd", "tau"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(original, name))
+    np.testing.assert_array_equal(read.lines, np.arange(2, 11))
+    path.write_bytes(path.read_bytes() + "0,\u00e4".encode()[:-1])
+    with pytest.raises(RecordingError, match=f"not a CSV text file in UTF-8: .* at byte {path.stat().st_size - 1}"):
+        read_recording(path)
+
+
+def test_a_csv_with_too_many_rows_or_too_long_lines_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "recording.csv"
+    path.write_text(f"{HEADER}\n" + f"{ROW}\n" * 4)
+    monkeypatch.setattr(recording, "LARGEST_COUNT", 3)
+    with pytest.raises(RecordingError, match=r":5: has more than 3 rows; cut the recording into parts"):
+        read_recording(path)
+    path.write_text(f"{HEADER}\n" + "1" * 3_000_000)
+    with pytest.raises(RecordingError, match="has a line of more than 1048576 characters"):
+        read_recording(path)
