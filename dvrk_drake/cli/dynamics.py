@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from dvrk_drake.errors import RecordingError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from dvrk_drake.analysis.check.report import RecordingReport
     from dvrk_drake.analysis.dynamic.validation import DynamicValidation
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm import Arm
@@ -20,9 +22,16 @@ if TYPE_CHECKING:
 
 
 def refuse_unusable(
-    console: Console, recording: Recording, arm: Arm, warn: bool = False, apart_from: tuple[str, ...] = ()
+    console: Console,
+    recording: Recording,
+    arm: Arm,
+    warn: bool = False,
+    apart_from: tuple[str, ...] = (),
+    check: Callable[[Recording, Arm], RecordingReport] | None = None,
 ) -> list[str]:
     """Prints what `check` refuses in a recording, and its warnings if wanted, `apart_from` kinds of findings.
+
+    `check` is `check_recording` by default.
 
     Returns:
         The warnings.
@@ -32,7 +41,9 @@ def refuse_unusable(
     """
     from dvrk_drake.analysis.check.recording_check import check_recording
 
-    findings = [f for f in check_recording(recording, arm).findings if f.kind not in apart_from]
+    with ProgressBar("checking the recording"):
+        report = (check or check_recording)(recording, arm)
+    findings = [f for f in report.findings if f.kind not in apart_from]
     for finding in findings:
         if finding.severity == "refusal" or (warn and finding.severity == "warning"):
             console.print(str(finding), style="yellow", markup=False, soft_wrap=True)

@@ -95,6 +95,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _identify(options: argparse.Namespace) -> None:
+    from dvrk_drake.analysis.check.identifiable import check_with_channels
     from dvrk_drake.analysis.plots import plot_identification
     from dvrk_drake.analysis.signals.poses import find_poses
     from dvrk_drake.analysis.static.static_identification import identify_static
@@ -111,7 +112,7 @@ def _identify(options: argparse.Namespace) -> None:
     plots = None if options.plots is None else made_folder(options.plots)
     console = make_console()
     recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
-    refuse_unusable(console, recording, arm, warn=True)
+    refuse_unusable(console, recording, arm, warn=True, check=check_with_channels)
     if moves:
         identify_motion(options, recording, arm, plots)
         return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from dvrk_drake.analysis.check.channel_check import check_channels
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.check.report import Finding, RecordingReport
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
@@ -21,13 +22,35 @@ def check_for_identification(recording: Recording, arm: Arm) -> RecordingReport:
         recording: as read.
         arm: which was recorded.
     """
-    report = check_recording(recording, arm)
+    report = check_with_channels(recording, arm)
     if report.refusals:
         return report
     refusals = _refusals_of_identify(recording, arm)
     # What a refusal says again, and with what is needed.
     others = [finding for finding in report.findings if not (refusals and finding.kind == "few poses")]
     return replace(report, findings=(*refusals, *others))
+
+
+def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
+    """As `check_recording`, with the findings of `check_channels` for a motion that has no other refusals.
+
+    Exchanged channels look like efforts of a wrong sign: that refusal is replaced by the one that names the cause.
+    """
+    report = check_recording(recording, arm)
+    others = [finding for finding in report.refusals if finding.kind != "effort sign"]
+    if report.kind != "motion" or others or not recording.motion(arm):
+        return report
+    try:
+        found = check_channels(recording, arm)
+    except RecordingError:
+        return report  # too short or too coarse to be fitted: identify refuses it with that reason
+    if any(finding.severity == "refusal" for finding in found):
+        kept = [finding for finding in report.findings if finding.severity != "refusal"]
+        return replace(report, findings=(*found, *kept))
+    if report.refusals:
+        return report
+    order = {"warning": 0, "note": 1}
+    return replace(report, findings=tuple(sorted((*report.findings, *found), key=lambda f: order[f.severity])))
 
 
 def _refusals_of_identify(recording: Recording, arm: Arm) -> tuple[Finding, ...]:

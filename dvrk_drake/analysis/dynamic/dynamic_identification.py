@@ -27,8 +27,9 @@ from dvrk_drake.dynamics.dynamic_section import (
     RotorEstimate,
 )
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics, Provenance
+from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.models.recording import REST_SPEED, Recording
 
 #: An effect whose effort is below this share of the actuators' is left out of the model.
 LEAST_EFFECT = 1e-4
@@ -76,7 +77,8 @@ def identify_dynamic(
 
     Raises:
         RecordingError: the recording does not fit the arm, or is no motion.
-        IdentificationError: the program for consistent parameters did not converge.
+        IdentificationError: the program for consistent parameters did not converge, or the model predicts the effort of
+            an actuator that moves worse than zero torque does.
     """
     grid = motion_grid(recording, arm, default_settings(arm))
     tau = recording.in_actuator_coordinates(arm).measured_effort()
@@ -88,6 +90,7 @@ def identify_dynamic(
     problem, chosen = choice.problem, choice.chosen
     fit = problem.consistent(chosen, choice.weights)
     left_out = left_out_errors(choice, fit.x[: problem.num_rigid], lambda share: progress(0.55 + 0.45 * share))
+    _refuse_worse_than_zero(recording, grid, np.sqrt(left_out / np.maximum(problem.efforts, np.finfo(float).tiny)))
     left = residuals(problem, chosen, fit)
     covariance = parameter_covariance(problem, fit, left, grid.rate, grid.settings.effort_cut_off, period)
     estimates = DynamicEstimates(problem, fit, covariance)
@@ -99,6 +102,18 @@ def identify_dynamic(
     predicted = problem.columns.tau - left
     nominal = float(sum(link.parameters[0] for link in problem.regressor.links))
     return DynamicIdentification(model, grid, period, problem.columns.tau, predicted, estimates.dry_friction(), nominal)
+
+
+def _refuse_worse_than_zero(recording: Recording, grid: MotionGrid, errors: NDArray[np.float64]) -> None:
+    """Raises IdentificationError if a cross-validated relative error (n,) of an actuator that moves exceeds 1."""
+    arm = grid.arm
+    moves = np.sqrt(np.mean(arm.transmission.velocity(grid.v) ** 2, axis=0)) > arm.per_joint(*REST_SPEED)
+    if len(bad := np.flatnonzero(moves & (errors > 1))):
+        raise IdentificationError(
+            f"{recording.source or 'recording'}: no model: its cross-validated error exceeds the effort itself on "
+            f"{', '.join(f'{arm.joint_names[i]} ({errors[i]:.0%})' for i in bad)}; check the arm, the coordinates, and "
+            "the order, signs and units of the columns (dvrk-drake check)"
+        )
 
 
 def motion_problem(

@@ -1,0 +1,127 @@
+"""What `identify` does with damaged recordings: `python benchmarks/damaged_recordings.py FOLDER [NAME ...]`.
+
+Every damage is made on its own in mtm_one.csv (MTMR) and psm_one.csv (PSM) of FOLDER, see docs/public_recordings.md, or
+in the NAMEd ones of them. A recording that is refused gives no model. Otherwise the model is identified and compared
+with the undamaged motion. The outcome is "harmless" if the error of no actuator rises by more than half and by five
+percent of its effort, and "noted" if it does and the check states that an offset of this joint does not show.
+The undamaged recordings of the folder must be accepted without a finding about their channels.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from itertools import combinations, repeat
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from dvrk_drake.analysis.check.identifiable import check_with_channels
+from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.errors import IdentificationError
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.recording import Recording, read_recording
+
+MOTIONS = {"mtm_one": "mtmr", "psm_one": "psm"}
+UNDAMAGED = {
+    **MOTIONS,
+    **dict.fromkeys(("psm_one_no_weight", "psm_one_105g_parallel", "psm_one_205g_insertion"), "psm"),
+}
+CHANNEL_KINDS = ("exchanged channels", "effort sign", "effort scale", "position offset")
+
+
+def damages(recording: Recording, arm: Arm) -> Iterator[tuple[str, str, Recording]]:
+    """(kind, channels, damaged recording)."""
+    n, tau, qd = arm.num_joints, recording.measured_effort(), np.asarray(recording.qd)
+    for i, j in combinations(range(n), 2):
+        order = np.arange(n)
+        order[[i, j]] = j, i
+        yield "efforts exchanged", f"{i + 1} {j + 1}", replace(recording, tau=tau[:, order])
+        exchanged = replace(recording, q=recording.q[:, order], qd=qd[:, order], tau=tau[:, order])
+        yield "all signals exchanged", f"{i + 1} {j + 1}", exchanged
+    for i, unit in enumerate(np.eye(n)):
+        yield "effort inverted", f"{i + 1}", replace(recording, tau=tau * (1 - 2 * unit))
+        yield (
+            "position inverted",
+            f"{i + 1}",
+            replace(recording, q=recording.q * (1 - 2 * unit), qd=qd * (1 - 2 * unit)),
+        )
+        yield "effort doubled", f"{i + 1}", replace(recording, tau=tau * (1 + unit))
+        yield "effort halved", f"{i + 1}", replace(recording, tau=tau * (1 - unit / 2))
+        offset = arm.per_joint(0.1, 0.01)[i] * unit
+        yield "position +0.1 rad, +10 mm", f"{i + 1}", replace(recording, q=recording.q + offset)
+        yield "position -0.1 rad, -10 mm", f"{i + 1}", replace(recording, q=recording.q - offset)
+
+
+def outcome(folder: Path, name: str, number: int) -> tuple[str, str, str, str]:
+    """(kind, channels, outcome, detail) of one damage."""
+    arm = load_arm(MOTIONS[name])
+    recording = read_recording(folder / f"{name}.csv", arm, "actuator")
+    kind, channels, damaged = list(damages(recording, arm))[number]
+    usual = {(f.kind, f.where) for f in check_with_channels(recording, arm).findings}
+    findings = [f for f in check_with_channels(damaged, arm).findings if (f.kind, f.where) not in usual]
+    if refusals := [f for f in findings if f.severity == "refusal"]:
+        return kind, channels, "refused", f"{refusals[0].where}: {refusals[0].kind}"
+    warnings = [f"{f.where}: {f.kind}" for f in findings if f.severity == "warning"]
+    try:
+        model = identify_dynamic(damaged, arm).model
+    except IdentificationError as error:
+        return kind, channels, "refused", f"identify: {error}"
+    assert model.dynamics is not None
+    poorly = [a.name for a in model.dynamics.actuators if a.rms_cross_validation > 0.5 * a.rms_effort]
+    if poorly:
+        warnings.append(f"{', '.join(poorly)}: most of the effort not explained")
+    after, before = (
+        np.array([a.relative_error for a in validate_motion(m, recording).actuators])
+        for m in (model, identify_dynamic(recording, arm).model)
+    )
+    harmful = (after > 1.5 * before) & (after > before + 0.05)
+    worst = int(np.argmax(after - before))
+    detail = f"{arm.joint_names[worst]} {before[worst]:.1%} -> {after[worst]:.1%}"
+    if warnings:
+        return kind, channels, "warned", f"{warnings[0]} ({detail})"
+    if not np.any(harmful):
+        return kind, channels, "harmless", detail
+    hidden = [f.where for f in check_with_channels(damaged, arm).findings if f.kind == "undetectable offset"]
+    noted = kind.startswith("position") and arm.joint_names[int(channels) - 1] in ", ".join(hidden).split(", ")
+    return kind, channels, "noted" if noted else "BAD", detail
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("name", nargs="*", default=list(MOTIONS), help=f"of {', '.join(MOTIONS)}")
+    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    options = parser.parse_args()
+    for name, arm_name in UNDAMAGED.items():
+        arm = load_arm(arm_name)
+        report = check_with_channels(read_recording(options.folder / f"{name}.csv", arm, "actuator"), arm)
+        bad = [str(f) for f in report.findings if f.kind in CHANNEL_KINDS]
+        print(f"{name} as recorded: {'; '.join(bad) or 'no finding about its channels'}", flush=True)
+    for name in options.name:
+        arm = load_arm(MOTIONS[name])
+        count = len(list(damages(read_recording(options.folder / f"{name}.csv", arm, "actuator"), arm)))
+        outcomes: dict[str, Counter] = {}
+        print(f"\n{name}\n| damage | channels | outcome | detail |\n|---|---|---|---|")
+        with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+            for kind, channels, what, detail in pool.map(outcome, repeat(options.folder), repeat(name), range(count)):
+                outcomes.setdefault(kind, Counter())[what] += 1
+                print(f"| {kind} | {channels} | {what} | {detail} |", flush=True)
+        print(f"\n{name}\n| damage | refused | warned | harmless | noted | silent and bad |\n|---|---|---|---|---|---|")
+        for kind, found in sorted(outcomes.items()):
+            print(
+                f"| {kind} | {' | '.join(str(found[k]) for k in ('refused', 'warned', 'harmless', 'noted', 'BAD'))} |"
+            )
+
+
+if __name__ == "__main__":
+    main()

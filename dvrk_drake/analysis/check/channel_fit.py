@@ -1,0 +1,251 @@
+"""Maximum-a-posteriori fit of an arm's dynamics to a motion, to compare hypotheses about its channels."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, drive_effects
+from dvrk_drake.analysis.dynamic.normal_equations import solve, squared_errors
+from dvrk_drake.analysis.signals.low_pass import low_pass, resample
+from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, default_settings, motion_grid
+from dvrk_drake.analysis.signals.phase_folds import period_of
+from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_coordinates
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.effect_shapes import effect_shapes
+from dvrk_drake.dynamics.physical_consistency import LinkScale
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.recording import REST_SPEED, Recording
+
+#: Prior standard deviations. Of links' parameters, and of the effects that the arm's file states: as shares of their
+#: size. Of simple friction, and of offsets, springs and cables of unknown size: as shares of the RMS effort.
+LINK_DEVIATION, EFFECT_DEVIATION, FRICTION_DEVIATION, POSITION_DEVIATION = 0.3, 0.5, 0.1, 1.0
+#: Of the base's tilt [rad], and of a position offset [rad], [m]; the least of a rotor's inertia [kg m^2; kg].
+TILT_DEVIATION, OFFSET_DEVIATION, LEAST_ROTOR_DEVIATION = 0.05, (0.1, 0.01), 3e-6
+#: Final samples in a period of the effort's cut-off frequency; time left out at each end, where filters swing in [s].
+OVERSAMPLING, ENDS = 2.5, 1.0
+#: Independent measurements of an effort that count at most: errors of the model do not average out.
+MOST_INDEPENDENT = 220.0
+#: The error of an actuator is not taken for less than this share of its effort.
+LEAST_ERROR = 0.02
+#: Directions of the rigid body's parameters are left out where a prior deviation along them changes the efforts by less
+#: than this share, squared.
+LEAST_INFORMATION = 1e-6
+#: Step of the derivative with respect to a position [rad, m].
+_STEP = 1e-3
+
+
+class ChannelFit:
+    """Linear model of a motion's efforts with priors: rigid bodies, base tilt and drive effects around the arm's files.
+
+    Everything is in actuator coordinates, low-passed at the arm's `effort_cut_off` and sampled as coarsely as that
+    allows, so that a fit takes milliseconds.
+
+    Attributes:
+        recording, arm: what is fitted.
+        used: (k,) indices of the actuators that move and have an effort; the others are left out.
+        log_likelihood: of the recording as it is, up to a constant.
+    """
+
+    def __init__(self, recording: Recording, arm: Arm) -> None:
+        """Prepares the columns and fits them.
+
+        Raises:
+            RecordingError: the recording does not fit the arm, or is not a motion.
+        """
+        self.recording, self.arm = recording, arm
+        self._grid = grid = motion_grid(recording, arm, default_settings(arm))
+        self._cut_off = min(arm.effort_cut_off, 0.4 * grid.rate)
+        self._half_step = max(int(GRID_RATE / (2 * OVERSAMPLING * self._cut_off)), 1)
+        self._to_joint = arm.transmission.inverse()
+        self._regressor = DynamicRegressor(arm)
+        self._tau = self._sampled_efforts()
+        moves = np.sqrt(np.mean(arm.transmission.velocity(grid.v) ** 2, axis=0)) > arm.per_joint(*REST_SPEED)
+        self.used = np.flatnonzero(moves & np.any(self._tau != 0, axis=0))
+        self.log_likelihood = 0.0
+        if len(self.used):
+            self._make_columns()
+            self.log_likelihood, self._x, _ = self._fit(self._tau)
+
+    def in_actuators(self, transform: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, n) transform of the actuators' efforts for one of the recording's effort channels."""
+        if self.recording.coordinates == "actuator":
+            return transform
+        J = self.arm.transmission.matrix
+        return np.asarray(np.linalg.inv(J.T) @ transform @ J.T)
+
+    def gain(self, transform: NDArray[np.float64]) -> float:
+        """Increase of the log-likelihood if the actuators' true efforts are `transform` (n, n) times the recorded."""
+        volume = self._independent * float(np.log(abs(np.linalg.det(transform))))
+        return self._fit(self._tau @ transform.T)[0] + volume - self.log_likelihood
+
+    def position_offset(self, channel: int) -> tuple[float, float]:
+        """Estimated offset of a position channel of the recording and its standard error [rad, m]."""
+        deviation = float(self.arm.per_joint(*OFFSET_DEVIATION)[channel])
+        _, x, precision = self._fit(self._tau, deviation * self._offset_column(channel))
+        return deviation * float(x[-1]), deviation * float(np.sqrt(np.linalg.inv(precision)[-1, -1]))
+
+    def dissipation(self) -> NDArray[np.float64]:
+        """(n,) power that actuators dissipate over that of the friction in the arm's file; nan where it states none.
+
+        What the fitted links, springs and cables carry is subtracted first: their power over a motion is not zero.
+        """
+        v = self._sampled(self.arm.transmission.velocity(self._grid.v))
+        friction = np.array([effect.kind not in POSITION_KINDS for effect in self._drive.effects])
+        carrying = np.append(self._x[: self._num_rigid], np.where(friction, 0.0, self._x[self._num_rigid :]))
+        stated = np.where(friction, self._drive.mean, 0.0)
+        power = np.full(len(self._columns), np.nan)
+        for i in self.used:
+            if expected := float(self._effect_columns[i] @ stated @ v[:, i]):
+                left = self._tau[:, i] - self._nominal[:, i] - self._columns[i] @ carrying
+                power[i] = float(left @ v[:, i]) / expected
+        return power
+
+    def _sampled_efforts(self) -> NDArray[np.float64]:
+        tau = self.recording.in_actuator_coordinates(self.arm).measured_effort()
+        # Rows that repeat the one before have its time.
+        times, rows = np.unique(self._grid.row_times, return_index=True)
+        filtered = low_pass(tau, self._grid.rate, self._cut_off)[rows]
+        return self._sampled(resample(times, filtered, self._grid.t))
+
+    def _make_columns(self) -> None:
+        grid, regressor, n = self._grid, self._regressor, self.arm.num_joints
+        q, v, vd = (x[:: self._half_step] for x in (grid.q, grid.v, grid.vd))
+        num_links = 10 * len(regressor.links)
+        prior = regressor.values[: num_links + n]
+        deviations = [LINK_DEVIATION * LinkScale.of(link).deviations for link in regressor.links]
+        rotors = np.maximum(LINK_DEVIATION * prior[num_links:], LEAST_ROTOR_DEVIATION)
+        Y = np.einsum("ji,mjp->mip", self._to_joint.matrix, regressor.regressor(q, v, vd)[..., : len(prior)])
+        self._nominal = self._filtered(Y @ prior)
+        Y = self._filtered(Y * np.concatenate([*deviations, rotors]))
+        effort = np.sqrt(np.mean(self._tau**2, axis=0))
+        information = sum(Y[:, i].T @ Y[:, i] / (len(Y) * effort[i] ** 2) for i in self.used)
+        values, vectors = np.linalg.eigh(information)
+        directions = vectors[:, values > LEAST_INFORMATION]
+        self._to_parameters = np.concatenate([*deviations, rotors])[:, None] * directions
+        tilts = TILT_DEVIATION * np.linalg.norm(self.arm.gravity) * self._weights_of_unit_gravity(q)
+        self._drive = drive = _drive_effects(self.arm, grid)
+        self._rows = np.array([effect_coordinates(self.arm)[effect.coordinate] for effect in drive.effects])
+        shapes = np.column_stack(list(effect_shapes(regressor, drive.effects, grid.q, grid.v)))
+        shapes = self._sampled(low_pass(shapes, GRID_RATE, self._cut_off))
+        self._effect_columns = [shapes * self._rows[:, i] for i in range(n)]
+        size = sum(np.mean(self._effect_columns[i] ** 2, axis=0) / effort[i] ** 2 for i in self.used)
+        share = drive.share / np.sqrt(np.maximum(np.asarray(size), np.finfo(float).tiny))
+        deviation = np.where(drive.deviation > 0, drive.deviation, share)
+        self._columns = [np.hstack([Y[:, i] @ directions, tilts[:, i], self._effect_columns[i]]) for i in range(n)]
+        self._num_rigid = directions.shape[1] + tilts.shape[2]
+        self._mean = np.append(np.zeros(self._num_rigid), drive.mean)
+        self._precision = np.append(np.ones(self._num_rigid), deviation**-2.0)
+        dissipative = [effect.dissipative for effect in drive.effects]
+        self._non_negative = np.append(np.zeros(self._num_rigid, dtype=bool), dissipative)
+        duration = float(grid.t[-1] - grid.t[0]) - 2 * ENDS
+        duration = min(duration, period_of(grid) or duration)
+        self._independent = min(2 * self._cut_off * duration, MOST_INDEPENDENT)
+
+    def _fit(
+        self, tau: NDArray[np.float64], column: NDArray[np.float64] | None = None
+    ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+        """Fits efforts tau (r, n), with one more `column` (r, n) of deviation 1 if given.
+
+        Returns:
+            The log-likelihood, the unknowns x (k,) and their precision (k, k).
+        """
+        extra = 0 if column is None else 1
+        precision, mean = np.append(self._precision, np.ones(extra)), np.append(self._mean, np.zeros(extra))
+        non_negative = np.append(self._non_negative, np.zeros(extra, dtype=bool))
+        products = []
+        for i in self.used:
+            left = tau[:, [i]] - self._nominal[:, [i]]
+            full = np.hstack([self._columns[i], *([] if column is None else [column[:, [i]]]), left])
+            products.append(full.T @ full)
+        # `solve` takes priors about zero: the means are one more measurement of all unknowns.
+        prior = np.sqrt(precision)[:, None] * np.column_stack([np.eye(len(mean)), mean])
+        products.append(prior.T @ prior)
+        stacked = np.array(products)
+        efforts = np.sum(tau[:, self.used] ** 2, axis=0)
+        weights = self._independent / (0.1**2 * efforts)
+        for _ in range(4):
+            x = solve(stacked, np.append(weights, 1.0), np.full(len(mean), 1e-9), non_negative)
+            errors = np.maximum(squared_errors(stacked[:-1], x), LEAST_ERROR**2 * efforts)
+            weights = self._independent / errors
+        likelihood = -0.5 * self._independent * float(np.sum(np.log(errors)))
+        likelihood -= 0.5 * float(np.sum(precision * (x - mean) ** 2))
+        return likelihood, x, np.tensordot(weights, stacked[:-1, :-1, :-1], axes=(0, 0)) + np.diag(precision)
+
+    def _offset_column(self, channel: int) -> NDArray[np.float64]:
+        """(r, n) change of the fitted efforts per unit by which a position channel is too large."""
+        step = _STEP * np.eye(self.arm.num_joints)[channel]
+        if self.recording.coordinates == "actuator":
+            step = self._to_joint.velocity(step)
+        phi = self._regressor.values.copy()
+        num_directions = self._to_parameters.shape[1]
+        phi[: len(self._to_parameters)] += self._to_parameters @ self._x[:num_directions]
+        q, v, vd = (x[:: self._half_step] for x in (self._grid.q, self._grid.v, self._grid.vd))
+        rigid = self._regressor.torque(q - step, v, vd, phi) - self._regressor.torque(q, v, vd, phi)
+        change = self._filtered(self._to_joint.pull_back_effort(rigid))
+        chosen = [k for k, effect in enumerate(self._drive.effects) if effect.kind in POSITION_KINDS]
+        if chosen:
+            effects, rest = [self._drive.effects[k] for k in chosen], np.zeros_like(q)
+            at, shifted = (
+                np.column_stack(list(effect_shapes(self._regressor, effects, pose, rest))) for pose in (q, q - step)
+            )
+            coefficients = self._x[self._num_rigid + np.array(chosen)]
+            change += self._filtered(shifted - at) @ (self._rows[chosen] * coefficients[:, None])
+        return np.asarray(change / _STEP)
+
+    def _weights_of_unit_gravity(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(r, n, 2) holding efforts under a gravity of 1 m/s^2 along the base's x and y."""
+        weights, rest = [], np.zeros_like(q)
+        for axis in np.eye(3)[:2]:
+            regressor = DynamicRegressor(self.arm.with_gravity([float(g) for g in axis]))
+            torque = regressor.torque(q, rest, rest, regressor.values)
+            weights.append(self._filtered(self._to_joint.pull_back_effort(torque)))
+        return np.stack(weights, axis=2)
+
+    def _sampled(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """x on the motion's grid at the final samples."""
+        return self._inner(x[:: self._half_step])
+
+    def _filtered(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """x (m, ...) at twice the rate of the final samples, low-passed, at the final samples."""
+        flat = low_pass(x.reshape(len(x), -1), GRID_RATE / self._half_step, self._cut_off)
+        return self._inner(flat.reshape(x.shape))
+
+    def _inner(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        ends = int(ENDS * GRID_RATE / self._half_step)
+        return x[ends : len(x) - ends : 2]
+
+
+class _DriveEffects(NamedTuple):
+    """Effects of the drives with priors of their coefficients.
+
+    Attributes:
+        effects: the e effects.
+        mean: (e,) expected coefficients.
+        deviation: (e,) their standard deviation, 0 where `share` states it.
+        share: (e,) the same as a share of the RMS effort that the effect acts on.
+    """
+
+    effects: list[ActuatorEffect]
+    mean: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+    share: NDArray[np.float64]
+
+
+def _drive_effects(arm: Arm, grid: MotionGrid) -> _DriveEffects:
+    """Effects that the arm's file states, springs and cables that it names without a size, and simple friction."""
+    stated: list[DriveEffect] = [*arm.effects.friction, *arm.effects.cables, *arm.effects.springs]
+    sized = {effect.coordinate for effect in stated if effect.kind in POSITION_KINDS}
+    others = [e for e in drive_effects(arm, grid) if e.kind in POSITION_KINDS and e.coordinate not in sized]
+    for name, speed in zip(arm.joint_names, np.std(arm.transmission.velocity(grid.v), axis=0), strict=True):
+        actuator = f"actuator.{name}"
+        others += [ActuatorEffect(actuator, "offset")] if actuator in sized else []
+        others.append(ActuatorEffect(actuator, "viscous"))
+        others.append(ActuatorEffect(actuator, "coulomb", DIRECTION_WIDTH * float(speed) or 1.0))
+    effects = [*(ActuatorEffect(e.coordinate, e.kind, e.scale) for e in stated), *others]
+    mean = np.array([e.coefficient for e in stated] + [0.0] * len(others))
+    share = [POSITION_DEVIATION if e.kind in POSITION_KINDS else FRICTION_DEVIATION for e in effects]
+    return _DriveEffects(effects, mean, EFFECT_DEVIATION * np.abs(mean), np.array(share))

@@ -1,0 +1,134 @@
+"""`check` and `identify` find channels that are exchanged, inverted, scaled or shifted, and name them."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from synthetic_motion import RATE, trajectory
+
+from dvrk_drake.analysis.check.channel_check import check_channels
+from dvrk_drake.analysis.check.identifiable import check_with_channels
+from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.errors import IdentificationError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.recording import Recording, read_recording, write_recording
+
+pytestmark = pytest.mark.slow
+
+
+@cache
+def motion(name):
+    """Efforts of the SDF's links, each up to 10 % heavier or lighter, and of the arm's drives, each up to 20 % off."""
+    arm, generator = load_arm(name), np.random.default_rng(3)
+    t = np.arange(0, 24, 1 / RATE)
+    q, v, vd = trajectory(arm, t, period=12.0)
+    regressor = DynamicRegressor(arm)
+    masses = np.repeat(generator.uniform(0.9, 1.1, len(regressor.links)), 10)
+    parameters = regressor.values * np.append(masses, np.ones(len(regressor.values) - len(masses)))
+    tau = arm.transmission.inverse().pull_back_effort(regressor.torque(q, v, vd, parameters))
+    a, a_dot = arm.transmission.position(q), arm.transmission.velocity(v)
+    for stated in [*arm.effects.friction, *arm.effects.cables, *arm.effects.springs]:
+        h = effect_coordinates(arm)[stated.coordinate]
+        shape = ActuatorEffect(stated.coordinate, stated.kind, stated.scale).column(a @ h, a_dot @ h)
+        tau += generator.uniform(0.8, 1.2) * stated.coefficient * np.outer(shape, h)
+    tau += 0.02 * np.sqrt(np.mean(tau**2, axis=0)) * generator.normal(size=tau.shape)
+    return Recording(a, tau, a_dot, t, "actuator", source=name)
+
+
+def exchanged(recording, i, j, *blocks):
+    order = np.arange(7)
+    order[[i, j]] = j, i
+    return replace(recording, **{block: getattr(recording, block)[:, order] for block in blocks})
+
+
+@pytest.mark.parametrize("coordinates", ["actuator", "joint"])
+@pytest.mark.parametrize("name", ["mtmr", "psm"])
+def test_undamaged_motion_has_no_finding(name, coordinates):
+    arm, recording = load_arm(name), motion(name)
+    recording = recording.in_joint_coordinates(arm) if coordinates == "joint" else recording
+    assert [f for f in check_channels(recording, arm) if f.severity != "note"] == []
+
+
+@pytest.mark.parametrize(("name", "pair"), [("mtmr", (0, 1)), ("mtmr", (5, 6)), ("psm", (4, 5)), ("psm", (1, 2))])
+def test_exchanged_efforts_are_named(name, pair):
+    damaged = exchanged(motion(name), *pair, "tau")
+    found = check_channels(damaged, load_arm(name))
+    assert [(f.severity, f.kind, f.joints) for f in found] == [("refusal", "exchanged channels", pair)]
+    assert f"tau{pair[0] + 1} and tau{pair[1] + 1}" in found[0].what
+
+
+@pytest.mark.parametrize(("name", "pair"), [("mtmr", (3, 4)), ("psm", (4, 5)), ("psm", (0, 1))])
+def test_channels_exchanged_as_a_whole_are_named(name, pair):
+    damaged = exchanged(motion(name), *pair, "q", "qd", "tau")
+    found = check_channels(damaged, load_arm(name))
+    assert [(f.kind, f.joints) for f in found] == [("exchanged channels", pair)]
+    assert "all signals" in found[0].what
+
+
+def test_exchanged_efforts_in_joint_coordinates_are_named():
+    arm = load_arm("mtmr")
+    damaged = exchanged(motion("mtmr").in_joint_coordinates(arm), 1, 3, "tau")
+    assert [(f.kind, f.joints) for f in check_channels(damaged, arm)] == [("exchanged channels", (1, 3))]
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.5])
+@pytest.mark.parametrize(("name", "joint"), [("mtmr", 3), ("mtmr", 6), ("psm", 0), ("psm", 3)])
+def test_scaled_effort_is_warned_about(name, joint, factor):
+    recording = motion(name)
+    scale = np.where(np.arange(7) == joint, factor, 1.0)
+    found = check_channels(replace(recording, tau=recording.tau * scale), load_arm(name))
+    # Drives that share a joint with it may be named too.
+    sizes = {f.joints[0]: f.size for f in found if f.kind == "effort scale"}
+    assert sizes[joint] == pytest.approx(factor, rel=0.3)
+
+
+@pytest.mark.parametrize(("joint", "offset"), [(1, 0.15), (2, -0.1), (3, 0.15)])
+def test_position_offset_is_warned_about(joint, offset):
+    recording = motion("mtmr")
+    found = check_channels(replace(recording, q=recording.q + offset * np.eye(7)[joint]), load_arm("mtmr"))
+    offsets = {f.joints[0]: f.size for f in found if f.kind == "position offset"}
+    assert offsets[joint] == pytest.approx(offset, abs=0.06)
+
+
+def test_joints_without_visible_zero_are_noted():
+    # Gravity cannot show the angle of a vertical axis.
+    notes = [f for f in check_channels(motion("mtmr"), load_arm("mtmr")) if f.kind == "undetectable offset"]
+    assert "outer_yaw" in notes[0].where
+    assert "elbow_pitch" not in notes[0].where
+
+
+def test_exchange_replaces_the_finding_of_a_wrong_sign():
+    arm = load_arm("mtmr")
+    damaged = exchanged(motion("mtmr"), 4, 5, "tau")
+    assert [f.kind for f in check_with_channels(damaged, arm).refusals] == ["exchanged channels"]
+
+
+def test_identify_refuses_and_names_the_channels(tmp_path, capfd):
+    write_recording(exchanged(motion("mtmr"), 0, 1, "tau"), tmp_path / "motion.csv")
+    model = tmp_path / "model.yaml"
+    command = ["identify", str(tmp_path / "motion.csv"), "--arm", "mtmr", "--coordinates", "actuator"]
+    assert main([*command, "--output", str(model)]) == 2
+    assert "tau1 and tau2 are exchanged" in capfd.readouterr().err
+    assert not model.exists()
+
+
+def test_model_worse_than_zero_torque_is_refused():
+    recording = motion("mtmr")
+    noise = np.random.default_rng(1).normal(size=recording.q.shape) * np.sqrt(np.mean(recording.tau**2, axis=0))
+    with pytest.raises(IdentificationError, match="cross-validated error exceeds the effort itself"):
+        identify_dynamic(replace(recording, tau=noise), load_arm("mtmr"))
+
+
+@pytest.mark.parametrize(
+    "name", ["mtm_one", "psm_one", "psm_one_no_weight", "psm_one_105g_parallel", "psm_one_205g_insertion"]
+)
+def test_real_motions_have_no_finding(shared_data, name):
+    path = shared_data / "trajectories" / f"{name}.csv"
+    if not path.is_file():
+        pytest.skip(f"needs {path}")
+    arm = load_arm("mtmr" if name.startswith("mtm") else "psm")
+    assert [f for f in check_channels(read_recording(path, arm, "actuator"), arm) if f.severity != "note"] == []
