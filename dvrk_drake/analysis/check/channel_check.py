@@ -1,4 +1,4 @@
-"""Checks the channels of a motion: refits it with channels exchanged, inverted, scaled or shifted."""
+"""Checks the channels of a recording: refits it with channels exchanged, inverted, scaled or shifted."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
 from dvrk_drake.analysis.check.report import Finding
+from dvrk_drake.analysis.static.doubts import find_doubts
+from dvrk_drake.analysis.static.static_identification import LEAST_POSES, average_repeated_poses
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
 
@@ -31,36 +33,47 @@ LIMIT_MARGIN = 0.02, 0.002
 
 
 def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
-    """Refits a motion under hypotheses about its channels and reports the ones that fit clearly better.
+    """Refits a recording under hypotheses about its channels and reports the ones that fit clearly better.
 
     The hypotheses are: the efforts of two channels are exchanged; all signals of two channels are exchanged; the effort
     of a channel is inverted; the effort of an actuator is a multiple of the true one; the position of a channel has an
     offset. Each is a maximum-a-posteriori fit of `ChannelFit`, compared by its log-likelihood. A wrong scale also shows
-    in the power that friction dissipates.
+    in the power that friction dissipates. Of poses at rest only exchanges are tried: friction and stops hide the rest.
 
     Args:
-        recording: motion with times and efforts, in either coordinates; channels are those of its columns.
+        recording: a motion, or poses at rest, with efforts, in either coordinates; channels are those of its columns.
         arm: the arm that was recorded.
 
     Returns:
         One refusal for exchanged or inverted channels; otherwise warnings for scales and offsets, and a note that names
-        the joints whose position offset the motion cannot show.
+        the joints whose position offset the recording cannot show.
 
     Raises:
-        RecordingError: the recording does not fit the arm, or is not a motion.
+        RecordingError: the recording does not fit the arm, or is a motion that is too short or too coarse.
     """
+    if not recording.motion(arm):
+        recording = _poses_in_order(recording, arm)
+        if len(recording) < LEAST_POSES:
+            return []
     fit = ChannelFit(recording, arm)
-    if len(fit.used) < 2:
-        return []
-    findings = [*_effort_exchanges(fit), *_full_exchanges(fit), *_inversions(fit)]
-    best = max(findings, key=lambda finding: finding.size)
-    if best.size > SURE:
+    hypotheses = [_effort_exchanges(fit), _full_exchanges(fit)]
+    if fit.moves:
+        hypotheses.append(_inversions(fit))
+    best = max((f for findings in hypotheses for f in findings), key=lambda finding: finding.size, default=None)
+    if best is not None and best.size > SURE:
         return [best]
-    return [*_scales(fit), *_offsets(fit)]
+    return [*_scales(fit), *_offsets(fit)] if fit.moves else []
+
+
+def _poses_in_order(recording: Recording, arm: Arm) -> Recording:
+    """The distinct poses, in joint coordinates, that do not press on a stop or exceed an effort limit."""
+    poses = average_repeated_poses(recording.in_joint_coordinates(arm), arm)
+    in_order = np.setdiff1d(np.arange(len(poses)), [doubt.row for doubt in find_doubts(poses, arm)])
+    return replace(poses, q=poses.q[in_order], tau=poses.measured_effort()[in_order], qd=None, t=None, lines=None)
 
 
 def _effort_exchanges(fit: ChannelFit) -> Iterator[Finding]:
-    for i, j in combinations(range(fit.arm.num_joints), 2):
+    for i, j in combinations(map(int, fit.used), 2):
         order = _exchanged(fit.arm.num_joints, i, j)
         gain = fit.gain(fit.in_actuators(np.eye(fit.arm.num_joints)[order]))
         yield _exchange(fit.arm, (i, j), f"tau{i + 1} and tau{j + 1}", gain)
@@ -71,7 +84,7 @@ def _full_exchanges(fit: ChannelFit) -> Iterator[Finding]:
     recording, arm = fit.recording, fit.arm
     margin = np.append(arm.per_joint(*LIMIT_MARGIN), np.full(len(arm.coupled_limits), LIMIT_MARGIN[0]))
     allowed = _limit_excess(recording, arm) + margin
-    for i, j in combinations(range(arm.num_joints), 2):
+    for i, j in combinations(map(int, fit.used), 2):
         order = _exchanged(arm.num_joints, i, j)
         qd = None if recording.qd is None else recording.qd[:, order]
         other = replace(recording, q=recording.q[:, order], qd=qd, tau=recording.measured_effort()[:, order])
@@ -93,17 +106,18 @@ def _limit_excess(recording: Recording, arm: Arm) -> NDArray[np.float64]:
     return np.asarray(np.max(np.maximum(np.maximum(lower - values, values - upper), 0.0), axis=0))
 
 
-def _exchange(arm: Arm, channels: tuple[int, int], which: str, gain: float) -> Finding:
+def _exchange(arm: Arm, channels: tuple[int, ...], which: str, gain: float) -> Finding:
     names = " and ".join(arm.joint_names[k] for k in channels)
-    what = f"{which} are exchanged: the arm's equations fit the motion far better with them exchanged back"
+    what = f"{which} are exchanged: the arm's equations fit the recording far better with them exchanged back"
     return Finding("refusal", "exchanged channels", names, what, "correct the columns of the file", channels, gain)
 
 
 def _inversions(fit: ChannelFit) -> Iterator[Finding]:
-    for i, name in enumerate(fit.arm.joint_names):
+    for i in map(int, fit.used):
+        name = fit.arm.joint_names[i]
         signs = np.where(np.arange(fit.arm.num_joints) == i, -1.0, 1.0)
         gain = fit.gain(fit.in_actuators(np.diag(signs)))
-        what = f"tau{i + 1} has the wrong sign: the arm's equations fit the motion far better with the other one"
+        what = f"tau{i + 1} has the wrong sign: the arm's equations fit the recording far better with the other one"
         advice = f"efforts are positive towards +q{i + 1}"
         yield Finding("refusal", "effort sign", name, what, advice, (i,), gain)
 
@@ -111,7 +125,8 @@ def _inversions(fit: ChannelFit) -> Iterator[Finding]:
 def _scales(fit: ChannelFit) -> Iterator[Finding]:
     """Efforts of actuators at a wrong scale, by the fit or by the power that friction dissipates."""
     power = fit.dissipation()
-    for i, name in enumerate(fit.arm.joint_names):
+    for i in map(int, fit.used):
+        name = fit.arm.joint_names[i]
         ratio = float(power[i]) if np.isfinite(power[i]) else 1.0
         # A scale that makes friction implausible is not the cause of a better fit: the file's inertia is wrong instead.
         scales = [s for s in SCALES if 1 / FRICTION_FACTOR < ratio * s < FRICTION_FACTOR]
@@ -130,7 +145,7 @@ def _scales(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _offsets(fit: ChannelFit) -> Iterator[Finding]:
-    """Position offsets of the joints whose zero the motion shows; a note names the other joints."""
+    """Position offsets of the joints whose zero the recording shows; a note names the other joints."""
     arm, hidden = fit.arm, []
     least, tolerated = arm.per_joint(*LEAST_OFFSET), arm.per_joint(*TOLERATED_OFFSET)
     for i, name in enumerate(arm.joint_names):
@@ -143,5 +158,5 @@ def _offsets(fit: ChannelFit) -> Iterator[Finding]:
             yield Finding("warning", "position offset", name, what, "check the zero of its encoder", (i,), offset)
     if hidden:
         what = f"an offset of {TOLERATED_OFFSET[0]} rad ({TOLERATED_OFFSET[1]} m) in their positions would not show"
-        advice = "this motion cannot tell it from the links' centres of mass; check the zeros of these encoders"
+        advice = "this recording cannot tell it from the links' centres of mass; check the zeros of these encoders"
         yield Finding("note", "undetectable offset", ", ".join(hidden), what, advice)

@@ -1,4 +1,4 @@
-"""Maximum-a-posteriori fit of an arm's dynamics to a motion, to compare hypotheses about its channels."""
+"""Maximum-a-posteriori fit of an arm's dynamics to a recording, to compare hypotheses about its channels."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, drive_effects
+from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, named_effects
 from dvrk_drake.analysis.dynamic.normal_equations import solve, squared_errors
 from dvrk_drake.analysis.signals.low_pass import low_pass, resample
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, default_settings, motion_grid
@@ -31,6 +31,8 @@ OVERSAMPLING, ENDS = 2.5, 1.0
 MOST_INDEPENDENT = 220.0
 #: The error of an actuator is not taken for less than this share of its effort.
 LEAST_ERROR = 0.02
+#: A joint that covers less over poses at rest is left out [rad], [m].
+LEAST_RANGE = 0.1, 0.01
 #: Directions of the rigid body's parameters are left out where a prior deviation along them changes the efforts by less
 #: than this share, squared.
 LEAST_INFORMATION = 1e-6
@@ -39,13 +41,14 @@ _STEP = 1e-3
 
 
 class ChannelFit:
-    """Linear model of a motion's efforts with priors: rigid bodies, base tilt and drive effects around the arm's files.
+    """Linear model of a recording's efforts with priors: rigid bodies, base tilt and drive effects of the arm's files.
 
-    Everything is in actuator coordinates, low-passed at the arm's `effort_cut_off` and sampled as coarsely as that
-    allows, so that a fit takes milliseconds.
+    Everything is in actuator coordinates. A motion is low-passed at the arm's `effort_cut_off` and sampled as coarsely
+    as that allows, so that a fit takes milliseconds. Poses at rest are explained by gravity, springs, cables and offsets.
 
     Attributes:
         recording, arm: what is fitted.
+        moves: whether it is a motion.
         used: (k,) indices of the actuators that move and have an effort; the others are left out.
         log_likelihood: of the recording as it is, up to a constant.
     """
@@ -54,16 +57,30 @@ class ChannelFit:
         """Prepares the columns and fits them.
 
         Raises:
-            RecordingError: the recording does not fit the arm, or is not a motion.
+            RecordingError: the recording does not fit the arm, or is a motion that is too short or too coarse.
         """
         self.recording, self.arm = recording, arm
-        self._grid = grid = motion_grid(recording, arm, default_settings(arm))
-        self._cut_off = min(arm.effort_cut_off, 0.4 * grid.rate)
-        self._half_step = max(int(GRID_RATE / (2 * OVERSAMPLING * self._cut_off)), 1)
         self._to_joint = arm.transmission.inverse()
         self._regressor = DynamicRegressor(arm)
-        self._tau = self._sampled_efforts()
-        moves = np.sqrt(np.mean(arm.transmission.velocity(grid.v) ** 2, axis=0)) > arm.per_joint(*REST_SPEED)
+        self.moves = bool(recording.motion(arm))
+        if self.moves:
+            grid = motion_grid(recording, arm, default_settings(arm))
+            self._cut_off = min(arm.effort_cut_off, 0.4 * grid.rate)
+            self._half_step = max(int(GRID_RATE / (2 * OVERSAMPLING * self._cut_off)), 1)
+            self._q, self._v, self._vd = grid.q, grid.v, grid.vd
+            self._tau = self._sampled_efforts(grid)
+            duration = float(grid.t[-1] - grid.t[0]) - 2 * ENDS
+            independent = 2 * self._cut_off * min(duration, period_of(grid) or duration)
+            moves = np.sqrt(np.mean(arm.transmission.velocity(grid.v) ** 2, axis=0)) > arm.per_joint(*REST_SPEED)
+        else:
+            recording.check_fits(arm)
+            self._half_step = 1
+            self._q = recording.in_joint_coordinates(arm).q
+            self._v = self._vd = np.zeros_like(self._q)
+            self._tau = recording.in_actuator_coordinates(arm).measured_effort()
+            independent = len(recording)
+            moves = np.ptp(arm.transmission.position(self._q), axis=0) > arm.per_joint(*LEAST_RANGE)
+        self._independent = min(independent, MOST_INDEPENDENT)
         self.used = np.flatnonzero(moves & np.any(self._tau != 0, axis=0))
         self.log_likelihood = 0.0
         if len(self.used):
@@ -93,7 +110,7 @@ class ChannelFit:
 
         What the fitted links, springs and cables carry is subtracted first: their power over a motion is not zero.
         """
-        v = self._sampled(self.arm.transmission.velocity(self._grid.v))
+        v = self._sampled(self.arm.transmission.velocity(self._v))
         friction = np.array([effect.kind not in POSITION_KINDS for effect in self._drive.effects])
         carrying = np.append(self._x[: self._num_rigid], np.where(friction, 0.0, self._x[self._num_rigid :]))
         stated = np.where(friction, self._drive.mean, 0.0)
@@ -104,16 +121,15 @@ class ChannelFit:
                 power[i] = float(left @ v[:, i]) / expected
         return power
 
-    def _sampled_efforts(self) -> NDArray[np.float64]:
+    def _sampled_efforts(self, grid: MotionGrid) -> NDArray[np.float64]:
         tau = self.recording.in_actuator_coordinates(self.arm).measured_effort()
         # Rows that repeat the one before have its time.
-        times, rows = np.unique(self._grid.row_times, return_index=True)
-        filtered = low_pass(tau, self._grid.rate, self._cut_off)[rows]
-        return self._sampled(resample(times, filtered, self._grid.t))
+        times, rows = np.unique(grid.row_times, return_index=True)
+        return self._sampled(resample(times, low_pass(tau, grid.rate, self._cut_off)[rows], grid.t))
 
     def _make_columns(self) -> None:
-        grid, regressor, n = self._grid, self._regressor, self.arm.num_joints
-        q, v, vd = (x[:: self._half_step] for x in (grid.q, grid.v, grid.vd))
+        regressor, n = self._regressor, self.arm.num_joints
+        q, v, vd = (x[:: self._half_step] for x in (self._q, self._v, self._vd))
         num_links = 10 * len(regressor.links)
         prior = regressor.values[: num_links + n]
         deviations = [LINK_DEVIATION * LinkScale.of(link).deviations for link in regressor.links]
@@ -127,10 +143,10 @@ class ChannelFit:
         directions = vectors[:, values > LEAST_INFORMATION]
         self._to_parameters = np.concatenate([*deviations, rotors])[:, None] * directions
         tilts = TILT_DEVIATION * np.linalg.norm(self.arm.gravity) * self._weights_of_unit_gravity(q)
-        self._drive = drive = _drive_effects(self.arm, grid)
+        self._drive = drive = _drive_effects(self.arm, self._q, self._v, self.moves)
         self._rows = np.array([effect_coordinates(self.arm)[effect.coordinate] for effect in drive.effects])
-        shapes = np.column_stack(list(effect_shapes(regressor, drive.effects, grid.q, grid.v)))
-        shapes = self._sampled(low_pass(shapes, GRID_RATE, self._cut_off))
+        shapes = np.column_stack(list(effect_shapes(regressor, drive.effects, self._q, self._v)))
+        shapes = self._sampled(low_pass(shapes, GRID_RATE, self._cut_off) if self.moves else shapes)
         self._effect_columns = [shapes * self._rows[:, i] for i in range(n)]
         size = sum(np.mean(self._effect_columns[i] ** 2, axis=0) / effort[i] ** 2 for i in self.used)
         share = drive.share / np.sqrt(np.maximum(np.asarray(size), np.finfo(float).tiny))
@@ -141,9 +157,6 @@ class ChannelFit:
         self._precision = np.append(np.ones(self._num_rigid), deviation**-2.0)
         dissipative = [effect.dissipative for effect in drive.effects]
         self._non_negative = np.append(np.zeros(self._num_rigid, dtype=bool), dissipative)
-        duration = float(grid.t[-1] - grid.t[0]) - 2 * ENDS
-        duration = min(duration, period_of(grid) or duration)
-        self._independent = min(2 * self._cut_off * duration, MOST_INDEPENDENT)
 
     def _fit(
         self, tau: NDArray[np.float64], column: NDArray[np.float64] | None = None
@@ -183,7 +196,7 @@ class ChannelFit:
         phi = self._regressor.values.copy()
         num_directions = self._to_parameters.shape[1]
         phi[: len(self._to_parameters)] += self._to_parameters @ self._x[:num_directions]
-        q, v, vd = (x[:: self._half_step] for x in (self._grid.q, self._grid.v, self._grid.vd))
+        q, v, vd = (x[:: self._half_step] for x in (self._q, self._v, self._vd))
         rigid = self._regressor.torque(q - step, v, vd, phi) - self._regressor.torque(q, v, vd, phi)
         change = self._filtered(self._to_joint.pull_back_effort(rigid))
         chosen = [k for k, effect in enumerate(self._drive.effects) if effect.kind in POSITION_KINDS]
@@ -207,10 +220,12 @@ class ChannelFit:
 
     def _sampled(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """x on the motion's grid at the final samples."""
-        return self._inner(x[:: self._half_step])
+        return self._inner(x[:: self._half_step]) if self.moves else x
 
     def _filtered(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """x (m, ...) at twice the rate of the final samples, low-passed, at the final samples."""
+        if not self.moves:
+            return x
         flat = low_pass(x.reshape(len(x), -1), GRID_RATE / self._half_step, self._cut_off)
         return self._inner(flat.reshape(x.shape))
 
@@ -235,16 +250,19 @@ class _DriveEffects(NamedTuple):
     share: NDArray[np.float64]
 
 
-def _drive_effects(arm: Arm, grid: MotionGrid) -> _DriveEffects:
-    """Effects that the arm's file states, springs and cables that it names without a size, and simple friction."""
-    stated: list[DriveEffect] = [*arm.effects.friction, *arm.effects.cables, *arm.effects.springs]
+def _drive_effects(arm: Arm, q: NDArray[np.float64], v: NDArray[np.float64], moves: bool) -> _DriveEffects:
+    """Effects that the arm's file states, springs and cables that it names without a size, and simple friction.
+
+    Without friction if the arm is at rest.
+    """
+    stated: list[DriveEffect] = [*(arm.effects.friction if moves else ()), *arm.effects.cables, *arm.effects.springs]
     sized = {effect.coordinate for effect in stated if effect.kind in POSITION_KINDS}
-    others = [e for e in drive_effects(arm, grid) if e.kind in POSITION_KINDS and e.coordinate not in sized]
-    for name, speed in zip(arm.joint_names, np.std(arm.transmission.velocity(grid.v), axis=0), strict=True):
-        actuator = f"actuator.{name}"
-        others += [ActuatorEffect(actuator, "offset")] if actuator in sized else []
-        others.append(ActuatorEffect(actuator, "viscous"))
-        others.append(ActuatorEffect(actuator, "coulomb", DIRECTION_WIDTH * float(speed) or 1.0))
+    others = [ActuatorEffect(f"actuator.{name}", "offset") for name in arm.joint_names]
+    others += [effect for effect in named_effects(arm, q) if effect.coordinate not in sized]
+    for name, speed in zip(arm.joint_names, np.std(arm.transmission.velocity(v), axis=0), strict=True):
+        if moves:
+            others.append(ActuatorEffect(f"actuator.{name}", "viscous"))
+            others.append(ActuatorEffect(f"actuator.{name}", "coulomb", DIRECTION_WIDTH * float(speed) or 1.0))
     effects = [*(ActuatorEffect(e.coordinate, e.kind, e.scale) for e in stated), *others]
     mean = np.array([e.coefficient for e in stated] + [0.0] * len(others))
     share = [POSITION_DEVIATION if e.kind in POSITION_KINDS else FRICTION_DEVIATION for e in effects]

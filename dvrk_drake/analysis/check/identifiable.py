@@ -32,13 +32,13 @@ def check_for_identification(recording: Recording, arm: Arm) -> RecordingReport:
 
 
 def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
-    """As `check_recording`, with the findings of `check_channels` for a motion that has no other refusals.
+    """As `check_recording`, with the findings of `check_channels` for a recording that has no other refusals.
 
     Exchanged channels look like efforts of a wrong sign: that refusal is replaced by the one that names the cause.
     """
     report = check_recording(recording, arm)
     others = [finding for finding in report.refusals if finding.kind != "effort sign"]
-    if report.kind != "motion" or others or not recording.motion(arm):
+    if others or (report.kind == "motion" and not recording.motion(arm)):
         return report
     try:
         found = check_channels(recording, arm)

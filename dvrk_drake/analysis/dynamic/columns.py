@@ -83,6 +83,15 @@ def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
     return effects
 
 
+def named_effects(arm: Arm, q: NDArray[np.float64]) -> list[ActuatorEffect]:
+    """Springs and cables that the arm's file names (`motion.known_effects`), over positions q (m, n) of the joints."""
+    effects = []
+    for name, kinds in arm.motion.known_effects.items():
+        x = position_along(arm, name, q)
+        effects += [e for kind in kinds if kind != ASYMMETRIC for e in _named(arm, name, kind, x, np.zeros_like(x))]
+    return effects
+
+
 def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
     """What a motion may show beside: what an arm's file can name, friction that grows at low speeds or with load."""
     effects = []

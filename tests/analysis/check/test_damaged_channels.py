@@ -15,6 +15,7 @@ from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordina
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.models.recording import Recording, read_recording, write_recording
 
 pytestmark = pytest.mark.slow
@@ -92,6 +93,17 @@ def test_position_offset_is_warned_about(joint, offset):
     found = check_channels(replace(recording, q=recording.q + offset * np.eye(7)[joint]), load_arm("mtmr"))
     offsets = {f.joints[0]: f.size for f in found if f.kind == "position offset"}
     assert offsets[joint] == pytest.approx(offset, abs=0.06)
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (1, 2), (3, 4)])
+def test_exchanged_efforts_of_poses_are_named(pair):
+    arm, generator = load_arm("mtmr"), np.random.default_rng(2)
+    q = arm.sample_poses(60, generator, margin=0.1)
+    noise = 0.02 * arm.effort_limits * generator.normal(size=q.shape)
+    poses = Recording(q, holding_torques(arm, q) + noise)
+    assert check_channels(poses, arm) == []
+    found = check_channels(exchanged(poses, *pair, "tau"), arm)
+    assert [(f.kind, f.joints) for f in found] == [("exchanged channels", pair)]
 
 
 def test_joints_without_visible_zero_are_noted():
