@@ -44,7 +44,7 @@ class ChannelFit:
     """Linear model of a recording's efforts with priors: rigid bodies, base tilt and drive effects of the arm's files.
 
     Everything is in actuator coordinates. A motion is low-passed at the arm's `effort_cut_off` and sampled as coarsely
-    as that allows, so that a fit takes milliseconds. Poses at rest are explained by gravity, springs, cables and offsets.
+    as that allows, so that a fit takes milliseconds. Gravity, springs, cables and offsets explain poses at rest.
 
     Attributes:
         recording, arm: what is fitted.
