@@ -173,7 +173,7 @@ def test_require_sets_the_exit_code_and_names_the_joints(files, tmp_path, capsys
     assert main(["validate", model, bad]) == 0
     assert capsys.readouterr().out.startswith("verdict: do not use (shoulder_pitch)\n")
     for required in ("usable", "good"):
-        assert main(["validate", model, bad, "--require", required, "--json", str(report)]) == 2
+        assert main(["validate", model, bad, "--require", required, "--json", str(report), "--overwrite"]) == 2
         said = capsys.readouterr()
         assert said.err.count("\n") == 1
         assert f"not {required} on {bad}: shoulder_pitch (do not use)" in said.err

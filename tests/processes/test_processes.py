@@ -15,7 +15,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes import pace
 from dvrk_drake.processes.lcm_network import open_lcm
-from dvrk_drake.processes.live_status import takeover_reason
+from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
 from dvrk_drake.processes.simulated_arm import load_driver, start_pose
 
 
@@ -159,9 +159,11 @@ def test_a_model_of_another_arm_is_refused(tmp_path, capfd):
 
 
 def test_why_an_arm_took_over():
-    status = lcmt_dvrk_status()
-    status.num_expired, status.guard_state = 3, lcmt_dvrk_status.STATE_OFF
-    assert takeover_reason(status, 2) == "commands came too late for it (use --realtime)"
-    assert takeover_reason(status, 3) == "its state is off"
+    before, status = lcmt_dvrk_status(), lcmt_dvrk_status()
+    status.guard_state = lcmt_dvrk_status.STATE_OFF
+    assert takeover_reason(status, before, AnswerTimes()) == "its state is off"
+    status.num_expired = 3
+    assert takeover_reason(status, before, AnswerTimes()) == "commands came too late for it (use --realtime)"
+    status.num_expired, status.num_refused = 0, 1
     status.refusal_code = lcmt_dvrk_status.REFUSAL_START_FAR
-    assert "starting too far" in takeover_reason(status, 3)
+    assert "starting too far" in takeover_reason(status, before, AnswerTimes())

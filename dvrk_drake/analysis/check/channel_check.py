@@ -56,12 +56,11 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
         if len(recording) < LEAST_POSES:
             return []
     fit = ChannelFit(recording, arm)
-    hypotheses = [_effort_exchanges(fit), _full_exchanges(fit)]
-    if fit.moves:
-        hypotheses.append(_inversions(fit))
-    best = max((f for findings in hypotheses for f in findings), key=lambda finding: finding.size, default=None)
+    findings = [*_effort_exchanges(fit), *_full_exchanges(fit), *_inversions(fit)]
+    best = max(findings, key=lambda finding: finding.size, default=None)
     if best is not None and best.size > SURE:
-        return [best]
+        # At a stop, efforts of poses look inverted.
+        return [best] if fit.moves or best.kind == "exchanged channels" else []
     return [*_scales(fit), *_offsets(fit)] if fit.moves else []
 
 
