@@ -125,6 +125,13 @@ def test_settings_that_switch_the_guard_off_are_refused(name, value):
             GuardSettings(**{name: bad})
 
 
+def test_settings_that_are_changed_afterwards_are_refused():
+    settings = GuardSettings()
+    settings.expiry = 9.0
+    with pytest.raises(StationError, match="guard settings: expiry must be"):
+        CommandGuard(ARM, SESSION, settings)
+
+
 def test_an_arm_that_nothing_holds_is_refused():
     gains = dataclasses.replace(ARM.gains, kp=[0.0, *ARM.gains.kp[1:]])
     with pytest.raises(StationError, match=r"MTML: all gains\.kp must be positive"):

@@ -9,6 +9,7 @@ from guard_bench import ARM, LIMIT, N, Q
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm_schema import CoupledLimit
 from dvrk_drake.systems.guard.limits import GuardLimits
 from dvrk_drake.systems.guard.settings import GuardSettings
 
@@ -134,6 +135,13 @@ def test_positions_start_near_the_measured_ones_only(joint, side):
     assert start(Command.POSITION, q=outside, position=outside, measured=2 * LIMIT) == Status.REFUSAL_NONE
 
 
+def test_a_start_exactly_as_far_as_allowed_is_near():
+    measured = LIMITS.command_limits + LIMITS.start_effort
+    assert start(Command.EFFORT, measured=FREE, effort=LIMITS.start_effort) == Status.REFUSAL_NONE
+    assert start(Command.EFFORT, measured=measured, effort=measured) == Status.REFUSAL_NONE
+    assert start(Command.POSITION, q=FREE, position=LIMITS.start_position) == Status.REFUSAL_NONE
+
+
 # Efforts
 
 
@@ -165,7 +173,7 @@ def test_a_joint_that_is_too_fast_is_braked(joint, side):
     np.testing.assert_allclose(limits.restrain_effort(FREE, Q, 9.0 * speed)[0], -push, atol=1e-12)
 
 
-def test_walls_are_no_stiffer_than_four_times_the_position_controller():
+def test_the_stiffness_of_walls_is_limited():
     """One period late, a stiffer wall would chatter; a softer one would be wider than it need be."""
     motors = [max(LIMIT[row != 0] / np.abs(row[row != 0])) for row in A]
     stiffness = 2 * np.array(motors)[:, None] * A**2 / LIMITS.wall_width[:, None] / KP
@@ -176,7 +184,7 @@ def test_walls_are_no_stiffer_than_four_times_the_position_controller():
 
 
 @pytest.mark.parametrize("row", range(N + 1))
-def test_a_wall_gives_no_energy_and_takes_some_from_what_comes_fast(row):
+def test_a_wall_is_passive(row):
     """Work over closed paths through the wall, of the limit's own coordinate, at several speeds."""
     a = A[row] / (A[row] @ A[row])
     middle = Q + (0.5 * (LOWER + UPPER)[row] - A[row] @ Q) * a
@@ -242,6 +250,59 @@ def test_a_target_outside_comes_back_and_goes_no_further_out():
     assert out[5] == last[5] and flags[5] & Status.FLAG_POSITION_LIMIT
     back, flags = LIMITS.limit_position(last - 0.01 * E[5], last, 0.1)
     assert back[5] == pytest.approx(last[5] - 0.01) and not np.any(flags)
+
+
+def coupled(*limits):
+    """The arm with other coupled limits; joints differ in effort and in Kd/Kp."""
+    gains = dataclasses.replace(ARM.gains, kd=list(KP * np.linspace(0.05, 0.2, N)))
+    return dataclasses.replace(ARM, coupled_limits=limits, effort_limits=LIMIT * np.linspace(1, 2, N), gains=gains)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_wall_outweighs_every_motor_that_pushes_on_it(side):
+    yaw, pitch = ARM.joint_names[0], ARM.joint_names[4]
+    arm = coupled(CoupledLimit("cable", {yaw: -2.0, pitch: 0.5}, -0.5, 0.5))
+    limits = GuardLimits(arm, GuardSettings(traverse_time=100.0, margin=0.001))
+    a, effort = arm.limit_matrix()[0][N], arm.effort_limits
+    joints = np.flatnonzero(a)
+    motor = max(effort[joints] / np.abs(a[joints]))
+    assert limits.wall_width[N] == pytest.approx(max(2 * motor * a**2 / (4 * np.array(arm.gains.kp))))
+    push = side * np.sign(a) * effort
+
+    def pushed(depth, rate=0.0):
+        q = Q + (side * (0.5 + (depth - 1) * limits.wall_width[N]) - a @ Q) / (a @ a) * a
+        return limits.restrain_effort(push, q, rate * side * a / (a @ a))
+
+    np.testing.assert_allclose(pushed(-0.01)[0], push)
+    applied, flags = pushed(0.3)
+    np.testing.assert_allclose(applied, np.clip(push - 0.6 * side * motor * a, -effort, effort))
+    assert flagged(flags) == (list(joints), {Status.FLAG_COUPLED_LIMIT})
+    assert np.all((pushed(0.5)[0] * push)[joints] <= 1e-12)
+    np.testing.assert_allclose(pushed(1.0)[0], -push)
+    # What comes fast is met earlier, by the largest Kd/Kp of these joints.
+    seconds = max((np.array(arm.gains.kd) / np.array(arm.gains.kp))[joints])
+    rate = 1e-3
+    np.testing.assert_allclose(
+        pushed(0.3, rate)[0], pushed(0.3 + seconds * rate / limits.wall_width[N])[0], rtol=1e-9, atol=1e-12
+    )
+
+
+def test_coupled_limits_that_undo_one_another_stop_the_target():
+    yaw, shoulder, elbow = ARM.joint_names[:3]
+    first = CoupledLimit("first", {shoulder: 1.0, elbow: 1.0}, -1.0, Q[1] + Q[2])
+    second = CoupledLimit("second", {shoulder: 1.0, yaw: 1.0}, Q[0] + Q[1], 2.0)
+    limits = GuardLimits(coupled(first, second), GuardSettings())
+    # The shoulder makes room for the elbow, but the second limit does not let it.
+    wanted = Q + np.array([-0.001, -0.001, 0.001, 0.001, 0.0, 0.0, 0.0])
+    last = Q.copy()
+    target, flags = limits.limit_position(wanted, last, 0.01)
+    np.testing.assert_array_equal(target, Q)
+    assert target is not last
+    assert np.all(flags[[0, 1]] == Status.FLAG_COUPLED_LIMIT)
+    # Each of them alone lets the target go on.
+    for alone in (first, second):
+        limits = GuardLimits(coupled(alone), GuardSettings())
+        assert limits.limit_position(wanted, Q, 0.01)[0][3] == pytest.approx(Q[3] + 0.001)
 
 
 # Feed-forward velocities

@@ -67,7 +67,7 @@ def test_noise_of_a_seed_depends_on_the_time_step_alone():
     assert abs(np.corrcoef(path[1:, 0], path[:-1, 0])[0, 1]) < 0.25
 
 
-def test_measured_efforts_are_whole_steps_and_zero_without_a_command():
+def test_measured_efforts_are_whole_steps():
     measured = sensor(0, measured_resolution=dict.fromkeys(ARM.joint_names, 0.002))
     np.testing.assert_array_equal(measured(0), np.zeros(N))
     effort = np.array([0.0011, -0.0029, 0.0045, 0.0, 0.0009, -0.0011, 0.0031])
