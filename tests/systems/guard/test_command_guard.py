@@ -168,6 +168,7 @@ def test_a_guard_that_has_measured_nothing_moves_nothing():
     assert (guard.state, guard.fault_code, guard.sender_id) == (Status.STATE_HOLD, Status.FAULT_NONE, 0)
     assert guard.output.control_mode == Command.HOLD
     assert not np.any(guard.output.effort) and not np.any(guard.output.velocity)
+    assert set(vars(guard.counts).values()) == {0}
 
 
 def test_accepted_modes_and_the_sender_in_each_state():
