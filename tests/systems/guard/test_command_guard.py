@@ -88,6 +88,21 @@ def test_a_command_expires_after_50_ms_into_a_hold_of_the_pose():
     assert bench.guard.state == Status.STATE_STARTING
 
 
+def test_a_command_that_comes_after_the_expiry_starts_anew():
+    """Also where no step came in between."""
+    bench = Bench().started()
+    bench.utime += 60 * MS
+    assert bench.send() == Status.REFUSAL_NONE
+    assert (bench.guard.state, bench.guard.counts.expired) == (Status.STATE_STARTING, 1)
+
+
+def test_two_steps_at_one_time_do_not_forget_the_sender():
+    bench = Bench()
+    bench.run(Command.HOLD, 1)
+    bench.step()
+    assert bench.send(Command.HOLD, sender=6) == Status.REFUSAL_OTHER_SENDER
+
+
 def test_hold_command_holds_at_once_and_does_not_creep():
     bench = Bench().started()
     bench.q = Q + 0.01
@@ -166,6 +181,7 @@ def test_modes_can_be_restricted():
 def test_a_guard_that_has_measured_nothing_moves_nothing():
     guard = CommandGuard(ARM, 1)
     assert (guard.state, guard.fault_code, guard.sender_id) == (Status.STATE_HOLD, Status.FAULT_NONE, 0)
+    assert (guard.fault_text, guard.refusal_code) == ("", Status.REFUSAL_NONE)
     assert guard.output.control_mode == Command.HOLD
     assert not np.any(guard.output.effort) and not np.any(guard.output.velocity)
     assert set(vars(guard.counts).values()) == {0}
@@ -275,6 +291,10 @@ def test_a_wall_comes_on_evenly_while_a_start_time_passes():
     for k in range(260):
         share = min(k / 250, 1.0)
         assert bench.run(Command.EFFORT, 1).effort[0] == pytest.approx(-share * LIMIT[0], abs=0.005 * LIMIT[0])
+    # From then on efforts are as if they had begun elsewhere.
+    bench.run(Command.EFFORT, 250)
+    bench.q = Q.copy()
+    np.testing.assert_allclose(bench.run(Command.EFFORT, 1).effort, np.zeros(N), atol=1e-12)
 
 
 def test_a_pose_beyond_a_limit_is_no_fault_while_positions_act():
