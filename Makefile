@@ -5,9 +5,11 @@ VENV ?= .venv
 TESTS ?= not slow
 # CI leaves out the PSM's collection, which is the MTM's again with another arm.
 RECORDINGS ?= tests/udp/test_record_udp.py tests/udp/test_collect_udp.py tests/udp/test_collect_psm_udp.py
+# What `make mutants` changes: a module or a folder of the package.
+MUTATE ?= dvrk_drake/systems/guard
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-busy test-fast test-udp test-recordings lint benchmark clean
+.PHONY: demo test test-busy test-fast test-udp test-recordings mutants lint benchmark clean
 
 demo: $(VENV)/.installed
 	$(BIN)/dvrk-drake demo --output demo_output
@@ -29,6 +31,10 @@ test-udp: $(VENV)/.installed-test
 # Recordings over UDP, and collections of both arms from the first pose to the release: minutes.
 test-recordings: $(VENV)/.installed-test
 	$(BIN)/python -m pytest $(RECORDINGS)
+
+# Mutation testing: which changes of the code no test detects. Not part of CI, since it takes many minutes.
+mutants: $(VENV)/.installed-test
+	nice -n 10 $(BIN)/python tools/mutants.py $(MUTATE)
 
 lint: $(VENV)/.installed-lint
 	$(BIN)/ruff check .

@@ -1,11 +1,14 @@
 """The watchdog's states: what it lets pass, from when on, and when it takes over."""
 
+import copy
+
 import numpy as np
 import pytest
-from guard_bench import LIMIT, MS, Bench, N, Q, modes
+from guard_bench import ARM, LIMIT, MS, Bench, N, Q, modes
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.systems.guard.command_guard import CommandGuard
 
 
 def test_holds_the_first_pose_without_any_command():
@@ -85,6 +88,21 @@ def test_a_command_expires_after_50_ms_into_a_hold_of_the_pose():
     assert bench.guard.state == Status.STATE_STARTING
 
 
+def test_a_command_that_comes_after_the_expiry_starts_anew():
+    """Also where no step came in between."""
+    bench = Bench().started()
+    bench.utime += 60 * MS
+    assert bench.send() == Status.REFUSAL_NONE
+    assert (bench.guard.state, bench.guard.counts.expired) == (Status.STATE_STARTING, 1)
+
+
+def test_two_steps_at_one_time_do_not_forget_the_sender():
+    bench = Bench()
+    bench.run(Command.HOLD, 1)
+    bench.step()
+    assert bench.send(Command.HOLD, sender=6) == Status.REFUSAL_OTHER_SENDER
+
+
 def test_hold_command_holds_at_once_and_does_not_creep():
     bench = Bench().started()
     bench.q = Q + 0.01
@@ -158,3 +176,184 @@ def test_modes_can_be_restricted():
     assert bench.send(Command.EFFORT) == Status.REFUSAL_BAD_MODE
     assert bench.guard.accepted_modes == modes(Command.OFF, Command.HOLD, Command.POSITION)
     bench.started(Command.POSITION)
+
+
+def test_a_guard_that_has_measured_nothing_moves_nothing():
+    guard = CommandGuard(ARM, 1)
+    assert (guard.state, guard.fault_code, guard.sender_id) == (Status.STATE_HOLD, Status.FAULT_NONE, 0)
+    assert (guard.fault_text, guard.refusal_code) == ("", Status.REFUSAL_NONE)
+    assert guard.output.control_mode == Command.HOLD
+    assert not np.any(guard.output.effort) and not np.any(guard.output.velocity)
+    assert set(vars(guard.counts).values()) == {0}
+
+
+def test_accepted_modes_and_the_sender_in_each_state():
+    both = modes(Command.HOLD, Command.POSITION, Command.EFFORT)
+    bench = Bench()
+    bench.run(Command.HOLD, 1)
+    assert (bench.guard.accepted_modes, bench.guard.sender_id) == (both | modes(Command.OFF), 0)
+    for mode in (Command.EFFORT, Command.POSITION):
+        bench.run(mode, 1)
+        assert (bench.guard.state, bench.guard.accepted_modes, bench.guard.sender_id) == (
+            Status.STATE_STARTING,
+            both,
+            5,
+        )
+        bench.started(mode)
+        assert (bench.guard.accepted_modes, bench.guard.sender_id) == (both, 5)
+        assert bench.guard.last_command.control_mode == mode
+    accepted = bench.guard.counts.accepted
+    bench.run(Command.HOLD, 1)
+    assert bench.guard.counts.accepted == accepted + 1 == bench.sequence
+    bench.run(Command.OFF, 1)
+    assert (bench.guard.accepted_modes, bench.guard.sender_id) == (modes(Command.OFF, Command.HOLD), 0)
+    bench.guard.report_fault("x")
+    assert (bench.guard.accepted_modes, bench.guard.sender_id) == (modes(Command.HOLD), 0)
+
+
+def test_changing_the_mode_while_starting_starts_anew():
+    bench = Bench()
+    bench.run(Command.EFFORT, 200)
+    bench.run(Command.POSITION, 250)
+    assert bench.guard.state == Status.STATE_STARTING
+    bench.run(Command.POSITION, 1)
+    assert bench.guard.state == Status.STATE_POSITION
+
+
+def test_a_hold_while_starting_ends_the_start():
+    bench = Bench()
+    bench.run(Command.EFFORT, 200)
+    bench.run(Command.HOLD, 1)
+    assert bench.guard.state == Status.STATE_HOLD
+    bench.run(Command.EFFORT, 250)
+    assert bench.guard.state == Status.STATE_STARTING
+
+
+def test_what_others_send_does_not_end_a_start():
+    bench = Bench()
+    bench.run(Command.EFFORT, 100)
+    for _ in range(160):
+        assert bench.guard.receive(None, bench.utime) == Status.REFUSAL_UNREADABLE
+        assert bench.guard.receive(bench.command(sender=9, arm_name="PSM1"), bench.utime) == Status.REFUSAL_WRONG_ARM
+        bench.run(Command.EFFORT, 1)
+    assert bench.guard.state == Status.STATE_EFFORT
+    assert bench.guard.refusal_code == Status.REFUSAL_WRONG_ARM
+    # What the sender itself sends does.
+    bench = Bench()
+    bench.run(Command.EFFORT, 100)
+    assert bench.send(arm_name="PSM1") == Status.REFUSAL_WRONG_ARM
+    assert bench.guard.state == Status.STATE_HOLD
+
+
+def test_a_refused_command_does_not_end_what_acts():
+    for mode in (Command.EFFORT, Command.POSITION):
+        bench = Bench().started(mode)
+        assert bench.send(mode, num_joints=3) == Status.REFUSAL_WRONG_SIZE
+        assert bench.tick().control_mode == mode
+
+
+@pytest.mark.parametrize("ending", ["refused", "expired", "fault and reset"])
+def test_a_start_that_ends_keeps_the_pose_that_was_held(ending):
+    bench = Bench()
+    bench.run(Command.EFFORT, 100)
+    bench.q = Q - 0.01  # it sags meanwhile
+    bench.tick()
+    if ending == "refused":
+        assert bench.send(effort=list(LIMIT)) == Status.REFUSAL_START_FAR
+    elif ending == "expired":
+        bench.tick(60)
+    else:
+        bench.guard.report_fault("x")
+        bench.tick()
+        np.testing.assert_array_equal(bench.output.position, Q)
+        bench.run(Command.HOLD, 1)
+        bench.run(Command.HOLD, 1, reset_fault=True)
+    output = bench.tick()
+    assert (output.control_mode, bench.guard.state) == (Command.HOLD, Status.STATE_HOLD)
+    np.testing.assert_array_equal(output.position, Q)
+
+
+def test_positions_start_from_the_held_pose():
+    bench = Bench()
+    bench.q = Q - 0.01
+    bench.tick()
+    output = bench.run(Command.POSITION, 251, position=list(Q))
+    assert output.control_mode == Command.POSITION
+    np.testing.assert_array_equal(output.position, Q)
+
+
+def test_a_wall_comes_on_evenly_while_a_start_time_passes():
+    bench = Bench()
+    bench.q[0] = ARM.position_upper[0]
+    bench.tick()
+    bench.effort = np.zeros(N)
+    bench.run(Command.EFFORT, 250)
+    for k in range(260):
+        share = min(k / 250, 1.0)
+        assert bench.run(Command.EFFORT, 1).effort[0] == pytest.approx(-share * LIMIT[0], abs=0.005 * LIMIT[0])
+    # From then on efforts are as if they had begun elsewhere.
+    bench.run(Command.EFFORT, 250)
+    bench.q = Q.copy()
+    np.testing.assert_allclose(bench.run(Command.EFFORT, 1).effort, np.zeros(N), atol=1e-12)
+
+
+def test_a_pose_beyond_a_limit_is_no_fault_while_positions_act():
+    bench = Bench()
+    for mode in (Command.HOLD, Command.OFF):
+        bench.run(mode, 1)
+    bench.q[5] = ARM.position_upper[5] + 0.04  # it is moved by hand
+    bench.tick()
+    bench.run(Command.HOLD, 1)
+    bench.started(Command.POSITION)
+    assert bench.tick().position[5] == bench.q[5]
+    assert bench.guard.fault_code == Status.FAULT_NONE
+
+
+def test_an_arms_clock_that_went_back_forgets_who_was_heard():
+    bench = Bench().started()
+    bench.utime -= 10**6
+    bench.step()
+    assert bench.guard.fault_code == Status.FAULT_CLOCK
+    # By the old clock this would be a second sender, and a command out of order.
+    bench.sequence = 0
+    assert bench.send(Command.HOLD, sender=6) == Status.REFUSAL_NONE
+    bench.tick()
+    assert bench.send(Command.HOLD, sender=6, reset_fault=True) == Status.REFUSAL_NONE
+    assert (bench.guard.state, bench.guard.sender_id) == (Status.STATE_HOLD, 0)
+
+
+def test_a_jump_of_the_senders_clock_does_not_disturb_a_hold():
+    bench = Bench()
+    bench.run(Command.HOLD, 1)
+    bench.q = Q - 0.01
+    bench.tick()
+    assert bench.send(Command.HOLD, utime=bench.utime) == Status.REFUSAL_CLOCK_JUMP
+    np.testing.assert_array_equal(bench.tick().position, Q)
+    bench.guard.report_fault("x")
+    assert bench.send(Command.HOLD, utime=bench.utime - 10**15) == Status.REFUSAL_CLOCK_JUMP
+    assert bench.guard.state == Status.STATE_FAULT
+
+
+@pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])
+def test_a_copy_goes_its_own_way(mode):
+    """Drake copies a guard with its context before every step."""
+    bench = Bench()
+    bench.run(mode, 260)
+    other = copy.copy(bench)
+    other.guard = copy.deepcopy(bench.guard)
+    before = vars(other.guard.counts).copy()
+    bench.run(Command.HOLD, 3)
+    bench.guard.report_fault("x", has_power=False)
+    bench.q = Q - 0.02
+    bench.tick()
+    assert vars(other.guard.counts) == before
+    assert other.guard.fault_code == Status.FAULT_NONE
+    other.run(mode, 300)
+    assert (other.output.control_mode, other.guard.fault_code) == (mode, Status.FAULT_NONE)
+    # The same from here on gives the same.
+    twin = copy.copy(other)
+    twin.guard = copy.deepcopy(other.guard)
+    for guarded in (other, twin):
+        guarded.run(mode, 20, position=list(Q + 0.01), effort=list(0.5 * LIMIT))
+    for name in ("position", "velocity", "effort", "joint_flags"):
+        np.testing.assert_array_equal(getattr(other.output, name), getattr(twin.output, name))

@@ -40,6 +40,8 @@ def test_a_long_step_moves_efforts_and_targets_no_further_than_ten_milliseconds(
         output = bench.step()
         assert output.control_mode == (mode if seconds <= 0.05 else Command.HOLD)
         dt = min(seconds, 0.01)
+        if seconds <= 0.05 and mode == Command.EFFORT:
+            np.testing.assert_allclose(before.effort - output.effort, dt / 0.02 * LIMIT, atol=1e-9)
         assert np.all(np.abs(output.effort - before.effort) <= dt / 0.02 * LIMIT + 1e-12) or seconds > 0.05
         assert np.all(np.abs(output.position - before.position) <= dt * bench.guard.limits.speed + 1e-12)
 
@@ -121,6 +123,13 @@ def test_settings_that_switch_the_guard_off_are_refused(name, value):
     for bad in (value, 0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(StationError, match=f"guard settings: {name} must be"):
             GuardSettings(**{name: bad})
+
+
+def test_settings_that_are_changed_afterwards_are_refused():
+    settings = GuardSettings()
+    settings.expiry = 9.0
+    with pytest.raises(StationError, match="guard settings: expiry must be"):
+        CommandGuard(ARM, SESSION, settings)
 
 
 def test_an_arm_that_nothing_holds_is_refused():

@@ -85,6 +85,14 @@ def test_a_jump_of_the_senders_clock_ends_in_a_hold_and_a_new_start(jump):
     assert bench.guard.state == Status.STATE_EFFORT
 
 
+@pytest.mark.parametrize("lead", [-49 * MS, 49 * MS])
+def test_a_senders_clock_may_be_off_by_the_tolerance(lead):
+    bench = Bench()
+    bench.run(Command.HOLD, 1)
+    bench.tick(50)
+    assert bench.send(Command.HOLD, utime=bench.utime - 10**15 + lead) == Status.REFUSAL_NONE
+
+
 def test_the_arms_clock_jumping_forward_expires_and_backward_is_a_fault():
     bench = Bench().started()
     bench.utime += 3600 * 10**6

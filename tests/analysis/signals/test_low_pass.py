@@ -1,0 +1,56 @@
+"""Filter, derivative and resampling of signals whose result is known."""
+
+import numpy as np
+import pytest
+
+from dvrk_drake.analysis.signals.low_pass import ORDER, central_difference, low_pass, resample
+
+RATE = 400.0
+T = np.arange(4000) / RATE
+INNER = slice(800, -800)  # away from the ends, where the filter swings in
+
+
+def sine_and_cosine(x, frequency):
+    """Coefficients of a signal in sin(2 pi f t) and cos(2 pi f t)."""
+    w = 2 * np.pi * frequency * T[INNER]
+    return np.linalg.lstsq(np.column_stack([np.sin(w), np.cos(w)]), x[INNER], rcond=None)[0]
+
+
+@pytest.mark.parametrize("frequency", [2.0, 10.0, 18.0, 20.0, 22.0, 40.0])
+def test_low_pass_has_the_gain_of_its_definition_and_no_delay(frequency):
+    in_phase, late = sine_and_cosine(low_pass(np.sin(2 * np.pi * frequency * T), RATE, 20.0), frequency)
+    # Butterworth's |H|^2, as it runs both ways; the bilinear transform bends the frequencies.
+    ratio = np.tan(np.pi * frequency / RATE) / np.tan(np.pi * 20.0 / RATE)
+    assert in_phase == pytest.approx(1 / (1 + ratio ** (2 * ORDER)), abs=1e-3)
+    assert late == pytest.approx(0.0, abs=1e-3)
+
+
+def test_low_pass_halves_the_amplitude_at_each_columns_cut_off():
+    cut_offs = np.array([10.0, 30.0, 200.0, 500.0])
+    x = np.sin(2 * np.pi * np.array([10.0, 30.0, 30.0, 30.0]) * T[:, None])
+    y = low_pass(x, RATE, cut_offs)
+    for column, frequency, gain in zip(y.T, (10.0, 30.0), (0.5, 0.5), strict=False):
+        assert sine_and_cosine(column, frequency)[0] == pytest.approx(gain, abs=1e-3)
+    np.testing.assert_array_equal(y[:, 2:], x[:, 2:])  # at half the rate and above a column stays as it is
+    np.testing.assert_allclose(low_pass(x[:, 0], RATE, 10.0), y[:, 0], atol=1e-12)
+    np.testing.assert_allclose(low_pass(np.full(400, 3.0), RATE, 5.0), 3.0, rtol=1e-9)
+
+
+def test_central_difference_is_exact_inside_a_parabola():
+    x = np.column_stack([1.0 + 2.0 * T - 3.0 * T**2, -T])
+    v = central_difference(x, RATE)
+    np.testing.assert_allclose(v[1:-1], np.column_stack([2.0 - 6.0 * T, np.full(len(T), -1.0)])[1:-1], atol=1e-8)
+    # One-sided at the ends: the derivative half a sample away.
+    np.testing.assert_allclose(v[[0, -1], 0], 2.0 - 6.0 * (T[[0, -1]] + np.array([0.5, -0.5]) / RATE), atol=1e-8)
+
+
+def test_resampling_does_not_overshoot_and_holds_the_ends():
+    t = np.array([0.0, 0.1, 0.15, 0.4, 0.5])
+    x = np.array([0.0, 0.0, 1.0, 1.0, 0.5])
+    fine = np.linspace(0.0, 0.5, 501)
+    y = resample(t, x, fine)
+    np.testing.assert_allclose(resample(t, x, t), x, atol=1e-12)
+    assert y.min() >= 0.0 and y.max() <= 1.0
+    assert np.all(np.diff(y[100:151]) >= 0)
+    np.testing.assert_allclose(resample(t, x, np.array([-1.0, 9.0])), [0.0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(resample(t, np.outer(t, [2.0, -1.0]), fine), np.outer(fine, [2.0, -1.0]), atol=1e-12)

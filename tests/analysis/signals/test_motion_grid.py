@@ -1,0 +1,118 @@
+"""A motion on a grid, its folds and the efforts that a model expects of it, against motions that are known."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from motions import friction_everywhere, true_dynamics
+
+from dvrk_drake.analysis.signals.drive_efforts import drive_efforts
+from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, default_settings, motion_grid
+from dvrk_drake.analysis.signals.phase_folds import FOLDS, GAP, period_of, phase_folds
+from dvrk_drake.dynamics.dynamic_section import SignalSettings
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.recording import Recording
+
+ARM = load_arm("mtml")
+N = ARM.num_joints
+PERIOD = 4.0
+
+
+def motion(t):
+    """q, v, vd (m, n) inside the arm's limits, after 4 s the same again."""
+    middle, half = (ARM.position_upper + ARM.position_lower) / 2, (ARM.position_upper - ARM.position_lower) / 2
+    w, size = 2 * np.pi / PERIOD * np.array([1, 2, 1, 3, 2, 1, 2]), 0.3 * np.minimum(half, 1.0)
+    wt = w * t[:, None] + np.arange(N)
+    return middle + size * np.sin(wt), size * w * np.cos(wt), -size * w**2 * np.sin(wt)
+
+
+def recorded(seconds=12.0, rate=200.0):
+    t = 5.0 + np.arange(round(seconds * rate) + 1) / rate
+    q, v, vd = motion(t)
+    return Recording(q=q, qd=v, tau=vd, t=t, source="motion.csv")
+
+
+@pytest.fixture(scope="module")
+def grid():
+    return motion_grid(recorded(), ARM, default_settings(ARM))
+
+
+def test_positions_velocities_and_accelerations_are_the_motions(grid):
+    inner = slice(400, -400)
+    for found, true in zip((grid.q, grid.v, grid.vd), motion(grid.t), strict=True):
+        np.testing.assert_allclose(found[inner], true[inner], atol=0.02 * np.abs(true - true.mean(axis=0)).max())
+    assert grid.rate == pytest.approx(200.0)
+    np.testing.assert_allclose(np.diff(grid.t), 1 / GRID_RATE, atol=1e-9)
+    np.testing.assert_allclose(grid.row_times, 5.0 + np.arange(2401) / 200, atol=1e-9)
+    assert grid.inner == slice(200, 2201)  # a second is left out at each end
+
+
+def test_actuator_coordinates_give_the_same_grid(grid):
+    other = motion_grid(recorded().in_actuator_coordinates(ARM), ARM, default_settings(ARM))
+    np.testing.assert_allclose(other.q, grid.q, atol=1e-9)
+    np.testing.assert_allclose(other.vd, grid.vd, atol=1e-6)
+
+
+def test_what_explains_an_effort_is_late_by_its_delay(grid):
+    delays = [0.0, 0.004, -0.01, 0.0, 0.02, 0.0, 0.0]
+    settings = SignalSettings(50.0, [20.0] * N, 20.0, delays)
+    late = MotionGrid(ARM, settings, grid.t, grid.q, grid.v, grid.vd, grid.row_times, grid.rate)
+    lines = np.tile((grid.t - 5.0)[:, None], (1, N))
+    rows = late.efforts_at_rows(lines)[late.inner]
+    np.testing.assert_allclose(rows, grid.row_times[grid.inner, None] - 5.0 - np.array(delays), atol=1e-9)
+    # A straight line passes the low-pass as it is.
+    np.testing.assert_allclose(late.behind_filter(late.efforts_at_rows(lines)), rows, atol=1e-3)
+
+
+@pytest.mark.parametrize(("seconds", "rate"), [(4.9, 200.0), (12.0, 45.0)])
+def test_short_and_coarse_motions_are_refused(seconds, rate):
+    with pytest.raises(RecordingError, match=rf"motion\.csv: {seconds} s at {rate:g} Hz; .* at least 5 s at 50 Hz"):
+        motion_grid(recorded(seconds, rate), ARM, default_settings(ARM))
+
+
+# Folds
+
+
+def test_folds_of_a_motion_that_repeats_go_by_phase(grid):
+    assert period_of(grid) == pytest.approx(PERIOD, abs=1e-3)
+    fold, edge = phase_folds(grid, PERIOD)
+    t = grid.row_times[grid.inner]
+    # 200 rows a second, 800 a period: a row and the one a period later are in the same fold.
+    np.testing.assert_array_equal(fold[800:1600], fold[:800])
+    np.testing.assert_allclose(np.bincount(fold[:800]), 800 / FOLDS, atol=1)
+    phase = (t - t[0]) % PERIOD
+    since = phase - fold * PERIOD / FOLDS
+    rounding = 1e-6
+    assert np.all(edge[:, 0][since < GAP - rounding]) and not np.any(edge[:, 0][since > GAP + rounding])
+    until = PERIOD / FOLDS - since
+    assert np.all(edge[:, 1][until < GAP - rounding]) and not np.any(edge[:, 1][until > GAP + rounding])
+
+
+def test_folds_of_a_motion_that_does_not_repeat_are_stretches(grid):
+    fold, _ = phase_folds(grid, None, 5)
+    assert np.all(np.diff(fold) >= 0)
+    np.testing.assert_allclose(np.bincount(fold), len(fold) / 5, atol=1)
+    slow = SimpleNamespace(arm=ARM, q=np.linspace(0, 1, 4000)[:, None] * np.ones(N))
+    assert period_of(slow) is None
+
+
+# Efforts
+
+
+def test_parts_of_the_efforts_add_up_to_the_models(grid):
+    t = np.arange(0, 8, 1e-3)
+    effects = friction_everywhere(ARM, (t, *motion(t)))
+    model = true_dynamics(ARM, np.random.default_rng(0), effects)
+    efforts = drive_efforts(model, grid)
+    whole = grid.behind_filter(grid.efforts_at_rows(model.effort(grid.q, grid.v, grid.vd)))
+    size = np.sqrt(np.mean(whole**2, axis=0))
+    np.testing.assert_allclose(efforts.total() / size, whole / size, atol=1e-6)
+    parts = efforts.friction_part("dry") + efforts.friction_part("viscous")
+    np.testing.assert_allclose((efforts.other + parts) / size, whole / size, atol=1e-6)
+    # Viscous friction is proportional to the actuators' speeds.
+    speed = grid.behind_filter(grid.efforts_at_rows(ARM.transmission.velocity(grid.v)))
+    viscous = [effect.value for effect in effects if effect.kind == "viscous"]
+    np.testing.assert_allclose(efforts.friction_part("viscous") / size, speed * viscous / size, atol=1e-6)
+    assert set(efforts.friction) == {(effect.coordinate, part) for effect in effects for part in ("dry", "viscous")}
+    assert np.all(efforts.friction_part("dry").std(axis=0) > 0.1 * size)

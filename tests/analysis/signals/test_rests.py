@@ -1,0 +1,81 @@
+"""Rests of a motion and what is taken for poses, on motions that are made of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rests import motion_with_rests
+
+from dvrk_drake.analysis.signals.poses import find_poses
+from dvrk_drake.analysis.signals.rests import is_motion, rest_poses, smooth_velocity, stationary_runs
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.recording import Recording
+
+ARM = load_arm("psm")
+
+
+def moving(count=3, rest=0.5, travel=0.5):
+    generator = np.random.default_rng(0)
+    poses = ARM.sample_poses(count, generator, margin=0.1)
+    return poses, motion_with_rests(ARM, poses, generator, travel=travel, rest=rest)
+
+
+def test_runs_end_where_the_arm_moves_or_has_crept_away():
+    still = np.array([0, 1, 1, 1, 0, 1, 1, 0, 1, 1, 1, 1, 1, 1], bool)
+    q = np.zeros((14, 2))
+    q[11:, 1] = 0.2  # beyond `same` of the first row of the run
+    runs = [list(run) for run in stationary_runs(still, q, np.array([0.1, 0.1]), 3)]
+    assert runs == [[1, 2, 3], [8, 9, 10], [11, 12, 13]]
+    assert [list(run) for run in stationary_runs(still, q, np.array([0.1, 0.3]), 4)] == [[8, 9, 10, 11, 12, 13]]
+
+
+def test_velocities_are_smoothed_without_delay():
+    t = np.arange(1000) / 200
+    slow, fast = np.sin(2 * np.pi * t), 0.05 * np.sin(2 * np.pi * 60 * t)
+    for recording in (
+        Recording(q=slow[:, None], t=t),
+        Recording(q=slow[:, None], qd=(2 * np.pi * np.cos(2 * np.pi * t) + fast)[:, None], t=t),
+    ):
+        v = smooth_velocity(recording)[:, 0]
+        np.testing.assert_allclose(v[200:-200], (2 * np.pi * np.cos(2 * np.pi * t))[200:-200], atol=0.01)
+
+
+def test_rests_are_where_the_arm_was_put():
+    poses, recording = moving()
+    rests = rest_poses(recording, ARM)
+    np.testing.assert_allclose(rests.q, poses, atol=1e-3)
+    assert rests.t is None and rests.qd is None
+    # A rest of 0.25 s is none.
+    assert len(rest_poses(moving(rest=0.15)[1], ARM)) == 0
+
+
+def test_what_is_no_motion_has_no_rests():
+    _, recording = moving()
+    t = recording.t
+    assert is_motion(recording)
+    for other in (None, 20 * t, t[::-1], np.where(np.arange(len(t)) == 50, t[49], t)):
+        assert not is_motion(replace(recording, t=other))
+        assert rest_poses(replace(recording, t=other), ARM) is None
+    assert not is_motion(Recording(q=recording.q[:99], t=t[:99]))
+
+
+def test_poses_come_from_rests_or_are_left_as_they_are():
+    poses, recording = moving(count=12)
+    found = find_poses(recording, ARM)
+    np.testing.assert_allclose(found.recording.q, poses, atol=1e-3)
+    assert "12 poses at which the arm rests" in found.note and not found.moves
+    few = find_poses(moving(count=3)[1], ARM)
+    assert few.moves and few.measured is None and len(few.recording) > 100
+    slow = find_poses(moving(count=3)[1], ARM, take_slow_parts=True)
+    assert np.all(slow.measured.sum(axis=1) == 1) and slow.note
+    table = Recording(q=poses, tau=np.zeros_like(poses))
+    assert find_poses(table, ARM).recording is table
+
+
+def test_a_motion_whose_times_go_back_is_refused():
+    _, recording = moving()
+    t = recording.t.copy()
+    t[150] = t[148]
+    with pytest.raises(RecordingError, match="row 151: time t does not increase"):
+        find_poses(replace(recording, t=t), ARM)

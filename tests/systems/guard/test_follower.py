@@ -1,0 +1,176 @@
+"""What an arm does from period to period, by itself: how each mode begins, follows and ends."""
+
+import numpy as np
+import pytest
+from guard_bench import ARM, LIMIT, N, Q
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.systems.guard.follower import Follower
+from dvrk_drake.systems.guard.limits import GuardLimits
+from dvrk_drake.systems.guard.settings import GuardSettings
+
+LIMITS = GuardLimits(ARM, GuardSettings(following_time=0.1))
+E, STILL = np.eye(N), np.zeros(N)
+RANGE = ARM.position_upper - ARM.position_lower
+
+
+def at(q=Q):
+    follower = Follower(LIMITS)
+    follower.target = q.copy()
+    return follower
+
+
+def test_off_and_hold_give_neither_velocity_nor_effort():
+    follower = at()
+    for output, mode, position in ((follower.off(Q + 1), Command.OFF, Q + 1), (follower.hold(), Command.HOLD, Q)):
+        assert output.control_mode == mode
+        np.testing.assert_array_equal(output.position, position)
+        for zero in (output.velocity, output.effort, output.joint_flags):
+            np.testing.assert_array_equal(zero, STILL)
+            zero[:] = 1
+        output.position[:] = 9.0
+    np.testing.assert_array_equal(follower.hold().position, Q)
+    np.testing.assert_array_equal(follower.hold().velocity, STILL)
+    np.testing.assert_array_equal(follower.hold().effort, STILL)
+    assert np.all(Follower(LIMITS).hold().position == 0.0)
+
+
+@pytest.mark.parametrize("joint", range(N))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_near_is_within_the_start_position_of_every_joint(joint, side):
+    away = side * LIMITS.start_position[joint] * E[joint]
+    assert at().is_near(Q + 0.999 * away)
+    assert not at().is_near(Q + 1.001 * away)
+
+
+def test_what_is_exactly_as_far_as_allowed_is_near():
+    follower = at(STILL)
+    follower.begin_position()
+    assert follower.is_near(LIMITS.start_position)
+    assert follower.astray(LIMITS.following_error) == ""
+
+
+# Positions
+
+
+def test_a_target_moves_towards_the_command_at_its_rate():
+    follower = at()
+    follower.begin_position()
+    goal = Q + 0.02
+    for k in range(1, 4):
+        output = follower.follow_position(goal, STILL, 1e-3)
+        expected = np.minimum(k * 1e-3 * LIMITS.speed, 0.02)
+        np.testing.assert_allclose(output.position - Q, expected, atol=1e-12)
+        np.testing.assert_array_equal(follower.target, output.position)
+        np.testing.assert_array_equal(output.joint_flags != 0, expected < 0.02)
+    assert output.control_mode == Command.POSITION
+    np.testing.assert_array_equal(output.effort, STILL)
+    output = follower.follow_position(goal, 0.01 * LIMITS.speed, 1.0)
+    np.testing.assert_allclose(output.position, goal)
+    np.testing.assert_allclose(output.velocity, 0.01 * LIMITS.speed)
+    # Whoever changes the output does not change the target.
+    output.position[:] = 9.0
+    np.testing.assert_allclose(follower.hold().position, goal)
+
+
+@pytest.mark.parametrize("joint", range(N))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_joint_too_far_from_its_target_is_astray(joint, side):
+    follower = at()
+    follower.begin_position()
+    away = side * 0.15 * RANGE[joint] * E[joint]
+    assert follower.astray(Q + 0.999 * away) == ""
+    text = follower.astray(Q + 1.001 * away)
+    assert text.startswith(f"{ARM.joint_names[joint]} = ")
+    assert text.endswith(f"{0.15 * RANGE[joint]:.3g} away is allowed")
+    # The worst one is named.
+    other = (joint + 1) % N
+    assert follower.astray(Q + 1.1 * away + 0.5 * RANGE[other] * E[other]).startswith(ARM.joint_names[other])
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_an_arm_may_be_as_late_as_the_following_time(side):
+    """Between the target and a first order that follows it late, and the following error beyond either."""
+    follower, joint = at(), 4
+    follower.begin_position()
+    late, dt, error = Q[joint], 1e-3, 0.15 * RANGE[joint]
+    for _ in range(100):
+        target = follower.follow_position(Q + side * 9.0 * E[joint], STILL, dt).position[joint]
+        late += dt / 0.1 * (target - late)
+    assert side * (target - late) > 0.5 * error
+
+    def astray(position):
+        return follower.astray(Q + (position - Q[joint]) * E[joint])
+
+    assert astray(late - side * 0.999 * error) == astray(target + side * 0.999 * error) == astray(late) == ""
+    assert astray(late - side * 1.001 * error) and astray(target + side * 1.001 * error)
+    # A step longer than the following time brings the late one to the target, not beyond.
+    target = follower.follow_position(Q + side * 9.0 * E[joint], STILL, 0.2).position[joint]
+    assert astray(target - side * 0.999 * error) == ""
+    assert astray(target - side * 1.001 * error) and astray(target + side * 1.001 * error)
+
+
+def test_positions_that_begin_forget_how_late_the_arm_was():
+    follower = at()
+    follower.begin_position()
+    for _ in range(100):
+        follower.follow_position(Q + 9.0 * E[4], STILL, 1e-3)
+    target = follower.target
+    assert follower.astray(target - 1.2 * 0.15 * RANGE[4] * E[4]) == ""
+    follower.begin_position()
+    assert follower.astray(target - 1.01 * 0.15 * RANGE[4] * E[4])
+    np.testing.assert_array_equal(follower.target, target)
+
+
+# Efforts
+
+
+def test_efforts_begin_at_the_measured_ones_and_go_at_their_rate():
+    follower, measured = at(), LIMIT * [0.3, -0.3, 0.0, 1.2, -1.2, 0.1, 0.0]
+    follower.begin_effort(measured, Q, STILL)
+    start = np.clip(measured, -LIMIT, LIMIT)
+    np.testing.assert_allclose(follower.follow_effort(start, Q, STILL, 1e-3, 0.0).effort, start, atol=1e-12)
+    output = follower.follow_effort(start - 0.1 * LIMIT, Q, STILL, 1e-3, 0.5)
+    np.testing.assert_allclose(output.effort, np.maximum(start - 0.05 * LIMIT, -LIMIT), atol=1e-12)
+    output = follower.follow_effort(start - 0.1 * LIMIT, Q, STILL, 1e-3, 1.0)
+    np.testing.assert_allclose(output.effort, np.maximum(start - 0.1 * LIMIT, -LIMIT), atol=1e-12)
+    assert output.control_mode == Command.EFFORT
+    np.testing.assert_array_equal(output.position, Q)
+    np.testing.assert_array_equal(output.velocity, STILL)
+
+
+def test_commands_that_may_use_a_fraction_begin_at_it():
+    follower = Follower(GuardLimits(ARM, GuardSettings(effort_fraction=0.2)))
+    follower.begin_effort(0.25 * LIMIT, Q, STILL)
+    np.testing.assert_allclose(follower.follow_effort(LIMIT, Q, STILL, 1e-3, 0.0).effort, 0.2 * LIMIT)
+    follower.begin_effort(-0.25 * LIMIT, Q, STILL)
+    np.testing.assert_allclose(follower.follow_effort(-LIMIT, Q, STILL, 1e-3, 0.0).effort, -0.2 * LIMIT)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_wall_that_efforts_begin_inside_comes_on_gradually(side):
+    q = Q.copy()
+    q[0] = (ARM.position_upper if side > 0 else ARM.position_lower)[0]
+    push = side * 0.25 * LIMIT * E[0]
+    wall = LIMITS.restrain_effort(push, q, STILL)[0] - push
+    assert wall[0] == pytest.approx(-side * 1.25 * LIMIT[0])  # to all that the motor has, inward
+    follower = at(q)
+    follower.begin_effort(push, q, STILL)
+    for share in (0.0, 0.25, 0.5, 1.0):
+        output = follower.follow_effort(push, q, STILL, 1e-3, share)
+        np.testing.assert_allclose(output.effort, push + share * wall, atol=1e-12)
+        assert output.joint_flags[0] == Status.FLAG_POSITION_LIMIT
+    # What is taken back does not push an arm outward beyond its motors when it has left the wall.
+    inside = follower.follow_effort(side * LIMIT * E[0], Q, STILL, 1.0, 0.0)
+    np.testing.assert_allclose(inside.effort, side * LIMIT * E[0])
+
+
+def test_flags_of_commands_and_of_walls_come_together():
+    q = Q.copy()
+    q[0] = ARM.position_upper[0]
+    follower = at(q)
+    follower.begin_effort(STILL, q, STILL)
+    flags = follower.follow_effort(2 * LIMIT * E[0], q, STILL, 1e-3, 1.0).joint_flags
+    assert flags[0] == Status.FLAG_EFFORT_CLAMPED | Status.FLAG_RATE_LIMITED | Status.FLAG_POSITION_LIMIT
+    assert not np.any(flags[1:])

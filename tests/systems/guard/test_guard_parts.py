@@ -1,0 +1,228 @@
+"""Measurements, streams of commands and settings by themselves: the edges of what is accepted."""
+
+import numpy as np
+import pytest
+from guard_bench import ARM, SESSION, Bench, N
+
+from dvrk_drake.errors import StationError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.systems.guard.command_stream import CommandInForce, CommandStream, is_finite, refusal_by_itself
+from dvrk_drake.systems.guard.measurement import Measurement
+from dvrk_drake.systems.guard.settings import GuardSettings
+
+# Measurements
+
+GOOD = np.arange(3.0)
+
+
+def test_a_clock_tells_how_much_time_has_passed():
+    measured = Measurement(3, 20_000)
+    assert measured.utime is None and measured.q is None
+    assert measured.advance(5_000_000) == (0.0, "")
+    assert measured.advance(5_002_500) == (pytest.approx(2.5e-3), "")
+    assert measured.utime == 5_002_500
+    dt, problem = measured.advance(5_001_500)
+    assert dt == pytest.approx(-1e-3) and problem == "the arm's clock went back by 0.001000 s"
+    assert measured.advance(5_002_500) == (pytest.approx(1e-3), "")
+
+
+def test_a_clock_that_stands_still_is_noticed():
+    measured = Measurement(3, 20_000)
+    for k in range(25):
+        assert (measured.advance(1000)[1] == "the arm's clock stands still") == (k >= 10)
+    for k in range(12):  # after a step the count begins anew
+        assert (measured.advance(2000)[1] != "") == (k > 10)
+
+
+@pytest.mark.parametrize(("age", "good"), [(-1, False), (0, True), (20_000, True), (20_001, False)])
+def test_a_measurement_has_an_age(age, good):
+    measured = Measurement(3, 20_000)
+    assert measured.take(0, GOOD, GOOD, GOOD) == ""
+    problem = measured.take(age, GOOD + 1, GOOD + 2, GOOD + 3)
+    assert (problem == "") == good
+    if good:
+        for kept, told in ((measured.q, 1), (measured.v, 2), (measured.effort, 3)):
+            np.testing.assert_array_equal(kept, GOOD + told)
+    else:
+        assert measured.q is None and "allowed is 0 to 0.02 s" in problem
+
+
+@pytest.mark.parametrize("which", range(3))
+@pytest.mark.parametrize("bad", [np.zeros(2), np.zeros(4), np.zeros((1, 3)), [0, np.nan, 0], [1e6, 0, 0], [0, 0, -1e6]])
+def test_a_measurement_is_that_many_finite_numbers(which, bad):
+    measured = Measurement(3, 20_000)
+    measured.take(0, GOOD, GOOD, GOOD)
+    vectors = [GOOD, GOOD, GOOD]
+    vectors[which] = bad
+    assert measured.take(0, *vectors) == "the measured positions, velocities or efforts are not 3 finite numbers each"
+    assert measured.q is None
+
+
+def test_a_measurement_is_a_copy():
+    measured, q = Measurement(3, 20_000), GOOD.copy()
+    measured.take(0, q, q, q)
+    q[:] = 9.0
+    np.testing.assert_array_equal(measured.q, GOOD)
+
+
+@pytest.mark.parametrize(("number", "finite"), [(0.99e6, True), (1e6, False), (-1e6, False), (np.nan, False)])
+def test_numbers_below_a_million_are_finite(number, finite):
+    assert is_finite([0.0, number], [1.0]) == is_finite([1.0], [0.0, number]) == finite
+
+
+# Streams of commands
+
+MS = 1000
+
+
+class Stream:
+    """Commands of a sender whose clock reads what the arm's does, less a million seconds."""
+
+    def __init__(self, **fields):
+        self.stream = CommandStream(expiry=50 * MS, clock_tolerance=30 * MS, **fields)
+        self.sequence = 0
+
+    def send(self, utime, mode=Command.HOLD, *, sender=5, ahead=0, step=1, reset=False):
+        """Refusal, or what accepting it said, of a command that arrives at `utime`."""
+        self.sequence += step
+        command = Command()
+        command.sender_id, command.sequence, command.utime = sender, self.sequence, utime - 10**12 + ahead
+        command.control_mode, command.reset_fault = mode, reset
+        code = self.stream.refusal(command, utime)
+        return code if code else self.stream.accept(command, utime)
+
+
+@pytest.mark.parametrize(("silence", "code"), [(50 * MS, Status.REFUSAL_OTHER_SENDER), (50 * MS + 1, False)])
+def test_another_sender_must_wait_for_silence(silence, code):
+    stream = Stream()
+    assert stream.send(0) is False
+    assert stream.send(silence, sender=6) == code
+    assert stream.stream.sender_id == (5 if code else 6)
+    # A sender that is refused is heard all the same.
+    stream = Stream()
+    stream.send(0)
+    assert stream.send(40 * MS, step=0) == Status.REFUSAL_OUT_OF_ORDER
+    assert stream.send(80 * MS, sender=6) == Status.REFUSAL_OTHER_SENDER
+
+
+@pytest.mark.parametrize(
+    ("step", "code"), [(-1, Status.REFUSAL_OUT_OF_ORDER), (0, Status.REFUSAL_OUT_OF_ORDER), (1, 0)]
+)
+def test_commands_come_in_order(step, code):
+    stream = Stream()
+    stream.send(0)
+    assert stream.send(MS, step=step) == code
+
+
+@pytest.mark.parametrize(
+    ("ahead", "jumps"),
+    [(0, False), (30 * MS, False), (30 * MS + 1, True), (-30 * MS, False), (-30 * MS - 1, True), (-40 * MS, True)],
+)
+def test_a_senders_clock_goes_on_as_the_arms_does(ahead, jumps):
+    stream = Stream()
+    stream.send(0)
+    assert stream.send(40 * MS, ahead=ahead) == (Status.REFUSAL_CLOCK_JUMP if jumps else 0)
+    # What follows is compared with the clock as it is now.
+    assert stream.send(41 * MS, ahead=ahead) is False
+
+
+def test_a_senders_clock_that_stands_still_jumps():
+    stream = Stream()
+    stream.send(0)
+    assert stream.send(1, ahead=-1) == Status.REFUSAL_CLOCK_JUMP
+    assert stream.send(2, ahead=-1) is False
+
+
+def test_commands_that_are_missing_are_counted():
+    stream = Stream()
+    for k, step in enumerate((5, 1, 3, 1, 2)):
+        stream.send(k * MS, step=step)
+    assert stream.stream.lost == 2 + 1
+    stream.send(9 * MS, step=2**62)
+    stream.send(10 * MS, step=2**62)
+    assert stream.stream.lost == 2**63 - 1
+
+
+def test_off_follows_a_hold_of_the_same_sender():
+    stream = Stream()
+    assert stream.send(0, Command.OFF) == Status.REFUSAL_SUDDEN_OFF
+    for before, allowed in ((Command.EFFORT, False), (Command.POSITION, False), (Command.HOLD, True)):
+        stream = Stream()
+        stream.send(0, before)
+        assert stream.send(MS, Command.OFF) == (False if allowed else Status.REFUSAL_SUDDEN_OFF)
+    assert stream.send(2 * MS, Command.OFF) is False
+    stream.send(3 * MS, Command.HOLD)
+    assert stream.send(60 * MS, Command.OFF, sender=6) == Status.REFUSAL_SUDDEN_OFF
+
+
+def test_a_reset_is_a_change_from_false_to_true():
+    stream = Stream()
+    asked = [stream.send(k * MS, reset=reset) for k, reset in enumerate([True, True, False, True, True, False, True])]
+    assert asked == [False, False, False, True, False, False, True]
+    # Another sender's false does not count.
+    stream.send(8 * MS)
+    assert stream.send(60 * MS, sender=6, reset=True) is False
+
+
+def test_who_was_heard_can_be_forgotten():
+    stream = Stream()
+    stream.send(50 * MS)
+    stream.stream.forget()
+    assert stream.stream.sender_id == 0
+    # The clock went back: an older time, a lower sequence and another sender are all right now.
+    assert stream.send(0, Command.OFF, sender=6, step=-5) == Status.REFUSAL_SUDDEN_OFF
+    assert stream.send(MS, reset=True, sender=6) is False
+    assert stream.stream.lost == 0
+
+
+def test_the_command_in_force_has_numbers_of_its_own():
+    command = Bench().command(effort=np.ones(N))
+    force = CommandInForce()
+    force.take(command)
+    command.effort[:] = 9.0
+    np.testing.assert_array_equal(force.effort, np.ones(N))
+    np.testing.assert_array_equal(force.position, command.position)
+    np.testing.assert_array_equal(force.velocity, np.zeros(N))
+    assert force.status_utime == command.status_utime and force.command is command
+
+
+@pytest.mark.parametrize("mode", [Command.OFF, Command.HOLD, Command.POSITION, Command.EFFORT])
+@pytest.mark.parametrize("reset", [False, True])
+def test_only_a_hold_resets(mode, reset):
+    code = refusal_by_itself(Bench().command(mode, reset_fault=reset), ARM.name, N, SESSION)
+    assert code == (Status.REFUSAL_BAD_RESET if reset and mode != Command.HOLD else Status.REFUSAL_NONE)
+
+
+# Settings
+
+#: What a person may set. A change of a default or of a bound is a decision about safety, which this makes visible.
+SETTINGS = {
+    "expiry": (0.002, 0.05, 1.0),
+    "measurement_age": (0.001, 0.02, 0.1),
+    "start_time": (0.05, 0.25, 10.0),
+    "clock_tolerance": (0.001, 0.05, 1.0),
+    "start_effort": (0.001, 0.1, 0.25),
+    "margin": (0.001, 0.05, 0.3),
+    "margin_fraction": (0.001, 0.05, 0.25),
+    "effort_fraction": (0.01, 1.0, 1.0),
+    "effort_rise_time": (0.002, 0.02, 10.0),
+    "traverse_time": (0.1, 0.5, 100.0),
+    "following_error": (0.01, 0.15, 0.5),
+    "following_time": (0.01, 0.2, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_each_setting_has_a_default_and_bounds(name):
+    lowest, default, highest = SETTINGS[name]
+    assert getattr(GuardSettings(), name) == default
+    for value in (lowest, highest):
+        assert getattr(GuardSettings(**{name: value}), name) == value
+    for value in (np.nextafter(lowest, 0.0), np.nextafter(highest, np.inf), np.nan):
+        with pytest.raises(StationError, match=f"guard settings: {name} must be {lowest:g} to {highest:g}; got"):
+            GuardSettings(**{name: value})
+
+
+def test_every_setting_has_bounds():
+    assert set(vars(GuardSettings())) == set(SETTINGS)

@@ -1,0 +1,331 @@
+"""Limits by themselves: what they clamp, where walls and brakes begin, and that neither gives energy."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from guard_bench import ARM, LIMIT, N, Q
+
+from dvrk_drake.errors import StationError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm_schema import CoupledLimit
+from dvrk_drake.systems.guard.limits import GuardLimits
+from dvrk_drake.systems.guard.settings import GuardSettings
+
+A, LOWER, UPPER = ARM.limit_matrix()
+WIDTH = UPPER - LOWER
+KP, KD = np.array(ARM.gains.kp), np.array(ARM.gains.kd)
+LIMITS = GuardLimits(ARM, GuardSettings())
+E = np.eye(N)
+FREE, HALF = np.zeros(N), 0.5 * LIMIT
+
+
+def flagged(flags):
+    """The joints that have a flag, and the flags."""
+    return list(np.flatnonzero(flags)), set(int(flag) for flag in flags if flag)
+
+
+def test_limits_follow_from_the_arm_and_the_settings():
+    settings = GuardSettings(
+        start_effort=0.2,
+        margin=0.02,
+        margin_fraction=0.01,
+        effort_fraction=0.6,
+        effort_rise_time=0.1,
+        traverse_time=2.0,
+        following_error=0.3,
+        following_time=0.4,
+    )
+    limits = GuardLimits(ARM, settings)
+    np.testing.assert_allclose(limits.effort_limits, LIMIT)
+    np.testing.assert_allclose(limits.command_limits, 0.6 * LIMIT)
+    np.testing.assert_allclose(limits.start_effort, 0.2 * LIMIT)
+    np.testing.assert_allclose(limits.margin, np.minimum(0.02, 0.01 * WIDTH))
+    np.testing.assert_allclose(limits.start_position, limits.margin[:N])
+    np.testing.assert_allclose(limits.speed, WIDTH[:N] / 2.0)
+    np.testing.assert_allclose(limits.following_error, 0.3 * WIDTH[:N])
+    assert limits.following_time == 0.4
+    effort, _ = limits.follow_effort(LIMIT, FREE, 0.01)
+    np.testing.assert_allclose(effort, 0.1 * LIMIT)
+    assert limits.names == [*ARM.joint_names, "parallelogram"]
+
+
+@pytest.mark.parametrize("kp", [0.0, -1.0])
+def test_a_joint_that_nothing_holds_is_refused(kp):
+    gains = dataclasses.replace(ARM.gains, kp=[*ARM.gains.kp[:-1], kp])
+    with pytest.raises(StationError, match=r"MTML: all gains\.kp must be positive"):
+        GuardLimits(dataclasses.replace(ARM, gains=gains), GuardSettings())
+
+
+# Poses beyond the limits
+
+
+@pytest.mark.parametrize("row", range(N + 1))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_pose_is_beyond_from_half_of_the_margin_on(row, side):
+    joint = int(np.flatnonzero(A[row])[0])
+    bound = (LOWER if side < 0 else UPPER)[row]
+    q = Q.copy()
+    # The sum of shoulder and elbow has limits of its own, and stays inside of them unless they are in question.
+    elsewhere = {(1, 1): -0.6, (1, -1): 0.3, (2, 1): -0.1, (2, -1): 1.0, (N, -1): -0.6, (N, 1): 0.2}
+    if (row, side) in elsewhere:
+        q[1 if row == 2 else 2] = elsewhere[row, side]
+
+    def at(share):
+        pose = q.copy()
+        pose[joint] += bound + side * share * LIMITS.margin[row] - A[row] @ q
+        return LIMITS.beyond(pose)
+
+    assert at(-0.5) == at(0.0) == at(0.499) == ""
+    assert at(0.501).startswith(f"{LIMITS.names[row]} = ")
+    assert at(0.501).endswith(f" is beyond {LOWER[row]:.4g}..{UPPER[row]:.4g}")
+
+
+def test_the_worst_limit_is_named():
+    q = Q.copy()
+    q[4], q[6] = UPPER[4] + 0.6 * LIMITS.margin[4], LOWER[6] - 0.7 * LIMITS.margin[6]
+    assert LIMITS.beyond(q).startswith("wrist_roll = ")
+    q[4] += 0.2 * LIMITS.margin[4]
+    assert LIMITS.beyond(q).startswith("wrist_pitch = ")
+
+
+# The start
+
+
+def start(mode, q=Q, measured=HALF, **fields):
+    command = Command()
+    command.control_mode = mode
+    command.position, command.velocity, command.effort = list(Q), [0.0] * N, list(HALF)
+    for name, value in fields.items():
+        setattr(command, name, list(value))
+    return LIMITS.refusal_to_start(command, q, measured)
+
+
+@pytest.mark.parametrize("joint", range(N))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_efforts_start_near_the_measured_ones_only(joint, side):
+    far = side * 0.1 * LIMIT[joint] * E[joint]
+    assert start(Command.EFFORT, effort=HALF + 0.99 * far) == Status.REFUSAL_NONE
+    assert start(Command.EFFORT, effort=HALF + 1.01 * far) == Status.REFUSAL_START_FAR
+    # Nor where the present effort is more than commands may be and than they may start beside.
+    most = side * LIMIT * E[joint]
+    assert start(Command.EFFORT, measured=1.09 * most, effort=1.05 * most) == Status.REFUSAL_NONE
+    assert start(Command.EFFORT, measured=1.11 * most, effort=1.05 * most) == Status.REFUSAL_START_FAR
+    outside = Q + (UPPER[joint] + LIMITS.margin[joint] - Q[joint]) * E[joint]
+    assert start(Command.EFFORT, q=outside) == Status.REFUSAL_START_OUTSIDE
+
+
+@pytest.mark.parametrize("joint", range(N))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_positions_start_near_the_measured_ones_only(joint, side):
+    far = side * LIMITS.margin[joint] * E[joint]
+    lead = KP[joint] / KD[joint] * far  # a velocity that leads as far
+    assert start(Command.POSITION, position=Q + 0.99 * far) == Status.REFUSAL_NONE
+    assert start(Command.POSITION, position=Q + 1.01 * far) == Status.REFUSAL_START_FAR
+    assert start(Command.POSITION, velocity=0.99 * lead) == Status.REFUSAL_NONE
+    assert start(Command.POSITION, velocity=1.01 * lead) == Status.REFUSAL_START_FAR
+    # Together they count where they lead the same way, and neither makes up for the other.
+    assert start(Command.POSITION, position=Q + 0.6 * far, velocity=0.3 * lead) == Status.REFUSAL_NONE
+    assert start(Command.POSITION, position=Q + 0.6 * far, velocity=0.6 * lead) == Status.REFUSAL_START_FAR
+    assert start(Command.POSITION, position=Q + 0.6 * far, velocity=-0.6 * lead) == Status.REFUSAL_NONE
+    assert start(Command.POSITION, position=Q + 1.1 * far, velocity=-0.6 * lead) == Status.REFUSAL_START_FAR
+    # Positions may start outside the limits, to come back, and whatever the effort is.
+    outside = Q + 9.0 * E[joint]
+    assert start(Command.POSITION, q=outside, position=outside, measured=2 * LIMIT) == Status.REFUSAL_NONE
+
+
+def test_a_start_exactly_as_far_as_allowed_is_near():
+    measured = LIMITS.command_limits + LIMITS.start_effort
+    assert start(Command.EFFORT, measured=FREE, effort=LIMITS.start_effort) == Status.REFUSAL_NONE
+    assert start(Command.EFFORT, measured=measured, effort=measured) == Status.REFUSAL_NONE
+    assert start(Command.POSITION, q=FREE, position=LIMITS.start_position) == Status.REFUSAL_NONE
+
+
+# Efforts
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_efforts_go_at_their_rate_to_what_is_clamped(sign):
+    command = sign * LIMIT * np.array([0.2, 1.0, 1.5, 0.04, 0.0, 3.0, -2.0])
+    effort, flags = LIMITS.follow_effort(command, FREE, 1e-3)
+    np.testing.assert_allclose(effort, sign * LIMIT * [0.05, 0.05, 0.05, 0.04, 0.0, 0.05, -0.05])
+    clamped, late = Status.FLAG_EFFORT_CLAMPED, Status.FLAG_RATE_LIMITED
+    both = clamped | late
+    np.testing.assert_array_equal(flags, [late, late, both, 0, 0, both, both])
+    effort, flags = LIMITS.follow_effort(command, sign * LIMIT * [0.19, 0.99, 1, 0.04, 0, 1, -1], 1e-3)
+    np.testing.assert_allclose(effort, sign * LIMIT * [0.2, 1.0, 1.0, 0.04, 0.0, 1.0, -1.0])
+    np.testing.assert_array_equal(flags, [0, 0, clamped, 0, 0, clamped, clamped])
+    np.testing.assert_array_equal(LIMITS.follow_effort(command, HALF, 0.0)[0], HALF)
+
+
+@pytest.mark.parametrize("joint", range(N))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_joint_that_is_too_fast_is_braked(joint, side):
+    limits = GuardLimits(ARM, GuardSettings(traverse_time=50.0))  # so slow that no wall is met early
+    push, speed = side * LIMIT * E[joint], side * limits.speed * E[joint]
+    for share, left in ((0.0, 1.0), (1.0, 1.0), (1.125, 0.5), (1.25, 0.0), (1.375, -0.5), (1.5, -1.0), (3.0, -1.0)):
+        effort, flags = limits.restrain_effort(push, Q, share * speed)
+        np.testing.assert_allclose(effort, left * push, atol=1e-12)
+        assert flagged(flags) == (([joint], {Status.FLAG_SPEED_LIMIT}) if share > 1 else ([], set()))
+    # It brakes what is too fast by itself, with up to all that the motor has.
+    np.testing.assert_allclose(limits.restrain_effort(FREE, Q, 1.1 * speed)[0], -0.4 * push, atol=1e-12)
+    np.testing.assert_allclose(limits.restrain_effort(FREE, Q, 9.0 * speed)[0], -push, atol=1e-12)
+
+
+def test_the_stiffness_of_walls_is_limited():
+    """One period late, a stiffer wall would chatter; a softer one would be wider than it need be."""
+    motors = [max(LIMIT[row != 0] / np.abs(row[row != 0])) for row in A]
+    stiffness = 2 * np.array(motors)[:, None] * A**2 / LIMITS.wall_width[:, None] / KP
+    assert np.all(stiffness <= 4.0 * (1 + 1e-9))
+    assert np.all(LIMITS.wall_width >= np.minimum(0.05, 0.05 * WIDTH))
+    wider = LIMITS.wall_width > np.minimum(0.05, 0.05 * WIDTH) * (1 + 1e-9)
+    np.testing.assert_allclose(stiffness.max(axis=1)[wider], 4.0)
+
+
+@pytest.mark.parametrize("row", range(N + 1))
+def test_a_wall_is_passive(row):
+    """Work over closed paths through the wall, of the limit's own coordinate, at several speeds."""
+    a = A[row] / (A[row] @ A[row])
+    middle = Q + (0.5 * (LOWER + UPPER)[row] - A[row] @ Q) * a
+    amplitude = 0.5 * WIDTH[row]
+    phase = np.linspace(0, 2 * np.pi, 401)
+    for rate in (0.0, 1.0, 5.0):
+        c, dc = amplitude * np.sin(phase), amplitude * rate * np.cos(phase)
+        force = []
+        for x, dx in zip(c, dc, strict=True):
+            wall = LIMITS.restrain_effort(FREE, middle + x * a, dx * a)[0]
+            force.append(wall @ a)
+        force = np.array(force)
+        work = np.sum(0.5 * (force[1:] + force[:-1]) * np.diff(c))
+        size = np.sum(np.abs(0.5 * (force[1:] + force[:-1]) * np.diff(c)))
+        assert size > 0
+        assert work <= 1e-9 * size
+        if rate:
+            assert work < -1e-3 * size
+
+
+# Positions
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_targets_go_at_their_rate_and_stop_at_the_limits(sign):
+    step = LIMITS.speed * 1e-3
+    command = Q + sign * step * [0.5, 0.5, 0.0, 1.0, 2.0, 0.0, 90.0]
+    target, flags = LIMITS.limit_position(command, Q, 1e-3)
+    np.testing.assert_allclose(target - Q, sign * step * [0.5, 0.5, 0.0, 1.0, 1.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_array_equal(flags[[0, 1, 2, 5]], 0)
+    np.testing.assert_array_equal(flags[[4, 6]], Status.FLAG_RATE_LIMITED)
+    near = Q.copy()
+    bound = UPPER[5] if sign > 0 else LOWER[5]
+    near[5] = bound - sign * 0.5 * step[5]
+    target, flags = LIMITS.limit_position(near + sign * step * E[5], near, 1e-3)
+    assert target[5] == bound
+    assert flags[5] & Status.FLAG_POSITION_LIMIT
+    assert not np.any(np.delete(flags, 5))
+    np.testing.assert_array_equal(np.delete(target, 5), np.delete(Q, 5))
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_joints_of_a_coupled_limit_stop_on_it_together(side):
+    bound = (UPPER if side > 0 else LOWER)[N]
+    last = Q.copy()
+    last[1:3] = bound / 2 - side * 0.001
+    wanted = last + side * np.array([0.001, 0.003, 0.001, 0.0, 0.0, 0.0, 0.001])
+    target, flags = LIMITS.limit_position(wanted, last, 0.01)
+    # A half of their way leads them to the limit; the other joints go all of theirs.
+    np.testing.assert_allclose(target - last, side * np.array([0.001, 0.0015, 0.0005, 0, 0, 0, 0.001]), atol=1e-12)
+    np.testing.assert_array_equal(flags, np.where(A[N] != 0, Status.FLAG_COUPLED_LIMIT, 0))
+    # Along the limit, and away from it, they are free.
+    for change in ([0.0, 0.002, -0.002], [0.0, -side * 0.002, 0.0]):
+        on = target + np.array([*change, 0, 0, 0, 0])
+        moved, flags = LIMITS.limit_position(on, target, 0.01)
+        np.testing.assert_allclose(moved, on, atol=1e-9)
+
+
+def test_a_target_outside_comes_back_and_goes_no_further_out():
+    last = Q.copy()
+    last[5] = UPPER[5] + 0.1
+    out, flags = LIMITS.limit_position(last + 0.01 * E[5], last, 0.1)
+    assert out[5] == last[5] and flags[5] & Status.FLAG_POSITION_LIMIT
+    back, flags = LIMITS.limit_position(last - 0.01 * E[5], last, 0.1)
+    assert back[5] == pytest.approx(last[5] - 0.01) and not np.any(flags)
+
+
+def coupled(*limits):
+    """The arm with other coupled limits; joints differ in effort and in Kd/Kp."""
+    gains = dataclasses.replace(ARM.gains, kd=list(KP * np.linspace(0.05, 0.2, N)))
+    return dataclasses.replace(ARM, coupled_limits=limits, effort_limits=LIMIT * np.linspace(1, 2, N), gains=gains)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_wall_outweighs_every_motor_that_pushes_on_it(side):
+    yaw, pitch = ARM.joint_names[0], ARM.joint_names[4]
+    arm = coupled(CoupledLimit("cable", {yaw: -2.0, pitch: 0.5}, -0.5, 0.5))
+    limits = GuardLimits(arm, GuardSettings(traverse_time=100.0, margin=0.001))
+    a, effort = arm.limit_matrix()[0][N], arm.effort_limits
+    joints = np.flatnonzero(a)
+    motor = max(effort[joints] / np.abs(a[joints]))
+    assert limits.wall_width[N] == pytest.approx(max(2 * motor * a**2 / (4 * np.array(arm.gains.kp))))
+    push = side * np.sign(a) * effort
+
+    def pushed(depth, rate=0.0):
+        q = Q + (side * (0.5 + (depth - 1) * limits.wall_width[N]) - a @ Q) / (a @ a) * a
+        return limits.restrain_effort(push, q, rate * side * a / (a @ a))
+
+    np.testing.assert_allclose(pushed(-0.01)[0], push)
+    applied, flags = pushed(0.3)
+    np.testing.assert_allclose(applied, np.clip(push - 0.6 * side * motor * a, -effort, effort))
+    assert flagged(flags) == (list(joints), {Status.FLAG_COUPLED_LIMIT})
+    assert np.all((pushed(0.5)[0] * push)[joints] <= 1e-12)
+    np.testing.assert_allclose(pushed(1.0)[0], -push)
+    # What comes fast is met earlier, by the largest Kd/Kp of these joints.
+    seconds = max((np.array(arm.gains.kd) / np.array(arm.gains.kp))[joints])
+    rate = 1e-3
+    np.testing.assert_allclose(
+        pushed(0.3, rate)[0], pushed(0.3 + seconds * rate / limits.wall_width[N])[0], rtol=1e-9, atol=1e-12
+    )
+
+
+def test_coupled_limits_that_undo_one_another_stop_the_target():
+    yaw, shoulder, elbow = ARM.joint_names[:3]
+    first = CoupledLimit("first", {shoulder: 1.0, elbow: 1.0}, -1.0, Q[1] + Q[2])
+    second = CoupledLimit("second", {shoulder: 1.0, yaw: 1.0}, Q[0] + Q[1], 2.0)
+    limits = GuardLimits(coupled(first, second), GuardSettings())
+    # The shoulder makes room for the elbow, but the second limit does not let it.
+    wanted = Q + np.array([-0.001, -0.001, 0.001, 0.001, 0.0, 0.0, 0.0])
+    last = Q.copy()
+    target, flags = limits.limit_position(wanted, last, 0.01)
+    np.testing.assert_array_equal(target, Q)
+    assert target is not last
+    assert np.all(flags[[0, 1]] == Status.FLAG_COUPLED_LIMIT)
+    # Each of them alone lets the target go on.
+    for alone in (first, second):
+        limits = GuardLimits(coupled(alone), GuardSettings())
+        assert limits.limit_position(wanted, Q, 0.01)[0][3] == pytest.approx(Q[3] + 0.001)
+
+
+# Feed-forward velocities
+
+
+@pytest.mark.parametrize("joint", [0, 3, 4, 5, 6])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_velocity_leads_to_the_limit_and_no_further(joint, side):
+    none = np.zeros(N, np.int8)
+    fast = side * 99.0 * E[joint]
+    np.testing.assert_allclose(LIMITS.limit_velocity(fast, Q, none), side * LIMITS.speed * E[joint])
+    slow = side * 0.5 * LIMITS.speed * E[joint]
+    np.testing.assert_array_equal(LIMITS.limit_velocity(slow, Q, none), slow)
+    bound = (UPPER if side > 0 else LOWER)[joint]
+    lead = KD[joint] / KP[joint] * LIMITS.speed[joint]
+    for share in (0.5, 0.25, 0.0):
+        target = Q + (bound - side * share * lead - Q[joint]) * E[joint]
+        velocity = LIMITS.limit_velocity(fast, target, none)
+        np.testing.assert_allclose(velocity, share * side * LIMITS.speed * E[joint], atol=1e-9)
+        np.testing.assert_array_equal(LIMITS.limit_velocity(-slow, target, none), -slow)  # inward
+
+
+def test_no_velocity_where_the_position_is_not_followed():
+    flags = np.array([0, 1, 2, 4, 8, 16, 0], np.int8)
+    velocity = 0.1 * LIMITS.speed
+    np.testing.assert_array_equal(LIMITS.limit_velocity(velocity, Q, flags), np.where(flags == 0, velocity, 0.0))
