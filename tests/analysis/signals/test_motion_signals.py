@@ -39,7 +39,7 @@ def recorded(at, t=None):
 def test_gain_and_lag_of_recorded_velocities_are_found(gain, lag):
     t = np.arange(3000) / RATE
     found = velocity_agreement(motion(t)[0], gain * motion(t - lag)[1], RATE)
-    np.testing.assert_allclose(found.gain, gain, rtol=0.01)
+    np.testing.assert_allclose(found.gain, gain, rtol=0.01, atol=1e-12)
     np.testing.assert_allclose(found.lag, lag, atol=5e-4)
     assert np.all(found.mismatch < 0.01)
     assert np.all(found.agrees == (gain == 1.0 and lag == 0.0))
@@ -144,14 +144,14 @@ def test_a_delay_of_the_efforts_is_found(lag):
     assert np.all(found.determined == (lag != 0.0))
     assert np.all(found.standard_error < 1e-3)
     # Away from its own time a step of friction is not fitted fully.
-    np.testing.assert_allclose(found.coulomb, 0.3, rtol=0.02 if lag == 0.0 else 0.5)
+    np.testing.assert_allclose(found.coulomb, 0.3, rtol=0.02 if lag == 0.0 else 0.5, atol=1e-12)
     assert np.all(found.gain >= 1.0)
 
 
 def test_friction_of_efforts_with_the_wrong_sign_is_negative():
     signals = delayed(0.0)
     found = effort_lag(replace(signals, tau=-signals.tau), np.ones(3, bool))
-    np.testing.assert_allclose(found.coulomb, -0.3, rtol=0.02)
+    np.testing.assert_allclose(found.coulomb, -0.3, rtol=0.02, atol=1e-12)
     assert np.all(np.abs(found.coulomb) > 5 * found.coulomb_error)
 
 

@@ -49,8 +49,10 @@ def test_spectra_separate_noise_from_signal(period):
     x = signal + deviation * np.random.default_rng(3).normal(size=(len(T), 2))
     of = spectra(x, RATE, period)
     # White noise of variance s^2 has the density 2 s^2 / rate, and a density sums up to the variance.
-    np.testing.assert_allclose(np.median(of.noise, axis=0), 2 * deviation**2 / RATE, rtol=0.15)
-    np.testing.assert_allclose(np.sum(of.signal, axis=0) * of.frequency[1], np.var(signal, axis=0), rtol=0.1)
+    np.testing.assert_allclose(np.median(of.noise, axis=0), 2 * deviation**2 / RATE, rtol=0.15, atol=1e-12)
+    np.testing.assert_allclose(
+        np.sum(of.signal, axis=0) * of.frequency[1], np.var(signal, axis=0), rtol=0.1, atol=1e-12
+    )
 
 
 def test_the_cut_off_is_where_noise_begins():

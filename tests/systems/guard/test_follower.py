@@ -67,11 +67,11 @@ def test_a_target_moves_towards_the_command_at_its_rate():
     assert output.control_mode == Command.POSITION
     np.testing.assert_array_equal(output.effort, STILL)
     output = follower.follow_position(goal, 0.01 * LIMITS.speed, 1.0)
-    np.testing.assert_allclose(output.position, goal)
-    np.testing.assert_allclose(output.velocity, 0.01 * LIMITS.speed)
+    np.testing.assert_allclose(output.position, goal, atol=1e-12)
+    np.testing.assert_allclose(output.velocity, 0.01 * LIMITS.speed, atol=1e-12)
     # Whoever changes the output does not change the target.
     output.position[:] = 9.0
-    np.testing.assert_allclose(follower.hold().position, goal)
+    np.testing.assert_allclose(follower.hold().position, goal, atol=1e-12)
 
 
 @pytest.mark.parametrize("joint", range(N))
@@ -143,9 +143,9 @@ def test_efforts_begin_at_the_measured_ones_and_go_at_their_rate():
 def test_commands_that_may_use_a_fraction_begin_at_it():
     follower = Follower(GuardLimits(ARM, GuardSettings(effort_fraction=0.2)))
     follower.begin_effort(0.25 * LIMIT, Q, STILL)
-    np.testing.assert_allclose(follower.follow_effort(LIMIT, Q, STILL, 1e-3, 0.0).effort, 0.2 * LIMIT)
+    np.testing.assert_allclose(follower.follow_effort(LIMIT, Q, STILL, 1e-3, 0.0).effort, 0.2 * LIMIT, atol=1e-12)
     follower.begin_effort(-0.25 * LIMIT, Q, STILL)
-    np.testing.assert_allclose(follower.follow_effort(-LIMIT, Q, STILL, 1e-3, 0.0).effort, -0.2 * LIMIT)
+    np.testing.assert_allclose(follower.follow_effort(-LIMIT, Q, STILL, 1e-3, 0.0).effort, -0.2 * LIMIT, atol=1e-12)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -163,7 +163,7 @@ def test_a_wall_that_efforts_begin_inside_comes_on_gradually(side):
         assert output.joint_flags[0] == Status.FLAG_POSITION_LIMIT
     # What is taken back does not push an arm outward beyond its motors when it has left the wall.
     inside = follower.follow_effort(side * LIMIT * E[0], Q, STILL, 1.0, 0.0)
-    np.testing.assert_allclose(inside.effort, side * LIMIT * E[0])
+    np.testing.assert_allclose(inside.effort, side * LIMIT * E[0], atol=1e-12)
 
 
 def test_flags_of_commands_and_of_walls_come_together():

@@ -38,16 +38,16 @@ def test_limits_follow_from_the_arm_and_the_settings():
         following_time=0.4,
     )
     limits = GuardLimits(ARM, settings)
-    np.testing.assert_allclose(limits.effort_limits, LIMIT)
-    np.testing.assert_allclose(limits.command_limits, 0.6 * LIMIT)
-    np.testing.assert_allclose(limits.start_effort, 0.2 * LIMIT)
-    np.testing.assert_allclose(limits.margin, np.minimum(0.02, 0.01 * WIDTH))
-    np.testing.assert_allclose(limits.start_position, limits.margin[:N])
-    np.testing.assert_allclose(limits.speed, WIDTH[:N] / 2.0)
-    np.testing.assert_allclose(limits.following_error, 0.3 * WIDTH[:N])
+    np.testing.assert_allclose(limits.effort_limits, LIMIT, atol=1e-12)
+    np.testing.assert_allclose(limits.command_limits, 0.6 * LIMIT, atol=1e-12)
+    np.testing.assert_allclose(limits.start_effort, 0.2 * LIMIT, atol=1e-12)
+    np.testing.assert_allclose(limits.margin, np.minimum(0.02, 0.01 * WIDTH), atol=1e-12)
+    np.testing.assert_allclose(limits.start_position, limits.margin[:N], atol=1e-12)
+    np.testing.assert_allclose(limits.speed, WIDTH[:N] / 2.0, atol=1e-12)
+    np.testing.assert_allclose(limits.following_error, 0.3 * WIDTH[:N], atol=1e-12)
     assert limits.following_time == 0.4
     effort, _ = limits.follow_effort(LIMIT, FREE, 0.01)
-    np.testing.assert_allclose(effort, 0.1 * LIMIT)
+    np.testing.assert_allclose(effort, 0.1 * LIMIT, atol=1e-12)
     assert limits.names == [*ARM.joint_names, "parallelogram"]
 
 
@@ -149,12 +149,12 @@ def test_a_start_exactly_as_far_as_allowed_is_near():
 def test_efforts_go_at_their_rate_to_what_is_clamped(sign):
     command = sign * LIMIT * np.array([0.2, 1.0, 1.5, 0.04, 0.0, 3.0, -2.0])
     effort, flags = LIMITS.follow_effort(command, FREE, 1e-3)
-    np.testing.assert_allclose(effort, sign * LIMIT * [0.05, 0.05, 0.05, 0.04, 0.0, 0.05, -0.05])
+    np.testing.assert_allclose(effort, sign * LIMIT * [0.05, 0.05, 0.05, 0.04, 0.0, 0.05, -0.05], atol=1e-12)
     clamped, late = Status.FLAG_EFFORT_CLAMPED, Status.FLAG_RATE_LIMITED
     both = clamped | late
     np.testing.assert_array_equal(flags, [late, late, both, 0, 0, both, both])
     effort, flags = LIMITS.follow_effort(command, sign * LIMIT * [0.19, 0.99, 1, 0.04, 0, 1, -1], 1e-3)
-    np.testing.assert_allclose(effort, sign * LIMIT * [0.2, 1.0, 1.0, 0.04, 0.0, 1.0, -1.0])
+    np.testing.assert_allclose(effort, sign * LIMIT * [0.2, 1.0, 1.0, 0.04, 0.0, 1.0, -1.0], atol=1e-12)
     np.testing.assert_array_equal(flags, [0, 0, clamped, 0, 0, clamped, clamped])
     np.testing.assert_array_equal(LIMITS.follow_effort(command, HALF, 0.0)[0], HALF)
 
@@ -180,7 +180,7 @@ def test_the_stiffness_of_walls_is_limited():
     assert np.all(stiffness <= 4.0 * (1 + 1e-9))
     assert np.all(LIMITS.wall_width >= np.minimum(0.05, 0.05 * WIDTH))
     wider = LIMITS.wall_width > np.minimum(0.05, 0.05 * WIDTH) * (1 + 1e-9)
-    np.testing.assert_allclose(stiffness.max(axis=1)[wider], 4.0)
+    np.testing.assert_allclose(stiffness.max(axis=1)[wider], 4.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("row", range(N + 1))
@@ -273,12 +273,12 @@ def test_a_wall_outweighs_every_motor_that_pushes_on_it(side):
         q = Q + (side * (0.5 + (depth - 1) * limits.wall_width[N]) - a @ Q) / (a @ a) * a
         return limits.restrain_effort(push, q, rate * side * a / (a @ a))
 
-    np.testing.assert_allclose(pushed(-0.01)[0], push)
+    np.testing.assert_allclose(pushed(-0.01)[0], push, atol=1e-12)
     applied, flags = pushed(0.3)
-    np.testing.assert_allclose(applied, np.clip(push - 0.6 * side * motor * a, -effort, effort))
+    np.testing.assert_allclose(applied, np.clip(push - 0.6 * side * motor * a, -effort, effort), atol=1e-12)
     assert flagged(flags) == (list(joints), {Status.FLAG_COUPLED_LIMIT})
     assert np.all((pushed(0.5)[0] * push)[joints] <= 1e-12)
-    np.testing.assert_allclose(pushed(1.0)[0], -push)
+    np.testing.assert_allclose(pushed(1.0)[0], -push, atol=1e-12)
     # What comes fast is met earlier, by the largest Kd/Kp of these joints.
     seconds = max((np.array(arm.gains.kd) / np.array(arm.gains.kp))[joints])
     rate = 1e-3
@@ -313,7 +313,7 @@ def test_coupled_limits_that_undo_one_another_stop_the_target():
 def test_a_velocity_leads_to_the_limit_and_no_further(joint, side):
     none = np.zeros(N, np.int8)
     fast = side * 99.0 * E[joint]
-    np.testing.assert_allclose(LIMITS.limit_velocity(fast, Q, none), side * LIMITS.speed * E[joint])
+    np.testing.assert_allclose(LIMITS.limit_velocity(fast, Q, none), side * LIMITS.speed * E[joint], atol=1e-12)
     slow = side * 0.5 * LIMITS.speed * E[joint]
     np.testing.assert_array_equal(LIMITS.limit_velocity(slow, Q, none), slow)
     bound = (UPPER if side > 0 else LOWER)[joint]

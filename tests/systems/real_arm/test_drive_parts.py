@@ -19,7 +19,7 @@ INVERSE = ARM.transmission.inverse()  # joints from actuators
 
 @pytest.mark.parametrize(("value", "step", "expected"), [(0.34, 0.1, 0.3), (-0.36, 0.1, -0.4), (0.34, 0.0, 0.34)])
 def test_a_value_is_counted_in_whole_steps(value, step, expected):
-    assert in_steps(value, step) == pytest.approx(expected, abs=1e-15)
+    assert in_steps(value, step) == pytest.approx(expected, abs=1e-12)
 
 
 def test_motors_clamp_step_and_saturate_in_this_order():
@@ -29,13 +29,13 @@ def test_motors_clamp_step_and_saturate_in_this_order():
     motors = Motors(ARM, effects, limits)
     inside = np.linspace(-0.2, 0.2, N)
     free = Motors(ARM, ArmEffects(), limits)
-    np.testing.assert_allclose(free.effort(inside), INVERSE.pull_back_effort(inside), atol=1e-15)
+    np.testing.assert_allclose(free.effort(inside), INVERSE.pull_back_effort(inside), atol=1e-12)
     # Beyond the joints' limits nothing more comes.
-    np.testing.assert_allclose(free.effort(np.full(N, 9.0)), INVERSE.pull_back_effort(limits), atol=1e-15)
+    np.testing.assert_allclose(free.effort(np.full(N, 9.0)), INVERSE.pull_back_effort(limits), atol=1e-12)
     # 0.33 is three steps, of which the motor has 0.25; the second has 0.3, all others what was commanded.
     command = ARM.transmission.pull_back_effort(np.array([0.33, -0.33, *[0.05] * (N - 2)]))
     assert np.all(np.abs(command) <= limits)
-    np.testing.assert_allclose(motors.effort(command), [0.25, -0.3, *[0.05] * (N - 2)], atol=1e-15)
+    np.testing.assert_allclose(motors.effort(command), [0.25, -0.3, *[0.05] * (N - 2)], atol=1e-12)
 
 
 # Sensors
@@ -90,12 +90,12 @@ def test_encoders_count_and_differentiate():
     positions = [0.0, 0.24, 0.26, 0.76, 0.8]
     counted = np.array([0.0, 0.0, 0.5, 1.0, 1.0])
     path = measure(positions, 0.5, decay=0.25)
-    np.testing.assert_allclose(path[:, 0], counted, atol=1e-15)
+    np.testing.assert_allclose(path[:, 0], counted, atol=1e-12)
     v, expected = 0.0, []
     for change in np.diff(counted, prepend=0.0):
         v = 0.25 * v + 0.75 * change / 0.5
         expected.append(v)
-    np.testing.assert_allclose(path[:, 1], expected, atol=1e-15)
+    np.testing.assert_allclose(path[:, 1], expected, atol=1e-12)
     # Without an encoder both are exact.
     np.testing.assert_array_equal(measure(positions, 0.5, decay=-1.0), np.column_stack([positions, [7.0] * 5]))
 
