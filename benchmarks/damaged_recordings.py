@@ -1,10 +1,10 @@
 """What `identify` does with damaged recordings: `python benchmarks/damaged_recordings.py FOLDER [NAME ...]`.
 
 Every damage is made on its own in mtm_one.csv (MTMR) and psm_one.csv (PSM) of FOLDER, see docs/public_recordings.md, or
-in the NAMEd ones of them. A recording that is refused gives no model. Otherwise the model is identified and compared
-with the undamaged motion. The outcome is "harmless" if the error of no actuator rises by more than half and by five
-percent of its effort, and "noted" if it does and the check states that an offset of this joint does not show.
-The undamaged recordings of the folder must be accepted without a finding about their channels.
+in the NAMEd ones of them. Without a refusal or a warning, the model is identified from it and compared with the
+undamaged motion. The outcome is "harmless" unless the error of an actuator rises by more than half and by five percent
+of its effort. It is "noted" if it does, and the check states that an offset of this joint does not show. The undamaged
+recordings of the folder must be accepted without a finding about their channels.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import cache
 from itertools import combinations, repeat
 from multiprocessing import get_context
 from pathlib import Path
@@ -27,6 +28,7 @@ import numpy as np
 from dvrk_drake.analysis.check.identifiable import check_with_channels
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.recording import Recording, read_recording
@@ -62,37 +64,51 @@ def damages(recording: Recording, arm: Arm) -> Iterator[tuple[str, str, Recordin
         yield "position -0.1 rad, -10 mm", f"{i + 1}", replace(recording, q=recording.q - offset)
 
 
-def outcome(folder: Path, name: str, number: int) -> tuple[str, str, str, str]:
-    """(kind, channels, outcome, detail) of one damage."""
+@cache
+def undamaged(folder: Path, name: str) -> tuple[Recording, Arm, set[tuple[str, str]], list[tuple[str, str, Recording]]]:
+    """The recording, its arm, what the check finds in it (kind, where), and all damages."""
     arm = load_arm(MOTIONS[name])
     recording = read_recording(folder / f"{name}.csv", arm, "actuator")
-    kind, channels, damaged = list(damages(recording, arm))[number]
-    usual = {(f.kind, f.where) for f in check_with_channels(recording, arm).findings}
-    findings = [f for f in check_with_channels(damaged, arm).findings if (f.kind, f.where) not in usual]
-    if refusals := [f for f in findings if f.severity == "refusal"]:
-        return kind, channels, "refused", f"{refusals[0].where}: {refusals[0].kind}"
-    warnings = [f"{f.where}: {f.kind}" for f in findings if f.severity == "warning"]
+    usual = {(finding.kind, finding.where) for finding in check_with_channels(recording, arm).findings}
+    return recording, arm, usual, list(damages(recording, arm))
+
+
+@cache
+def errors_of_undamaged(folder: Path, name: str) -> np.ndarray:
+    """(n,) relative errors of the model of the undamaged recording, on itself."""
+    recording, arm, *_ = undamaged(folder, name)
+    return relative_errors(identify_dynamic(recording, arm).model, recording)
+
+
+def relative_errors(model: IdentifiedModel, recording: Recording) -> np.ndarray:
+    """(n,) of the actuators' efforts."""
+    return np.array([a.relative_error for a in validate_motion(model, recording).actuators])
+
+
+def outcome(folder: Path, name: str, number: int) -> tuple[str, str, str, str]:
+    """(kind, channels, outcome, detail) of one damage."""
+    recording, arm, usual, all_damages = undamaged(folder, name)
+    kind, channels, damaged = all_damages[number]
+    findings = check_with_channels(damaged, arm).findings
+    new = [finding for finding in findings if (finding.kind, finding.where) not in usual]
+    for severity, what in (("refusal", "refused"), ("warning", "warned")):
+        if found := [f for f in new if f.severity == severity]:
+            where = "recording" if found[0].where == recording.source else found[0].where
+            return kind, channels, what, f"{where}: {found[0].kind}"
     try:
         model = identify_dynamic(damaged, arm).model
     except IdentificationError as error:
         return kind, channels, "refused", f"identify: {error}"
     assert model.dynamics is not None
-    poorly = [a.name for a in model.dynamics.actuators if a.rms_cross_validation > 0.5 * a.rms_effort]
-    if poorly:
-        warnings.append(f"{', '.join(poorly)}: most of the effort not explained")
-    after, before = (
-        np.array([a.relative_error for a in validate_motion(m, recording).actuators])
-        for m in (model, identify_dynamic(recording, arm).model)
-    )
-    harmful = (after > 1.5 * before) & (after > before + 0.05)
+    if poorly := [a.name for a in model.dynamics.actuators if a.rms_cross_validation > 0.5 * a.rms_effort]:
+        return kind, channels, "warned", f"{', '.join(poorly)}: most of the effort is not explained"
+    before, after = errors_of_undamaged(folder, name), relative_errors(model, recording)
     worst = int(np.argmax(after - before))
     detail = f"{arm.joint_names[worst]} {before[worst]:.1%} -> {after[worst]:.1%}"
-    if warnings:
-        return kind, channels, "warned", f"{warnings[0]} ({detail})"
-    if not np.any(harmful):
+    if not np.any((after > 1.5 * before) & (after > before + 0.05)):
         return kind, channels, "harmless", detail
-    hidden = [f.where for f in check_with_channels(damaged, arm).findings if f.kind == "undetectable offset"]
-    noted = kind.startswith("position") and arm.joint_names[int(channels) - 1] in ", ".join(hidden).split(", ")
+    hidden = ", ".join(f.where for f in findings if f.kind == "undetectable offset").split(", ")
+    noted = kind.startswith("position") and arm.joint_names[int(channels) - 1] in hidden
     return kind, channels, "noted" if noted else "BAD", detail
 
 
@@ -108,8 +124,7 @@ def main() -> None:
         bad = [str(f) for f in report.findings if f.kind in CHANNEL_KINDS]
         print(f"{name} as recorded: {'; '.join(bad) or 'no finding about its channels'}", flush=True)
     for name in options.name:
-        arm = load_arm(MOTIONS[name])
-        count = len(list(damages(read_recording(options.folder / f"{name}.csv", arm, "actuator"), arm)))
+        count = len(undamaged(options.folder, name)[-1])
         outcomes: dict[str, Counter] = {}
         print(f"\n{name}\n| damage | channels | outcome | detail |\n|---|---|---|---|")
         with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
