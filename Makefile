@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 # Which tests test-fast runs, as pytest's -m; TESTS= runs all of them, as CI does.
 TESTS ?= not slow
+# Files and folders whose tests test-fast runs; default: all.
+PATHS ?=
 # CI leaves out the PSM's collection, which is the MTM's again with another arm.
 RECORDINGS ?= tests/udp/test_record_udp.py tests/udp/test_collect_udp.py tests/udp/test_collect_psm_udp.py
 # What `make mutants` changes: a module or a folder of the package.
@@ -22,7 +24,7 @@ test-busy:
 	  busy & first=$$!; busy & trap "kill $$first $$! 2>/dev/null || :" EXIT INT TERM; $(MAKE) test
 
 test-fast: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --ignore-glob='*_udp.py' -m '$(TESTS)'
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --ignore-glob='*_udp.py' -m '$(TESTS)' $(PATHS)
 
 # One after the other: each runs several processes at 1 kHz, and wants the cores for itself.
 test-udp: $(VENV)/.installed-test
