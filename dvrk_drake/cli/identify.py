@@ -170,6 +170,9 @@ def _validate(options: argparse.Namespace) -> None:
         check_output(options.model, options.recording, overwrite=True)
         if same:
             raise ModelError(f"{source}: --save needs a recording that the model was not identified from")
+        if model.validation is not None and not options.overwrite:
+            saved = model.validation.recording
+            raise ModelError(f"{options.model}: has verdicts from {saved} already; replace them with --overwrite")
     recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
     warnings = refuse_unusable(console, recording, arm)
     in_motion = moves and model.dynamics is not None

@@ -226,7 +226,9 @@ def test_saved_verdicts_are_those_that_run_warns_of(files, capsys):
     assert dataclasses.replace(saved, validation=None) == loaded
     warning = model_warning(model, saved)
     assert f"did not pass validation on {bad}: shoulder_pitch (do not use);" in warning and "\n" not in warning
-    assert main(["validate", model, good, "--save"]) == 0
+    assert main(["validate", model, good, "--save"]) == 2
+    assert f"has verdicts from {bad} already" in capsys.readouterr().err
+    assert main(["validate", model, good, "--save", "--overwrite"]) == 0
     assert model_warning(model, IdentifiedModel.load(model)) == ""
 
 

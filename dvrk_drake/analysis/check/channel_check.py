@@ -19,8 +19,11 @@ from dvrk_drake.models.recording import Recording
 #: A hypothesis is accepted if it raises the log-likelihood by this much. On the public motions as recorded no exchange
 #: gains anything; on damaged ones the right one gains 25 or more, in most cases hundreds.
 SURE = 20.0
+#: An arm is nearly its own mirror image: inverted channels are accepted only from here on. On the public motions as
+#: recorded they gain up to 46.
+SURE_OF_MIRROR = 100.0
 #: Multiples of the recorded effort that are tried.
-SCALES = (0.35, 0.5, 2.0, 2.8)
+SCALES = (0.5, 2.0)
 #: Friction dissipates the power that the arm's file states within this factor. The public recordings of one PSM on two
 #: days lie between 0.96 and 1.54.
 FRICTION_FACTOR = 1.7
@@ -35,10 +38,11 @@ LIMIT_MARGIN = 0.02, 0.002
 def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
     """Refits a recording under hypotheses about its channels and reports the ones that fit clearly better.
 
-    The hypotheses are: the efforts of two channels are exchanged; all signals of two channels are exchanged; the effort
-    of a channel is inverted; the effort of an actuator is a multiple of the true one; the position of a channel has an
-    offset. Each is a maximum-a-posteriori fit of `ChannelFit`, compared by its log-likelihood. A wrong scale also shows
-    in the power that friction dissipates. Of poses at rest only exchanges are tried: friction and stops hide the rest.
+    The hypotheses are: the efforts of two channels are exchanged; all signals of two channels are exchanged; the
+    effort of a channel, or all its signals, are inverted; the effort of an actuator is a multiple of the true one; the
+    position of a channel has an offset. Each is a maximum-a-posteriori fit of `ChannelFit`, compared by its
+    log-likelihood. A wrong scale shows in the power that friction dissipates. Of poses at rest only exchanges are
+    tried: friction and stops hide the rest.
 
     Args:
         recording: a motion, or poses at rest, with efforts, in either coordinates; channels are those of its columns.
@@ -57,6 +61,8 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
             return []
     fit = ChannelFit(recording, arm)
     findings = [*_effort_exchanges(fit), *_full_exchanges(fit), *_inversions(fit)]
+    if fit.moves:
+        findings += [finding for finding in _full_inversions(fit) if finding.size > SURE_OF_MIRROR]
     best = max(findings, key=lambda finding: finding.size, default=None)
     if best is not None and best.size > SURE:
         # At a stop, efforts of poses look inverted.
@@ -81,8 +87,7 @@ def _effort_exchanges(fit: ChannelFit) -> Iterator[Finding]:
 def _full_exchanges(fit: ChannelFit) -> Iterator[Finding]:
     """Exchanges of all signals of two channels that keep the arm within its limits."""
     recording, arm = fit.recording, fit.arm
-    margin = np.append(arm.per_joint(*LIMIT_MARGIN), np.full(len(arm.coupled_limits), LIMIT_MARGIN[0]))
-    allowed = _limit_excess(recording, arm) + margin
+    allowed = _limit_excess(recording, arm) + _limit_margin(arm)
     for i, j in combinations(map(int, fit.used), 2):
         order = _exchanged(arm.num_joints, i, j)
         qd = None if recording.qd is None else recording.qd[:, order]
@@ -108,7 +113,9 @@ def _limit_excess(recording: Recording, arm: Arm) -> NDArray[np.float64]:
 def _exchange(arm: Arm, channels: tuple[int, ...], which: str, gain: float) -> Finding:
     names = " and ".join(arm.joint_names[k] for k in channels)
     what = f"{which} are exchanged: the arm's equations fit the recording far better with them exchanged back"
-    return Finding("refusal", "exchanged channels", names, what, "correct the columns of the file", channels, gain)
+    return Finding(
+        "refusal", "exchanged channels", names, what, "correct the columns of the file and check again", channels, gain
+    )
 
 
 def _inversions(fit: ChannelFit) -> Iterator[Finding]:
@@ -116,31 +123,66 @@ def _inversions(fit: ChannelFit) -> Iterator[Finding]:
         name = fit.arm.joint_names[i]
         signs = np.where(np.arange(fit.arm.num_joints) == i, -1.0, 1.0)
         gain = fit.gain(fit.in_actuators(np.diag(signs)))
-        what = f"tau{i + 1} has the wrong sign: the arm's equations fit the recording far better with the other one"
-        advice = f"efforts are positive towards +q{i + 1}"
+        what = f"tau{i + 1}, or q{i + 1}, has the wrong sign: the arm's equations fit far better with the other"
+        advice = f"efforts are positive towards +q{i + 1}; correct one of them and check again"
         yield Finding("refusal", "effort sign", name, what, advice, (i,), gain)
 
 
-def _scales(fit: ChannelFit) -> Iterator[Finding]:
-    """Efforts of actuators at a wrong scale, by the fit or by the power that friction dissipates."""
-    power = fit.dissipation()
+def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
+    """Channels all of whose signals have the other sign, where that keeps the arm within its limits."""
+    recording, arm = fit.recording, fit.arm
+    allowed = _limit_excess(recording, arm) + _limit_margin(arm)
     for i in map(int, fit.used):
-        name = fit.arm.joint_names[i]
-        ratio = float(power[i]) if np.isfinite(power[i]) else 1.0
-        # A scale that makes friction implausible is not the cause of a better fit: the file's inertia is wrong instead.
-        scales = [s for s in SCALES if 1 / FRICTION_FACTOR < ratio * s < FRICTION_FACTOR]
-        n = fit.arm.num_joints
-        gains = [fit.gain(np.diag(np.where(np.arange(n) == i, scale, 1.0))) for scale in scales]
-        if gains and max(gains) > SURE:
-            size = 1 / scales[int(np.argmax(gains))]
-            what = f"effort of its actuator is about {size:.1g} times what the arm's inertia and friction need"
-        elif not 1 / FRICTION_FACTOR < ratio < FRICTION_FACTOR:
-            size = ratio
-            what = f"friction of its actuator dissipates {size:.2g} times the power that the arm's file states"
-        else:
-            continue
+        signs = np.where(np.arange(arm.num_joints) == i, -1.0, 1.0)
+        qd = None if recording.qd is None else recording.qd * signs
+        other = replace(recording, q=recording.q * signs, qd=qd, tau=recording.measured_effort() * signs)
+        if np.all(_limit_excess(other, arm) <= allowed):
+            gain = ChannelFit(other, arm).log_likelihood - fit.log_likelihood
+            what = (
+                f"all signals of channel {i + 1} have the wrong sign: the arm's equations fit far better with the other"
+            )
+            advice = "correct the columns of the file and check again"
+            yield Finding("refusal", "inverted channel", arm.joint_names[i], what, advice, (i,), gain)
+
+
+def _limit_margin(arm: Arm) -> NDArray[np.float64]:
+    return np.append(arm.per_joint(*LIMIT_MARGIN), np.full(len(arm.coupled_limits), LIMIT_MARGIN[0]))
+
+
+def _scales(fit: ChannelFit) -> Iterator[Finding]:
+    """Efforts of actuators at a wrong scale, by the power of friction, or by the fit if the arm's file states none."""
+    power, allowed = fit.dissipation(), _friction_factors(fit)
+    for i in map(int, fit.used):
+        name, ratio = fit.arm.joint_names[i], float(power[i])
         advice = f"check the scale of tau{i + 1} (torque constant, gear ratio, unit) and the condition of the drive"
-        yield Finding("warning", "effort scale", name, what, advice, (i,), size)
+        if ratio <= 0:
+            what = "the effort of its actuator does not oppose the motion as friction does"
+            advice = f"check that tau{i + 1} and the positions are of the same motion"
+        elif ratio > 0:
+            if 1 / allowed[i] < ratio < allowed[i]:
+                continue
+            what = f"friction of its actuator dissipates {ratio:.2g} times the power that the arm's file states"
+        else:
+            gains = {s: fit.gain(np.diag(np.where(np.arange(fit.arm.num_joints) == i, s, 1.0))) for s in SCALES}
+            scale = max(gains, key=lambda s: gains[s])
+            if gains[scale] < SURE:
+                continue
+            ratio = 1 / scale
+            what = f"effort of its actuator is about {ratio:g} times what the arm's inertia needs"
+        yield Finding("warning", "effort scale", name, what, advice, (i,), ratio)
+
+
+def _friction_factors(fit: ChannelFit) -> NDArray[np.float64]:
+    """(n,) allowed factors of the friction power.
+
+    In joint coordinates the gear ratio between an actuator and the only joint that it moves is allowed for: the
+    friction of the PSM's roll in the arm's file is from a recording whose roll may be the disc's or the joint's.
+    """
+    if fit.recording.coordinates == "actuator":
+        return np.full(fit.arm.num_joints, FRICTION_FACTOR)
+    J = fit.arm.transmission.matrix
+    gear = np.where(np.count_nonzero(J, axis=1) == 1, np.abs(np.diag(J)), 1.0)
+    return FRICTION_FACTOR * np.maximum(gear, 1 / gear)
 
 
 def _offsets(fit: ChannelFit) -> Iterator[Finding]:

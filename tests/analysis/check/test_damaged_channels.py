@@ -9,6 +9,7 @@ from synthetic_motion import RATE, trajectory
 
 from dvrk_drake.analysis.check.channel_check import check_channels
 from dvrk_drake.analysis.check.identifiable import check_with_channels
+from dvrk_drake.analysis.convert.convert import read_wpi_csv, wpi_in_joint_coordinates
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates
@@ -87,6 +88,14 @@ def test_scaled_effort_is_warned_about(name, joint, factor):
     assert sizes[joint] == pytest.approx(factor, rel=0.3)
 
 
+@pytest.mark.parametrize("joint", [0, 5])
+def test_channel_inverted_as_a_whole_is_named(joint):
+    recording, signs = motion("mtmr"), np.where(np.arange(7) == joint, -1.0, 1.0)
+    damaged = replace(recording, q=recording.q * signs, qd=recording.qd * signs, tau=recording.tau * signs)
+    found = check_channels(damaged, load_arm("mtmr"))
+    assert [(f.kind, f.joints) for f in found] == [("inverted channel", (joint,))]
+
+
 @pytest.mark.parametrize(("joint", "offset"), [(1, 0.15), (2, -0.1), (3, 0.15)])
 def test_position_offset_is_warned_about(joint, offset):
     recording = motion("mtmr")
@@ -135,12 +144,16 @@ def test_model_worse_than_zero_torque_is_refused():
         identify_dynamic(replace(recording, tau=noise), load_arm("mtmr"))
 
 
+@pytest.mark.parametrize("coordinates", ["actuator", "joint"])
 @pytest.mark.parametrize(
     "name", ["mtm_one", "psm_one", "psm_one_no_weight", "psm_one_105g_parallel", "psm_one_205g_insertion"]
 )
-def test_real_motions_have_no_finding(shared_data, name):
+def test_real_motions_have_no_finding(shared_data, name, coordinates):
     path = shared_data / "trajectories" / f"{name}.csv"
     if not path.is_file():
         pytest.skip(f"needs {path}")
     arm = load_arm("mtmr" if name.startswith("mtm") else "psm")
-    assert [f for f in check_channels(read_recording(path, arm, "actuator"), arm) if f.severity != "note"] == []
+    recording = read_recording(path, arm, "actuator")
+    if coordinates == "joint":  # as `convert` writes it
+        recording = wpi_in_joint_coordinates(read_wpi_csv(path), arm)
+    assert [f for f in check_channels(recording, arm) if f.severity != "note"] == []
