@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -61,7 +62,7 @@ class ChannelFit:
         """
         self.recording, self.arm = recording, arm
         self._to_joint = arm.transmission.inverse()
-        self._regressor = DynamicRegressor(arm)
+        self._regressor, self._tilted = _regressors(arm)
         self.moves = bool(recording.motion(arm))
         if self.moves:
             grid = motion_grid(recording, arm, default_settings(arm))
@@ -212,8 +213,7 @@ class ChannelFit:
     def _weights_of_unit_gravity(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         """(r, n, 2) holding efforts under a gravity of 1 m/s^2 along the base's x and y."""
         weights, rest = [], np.zeros_like(q)
-        for axis in np.eye(3)[:2]:
-            regressor = DynamicRegressor(self.arm.with_gravity([float(g) for g in axis]))
+        for regressor in self._tilted:
             torque = regressor.torque(q, rest, rest, regressor.values)
             weights.append(self._filtered(self._to_joint.pull_back_effort(torque)))
         return np.stack(weights, axis=2)
@@ -232,6 +232,12 @@ class ChannelFit:
     def _inner(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         ends = int(ENDS * GRID_RATE / self._half_step)
         return x[ends : len(x) - ends : 2]
+
+
+@cache
+def _regressors(arm: Arm) -> tuple[DynamicRegressor, list[DynamicRegressor]]:
+    """The arm's regressor, and those of the arm under a gravity of 1 m/s^2 along the base's x and y."""
+    return DynamicRegressor(arm), [DynamicRegressor(arm.with_gravity(axis)) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
 
 
 class _DriveEffects(NamedTuple):
