@@ -19,8 +19,8 @@ from dvrk_drake.analysis.demo.teleoperation import TeleoperationResult
 from dvrk_drake.analysis.simulation.simulation import Simulation
 from dvrk_drake.analysis.static.doubts import Doubt
 from dvrk_drake.analysis.static.validation import Validation
-from dvrk_drake.analysis.verdict import Verdict, rule_text, worst
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.analysis.verdict import rule_text, worst
+from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity, derive_gravity
 from dvrk_drake.models.arm import Arm, load_arm
 

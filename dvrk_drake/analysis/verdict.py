@@ -10,10 +10,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 
-#: From the most to the least favourable. A joint that is "off" gets no torque, so it cannot be wrong.
-Verdict = Literal["off", "good", "usable", "not judged", "do not use"]
 Requirement = Literal["good", "usable"]
 
 #: Largest ratio of the error to the measured effort (RMS both) of a joint that is "good".

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 
 from dvrk_drake.cli.support import ProgressBar, add_overwrite, add_recording, check_output, made_folder
 from dvrk_drake.errors import RecordingError
@@ -46,8 +47,8 @@ def _check(options: argparse.Namespace) -> None:
         with atomic_write(options.json) as stream:
             json.dump(report.as_dict(), stream, indent=2)
             stream.write("\n")
-    if plots is not None:
-        plot_report(plots, report, recording, arm)
+    if plots is not None and not plot_report(plots, report, recording, arm):
+        print("no plots: spectra need a motion with efforts at a known rate", file=sys.stderr)
     if report.refusals:
         first, *others = report.refusals
         reasons = f"refused for {len(others) + 1} reasons, the first: " if others else "refused: "

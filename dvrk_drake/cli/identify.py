@@ -89,7 +89,11 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument(
         "--arm", help="e.g. psm; CSV, WPI: write its joint coordinates, not the actuators'; LCM log: which arm"
     )
-    verb.add_argument("--skip-invalid", action="store_true", help="leave out rows that are not numbers, and count them")
+    verb.add_argument(
+        "--skip-invalid",
+        action="store_true",
+        help="leave out rows with an empty cell, a NaN or an infinity, and count them",
+    )
     add_overwrite(verb)
     verb.set_defaults(run=_convert)
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,6 +71,10 @@ class Provenance:
     rank: int = 0
     condition_number: float = field(default=0.0, metadata={INFINITE: True})
     version: str = ""
+
+
+#: On a joint of a model, from the most to the least favourable; `off`: the model commands no torque.
+Verdict = Literal["off", "good", "usable", "not judged", "do not use"]
 
 
 @dataclass
@@ -171,6 +176,9 @@ class IdentifiedModel:
                 raise ModelError(f"effects[{i}]: {fault}")
         if self.validation is not None and set(self.validation.verdicts) != set(arm.joint_names):
             raise ModelError(f"validation.verdicts must name these joints: {', '.join(arm.joint_names)}")
+        for name, verdict in self.validation.verdicts.items() if self.validation else ():
+            if verdict not in get_args(Verdict):
+                raise ModelError(f'validation.verdicts.{name} is "{verdict}"; allowed: {", ".join(get_args(Verdict))}')
         if not np.all((self.trust >= 0) & (self.trust <= 1)):
             raise ModelError("trust must be between 0 and 1")
         if self.dynamics is not None:

@@ -142,7 +142,7 @@ def listed(numbers: Iterable[int]) -> str:
 
 def skipped_note(skipped: NDArray[np.int_], count: int) -> str:
     """The note on the lines that were left out of `count` rows."""
-    return f"{len(skipped)} of {count} rows skipped (NaN or infinite): lines {listed(skipped)}"
+    return f"{len(skipped)} of {count} rows skipped (empty, NaN or infinite): lines {listed(skipped)}"
 
 
 def is_number(cell: str) -> bool:
@@ -170,6 +170,11 @@ def parse_number(cell: str, where: str) -> float:
     if not is_number(cell):
         raise RecordingError(f"{where} is empty" if not cell else f"{where} is not a number: {cell[:30]!r}")
     return float(cell)
+
+
+def parse_or_nan(cell: str, where: str) -> float:
+    """As `parse_number`, but an empty cell is NaN."""
+    return parse_number(cell, where) if cell else float("nan")
 
 
 def parse_finite(cell: str, where: str) -> float:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.atomic_file import atomic_write
-from dvrk_drake.models.csv_rows import CsvReader, is_number, parse_finite, parse_number, skipped_note
+from dvrk_drake.models.csv_rows import CsvReader, is_number, parse_finite, parse_or_nan, skipped_note
 from dvrk_drake.models.lcm_log import is_lcm_log
 from dvrk_drake.models.status_log import read_status_log
 
@@ -198,7 +198,8 @@ def read_recording(
             7 joints, as all arms have so far, and a log statuses of one arm only.
         coordinates: what q, qd and tau are of; a log's are of the joints.
         progress: called with the share 0..1 of a CSV that was read.
-        skip_invalid: leave out rows of a CSV with a NaN or an infinity, and note them, instead of refusing the file.
+        skip_invalid: leave out rows of a CSV with an empty cell, a NaN or an infinity, and note them, instead of
+            refusing the file.
 
     Raises:
         RecordingError: names the file, the line and the column of what is wrong.
@@ -287,7 +288,7 @@ def _read_numbers(
         if len(lines) == LARGEST_COUNT:
             raise RecordingError(f"{path}:{line}: has more than {LARGEST_COUNT} rows; cut the recording into parts")
         if skip_invalid and not all(
-            math.isfinite(parse_number(cells[column].strip(), f"{path}:{line}: {header[column]}"))
+            math.isfinite(parse_or_nan(cells[column].strip(), f"{path}:{line}: {header[column]}"))
             for _, columns in parts
             for column in columns
         ):

@@ -235,6 +235,9 @@ def test_saved_verdicts_are_those_that_run_warns_of(files, capsys):
 def test_saved_verdicts_are_of_all_joints(truth, tmp_path):
     with pytest.raises(ModelError, match=r"validation\.verdicts must name these joints: outer_yaw"):
         dataclasses.replace(truth, validation=ValidationSummary("a.csv", "", {"outer_yaw": "good"})).check()
+    verdicts = {joint.name: "good" for joint in truth.joints} | {"wrist_roll": "splendid"}
+    with pytest.raises(ModelError, match=r'verdicts\.wrist_roll is "splendid"; allowed: off, good, usable'):
+        dataclasses.replace(truth, validation=ValidationSummary("a.csv", "", verdicts)).check()
 
 
 def test_run_warns_before_it_looks_for_the_arm(files, monkeypatch, capsys):

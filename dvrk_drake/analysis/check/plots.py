@@ -18,13 +18,16 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
 
 
-def plot_report(folder: Path, report: RecordingReport, recording: Recording, arm: Arm) -> None:
-    """Writes spectra.png: one panel a joint, with the cut-off that follows; nothing for what has no rate.
+def plot_report(folder: Path, report: RecordingReport, recording: Recording, arm: Arm) -> bool:
+    """Writes spectra.png: one panel a joint, with the cut-off that follows.
 
     Rows are taken as evenly spaced; of a motion with gaps the spectra are rough.
+
+    Returns:
+        Whether it was written: poses, and motions without efforts, have no spectra.
     """
     if report.rate is None or report.joints[0].effort_cut_off is None:
-        return
+        return False
     tau = recording.in_actuator_coordinates(arm).measured_effort()
     of = spectra(tau, report.rate, report.period)
     noise = "does not repeat" if report.period is not None else "white noise"
@@ -44,3 +47,4 @@ def plot_report(folder: Path, report: RecordingReport, recording: Recording, arm
     figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="lower right", fontsize=8)
     figure.suptitle(f"{arm.name}: efforts of the actuators, {Path(report.source).name}")
     save_figure(figure, folder / "spectra.png")
+    return True

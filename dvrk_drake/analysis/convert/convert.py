@@ -148,12 +148,14 @@ def detect_format(path: str | Path) -> Format:
     The reader judges the rest.
 
     Raises:
-        RecordingError: no such file, or it is none of them.
+        RecordingError: no such file, or it is empty or none of them.
     """
     path = Path(path)
     if is_lcm_log(path):
         return "lcm-log"
     content = read_bytes(path)
+    if not content.strip():
+        raise RecordingError(f"{path}: is empty")
     if looks_like_matlab(path, content):
         return "team-mat"
     if b"\0" in content[:_HEAD]:

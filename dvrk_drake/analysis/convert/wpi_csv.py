@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.csv_rows import is_number, parse_finite, parse_number, read_rows, skipped_note
+from dvrk_drake.models.csv_rows import is_number, parse_finite, parse_or_nan, read_rows, skipped_note
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.recording import Recording
 
@@ -42,8 +42,8 @@ def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: b
     Args:
         path: the CSV file.
         rate: samples a second [Hz]; default: `WPI_RATE`.
-        skip_invalid: leave out rows with a NaN or an infinity instead of refusing the file; the other rows
-            keep their t.
+        skip_invalid: leave out rows with an empty cell, a NaN or an infinity instead of refusing the file; the other
+            rows keep their t.
 
     Raises:
         RecordingError: not such a file, fewer than two rows, a cell that is no finite number, or a rate for a file that
@@ -65,7 +65,7 @@ def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: b
             "a CSV whose header names q1..q7 needs no conversion"
         )
     values = np.empty((len(rows), len(names)))
-    parse = parse_number if skip_invalid else parse_finite
+    parse = parse_or_nan if skip_invalid else parse_finite
     for row, (line, cells) in enumerate(rows):
         if len(cells) != len(names):
             layout = f"its header names {len(names)} columns" if timed else f"wpi-csv has {_WPI_LAYOUT}"

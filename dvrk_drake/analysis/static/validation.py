@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.static.doubts import Doubt, check_effort_unit, find_doubts, usable_measurements
 from dvrk_drake.analysis.static.linear_fit import rms
-from dvrk_drake.analysis.verdict import Verdict, judge, rule_text, worst
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.analysis.verdict import judge, rule_text, worst
+from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.recording import Recording
 

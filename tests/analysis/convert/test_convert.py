@@ -56,6 +56,12 @@ def test_detect_format(tmp_path):
     assert_refused("is not a file", detect_format, tmp_path)
 
 
+@pytest.mark.parametrize("content", ["", " \n"])
+def test_an_empty_file_has_no_format(tmp_path, content):
+    path = write_text(tmp_path, content)
+    assert_refused(r"motion\.csv: is empty", convert, path, tmp_path / "out.csv", coordinates="joint")
+
+
 def test_an_explicit_format_wins_over_the_name(tmp_path):
     path = write_wpi(tmp_path, wpi_rows()).rename(tmp_path / "motion.mat")
     assert len(convert(path, tmp_path / "out.csv", format="wpi-csv")) == 4
@@ -196,7 +202,7 @@ def test_time_stamps_that_are_no_numbers(tmp_path):
         recording = convert(path, tmp_path / "out.csv", skip_invalid=True, **options)
         np.testing.assert_array_equal(recording.t, [0, 0.02, 0.03])
         np.testing.assert_array_equal(recording.q, rows[[0, 2, 3], :7])
-        assert any("1 of 4 rows skipped (NaN or infinite): lines 3" in note for note in recording.notes)
+        assert any("1 of 4 rows skipped (empty, NaN or infinite): lines 3" in note for note in recording.notes)
 
 
 def test_positions_alone_and_columns_that_are_not_kept(tmp_path):

@@ -80,11 +80,12 @@ def test_wpi_csv_skips_invalid_rows_and_keeps_the_time_of_the_others(tmp_path):
     rows[1, 3] = np.nan
     rows[3, 20] = np.inf
     path = write_wpi(tmp_path, rows)
+    path.write_text(path.read_text().replace("nan", ""))
     recording = convert(path, tmp_path / "out.csv", skip_invalid=True)
     notes = recording.notes
     np.testing.assert_array_equal(recording.t, [0, 0.01, 0.02])
     np.testing.assert_array_equal(recording.lines, [1, 3, 5])
-    assert "2 of 5 rows skipped (NaN or infinite): lines 2, 4" in notes
+    assert "2 of 5 rows skipped (empty, NaN or infinite): lines 2, 4" in notes
     rows[2:] = np.nan
     assert_refused("has 1 valid row;", read_wpi_csv, write_wpi(tmp_path, rows), skip_invalid=True)
     bad = write_text(tmp_path, f"{NUMBERS}\n{NUMBERS[:-1]}abc\n")
