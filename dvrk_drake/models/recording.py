@@ -8,6 +8,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -160,7 +161,20 @@ class Recording:
             message += "; are these millimetres or centimetres? A prismatic joint must be in m, its effort in N"
         else:
             message += "; is this the right arm, and are the coordinates (joint or actuator) right?"
+        if pairs := self._exchanges_within_limits(arm):
+            message += f" Or are columns exchanged? Within the limits with {', '.join(pairs)} exchanged"
         raise RecordingError(message)
+
+    def _exchanges_within_limits(self, arm: Arm) -> list[str]:
+        """Pairs of columns, such as "q1 and q4", that put all poses within the limits if they are exchanged."""
+        pairs, tolerance = [], arm.per_joint(*LIMIT_TOLERANCE)
+        for i, j in combinations(range(arm.num_joints), 2):
+            order = np.arange(arm.num_joints)
+            order[[i, j]] = j, i
+            q = replace(self, q=self.q[:, order], qd=None, tau=None).in_joint_coordinates(arm).q
+            if np.all((q >= arm.position_lower - tolerance) & (q <= arm.position_upper + tolerance)):
+                pairs.append(f"q{i + 1} and q{j + 1}")
+        return pairs
 
     def _check_sizes(self) -> None:
         for name, values in (("q", self.q), ("qd", self.qd), ("tau", self.tau)):

@@ -80,6 +80,21 @@ def test_a_right_arm_is_not_a_left_arm():
         Recording(q=q).check_fits(load_arm("mtml"))
 
 
+@pytest.mark.parametrize("pair", [(0, 3), (4, 6), (5, 6)])
+def test_exchanged_columns_that_exceed_the_limits_are_named(pair):
+    arm = load_arm("mtmr")
+    q = arm.sample_poses(200, np.random.default_rng(0))
+    order = np.arange(7)
+    order[list(pair)] = pair[::-1]
+    with pytest.raises(
+        RecordingError, match=rf"Within the limits with.* q{pair[0] + 1} and q{pair[1] + 1}\b.* exchanged"
+    ):
+        Recording(q=q[:, order]).check_fits(arm)
+    with pytest.raises(RecordingError) as degrees:
+        Recording(q=np.degrees(q)).check_fits(arm)
+    assert "exchanged" not in str(degrees.value)
+
+
 @pytest.mark.parametrize("coordinates", ["joint", "actuator"])
 def test_the_number_of_joints_must_be_the_arms(coordinates):
     recording = Recording(q=np.zeros((2, 6)), source="psm.csv", coordinates=coordinates)

@@ -186,18 +186,34 @@ def _friction_factors(fit: ChannelFit) -> NDArray[np.float64]:
 
 
 def _offsets(fit: ChannelFit) -> Iterator[Finding]:
-    """Position offsets of the joints whose zero the recording shows; a note names the other joints."""
-    arm, hidden = fit.arm, []
+    """The likeliest position offset of the joints whose zero the recording shows; a note names the joints it does not.
+
+    Offsets of joints with parallel axes look alike, so the warning also names the other candidates.
+    """
+    arm, hidden, found = fit.arm, [], {}
     least, tolerated = arm.per_joint(*LEAST_OFFSET), arm.per_joint(*TOLERATED_OFFSET)
     for i, name in enumerate(arm.joint_names):
         offset, error = fit.position_offset(i)
         if OFFSET_ERRORS * error > tolerated[i]:
             hidden.append(name)
         elif abs(offset) > max(least[i], OFFSET_ERRORS * error):
-            unit = "m" if arm.prismatic[i] else "rad"
-            what = f"q{i + 1} has an offset of about {offset:+.2f} {unit} (standard error {error:.2g})"
-            yield Finding("warning", "position offset", name, what, "check the zero of its encoder", (i,), offset)
+            found[i] = (offset, error)
+    if found:
+        first, *others = sorted(found, key=lambda i: -_shifted_back(fit, i, found[i][0]).log_likelihood)
+        sizes = {i: f"{offset:+.2g} {'m' if arm.prismatic[i] else 'rad'}" for i, (offset, _) in found.items()}
+        what = f"q{first + 1} has an offset of about {sizes[first]} (standard error {found[first][1]:.2g})"
+        if others:
+            what += f", or, less likely, {' or '.join(f'q{i + 1} one of {sizes[i]}' for i in others)}"
+        advice = "check the zero of its encoder"
+        yield Finding(
+            "warning", "position offset", arm.joint_names[first], what, advice, (first, *others), found[first][0]
+        )
     if hidden:
         what = f"an offset of {TOLERATED_OFFSET[0]} rad ({TOLERATED_OFFSET[1]} m) in their positions would not show"
         advice = "this recording cannot tell it from the links' centres of mass; check the zeros of these encoders"
         yield Finding("note", "undetectable offset", ", ".join(hidden), what, advice)
+
+
+def _shifted_back(fit: ChannelFit, channel: int, offset: float) -> ChannelFit:
+    shift = offset * np.eye(fit.arm.num_joints)[channel]
+    return ChannelFit(replace(fit.recording, q=fit.recording.q - shift), fit.arm)

@@ -70,7 +70,7 @@ def check_effort_unit(recording: Recording, arm: Arm) -> None:
         unit = "N" if arm.prismatic[joint] else "N m"
         raise RecordingError(
             f"{recording.source}: most efforts of {arm.joint_names[joint]} (tau{joint + 1}) exceed its limit of "
-            f"{arm.effort_limits[joint]:.3g} {unit}; are they in N m (N on a prismatic joint)?"
+            f"{arm.effort_limits[joint]:.3g} {unit}; are they in N m (N on a prismatic joint), and of this joint?"
         )
 
 

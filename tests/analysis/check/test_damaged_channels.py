@@ -96,12 +96,13 @@ def test_channel_inverted_as_a_whole_is_named(joint):
     assert [(f.kind, f.joints) for f in found] == [("inverted channel", (joint,))]
 
 
-@pytest.mark.parametrize(("joint", "offset"), [(1, 0.15), (2, -0.1), (3, 0.15)])
+@pytest.mark.parametrize(("joint", "offset"), [(1, 0.15), (1, -0.15), (2, -0.1), (3, 0.15), (3, -0.15)])
 def test_position_offset_is_warned_about(joint, offset):
     recording = motion("mtmr")
     found = check_channels(replace(recording, q=recording.q + offset * np.eye(7)[joint]), load_arm("mtmr"))
-    offsets = {f.joints[0]: f.size for f in found if f.kind == "position offset"}
-    assert offsets[joint] == pytest.approx(offset, abs=0.06)
+    (finding,) = (f for f in found if f.kind == "position offset")
+    assert finding.joints[0] == joint
+    assert finding.size == pytest.approx(offset, abs=0.06)
 
 
 @pytest.mark.parametrize("pair", [(0, 1), (1, 2), (3, 4)])
