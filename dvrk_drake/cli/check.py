@@ -41,7 +41,8 @@ def _check(options: argparse.Namespace) -> None:
         recording = read_recording(
             options.recording, arm, options.coordinates, lambda share: progress.update(task, completed=100 * share)
         )
-    report = check_for_identification(recording, arm)
+    with ProgressBar("checking"):
+        report = check_for_identification(recording, arm)
     print_report(make_console(), report)
     if options.json is not None:
         with atomic_write(options.json) as stream:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,8 @@ FRICTION_FACTOR = 1.7
 LEAST_OFFSET, OFFSET_ERRORS = (0.06, 0.006), 3.3
 #: The zero of a joint is judged only if an offset of this size would be significant [rad], [m].
 TOLERATED_OFFSET = 0.1, 0.01
+#: A longer motion is checked in equal parts of at most this duration [s], which bounds the memory that a fit takes.
+LONGEST_PART = 120.0
 #: Exchanged channels may exceed the arm's limits by this much more than the recorded ones [rad], [m].
 LIMIT_MARGIN = 0.02, 0.002
 
@@ -42,7 +44,8 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
     effort of a channel, or all its signals, are inverted; the effort of an actuator is a multiple of the true one; the
     position of a channel has an offset. Each is a maximum-a-posteriori fit of `ChannelFit`, compared by its
     log-likelihood. A wrong scale shows in the power that friction dissipates. Of poses at rest only exchanges are
-    tried: friction and stops hide the rest.
+    tried: friction and stops hide the rest. A long motion is fitted in parts: their log-likelihoods are added, and a
+    warning needs at least half of them.
 
     Args:
         recording: a motion, or poses at rest, with efforts, in either coordinates; channels are those of its columns.
@@ -56,18 +59,61 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
         RecordingError: the recording does not fit the arm, or is a motion that is too short or too coarse.
     """
     if not recording.motion(arm):
-        recording = _poses_in_order(recording, arm)
-        if len(recording) < LEAST_POSES:
+        poses = _poses_in_order(recording, arm)
+        if len(poses) < LEAST_POSES:
             return []
-    fit = ChannelFit(recording, arm)
+        # At a stop, efforts look inverted.
+        refusals = _likeliest([_hypotheses(ChannelFit(poses, arm))])
+        return [finding for finding in refusals if finding.kind == "exchanged channels"]
+    hypotheses, others = [], []
+    for part in _parts(recording):
+        if part.motion(arm):
+            fit = ChannelFit(part, arm)
+            hypotheses.append(_hypotheses(fit))
+            others.append([] if _likeliest(hypotheses[-1:]) else [*_scales(fit), *_offsets(fit)])
+    return _likeliest(hypotheses) or _merged(others, arm)
+
+
+def _parts(recording: Recording) -> list[Recording]:
+    """Equal parts of a motion, none longer than `LONGEST_PART`."""
+    t, qd = recording.t, recording.qd
+    if t is None or t[-1] - t[0] <= LONGEST_PART:
+        return [recording]
+    edges = np.linspace(t[0], t[-1], int(np.ceil((t[-1] - t[0]) / LONGEST_PART)) + 1)
+    tau = recording.measured_effort()
+    return [
+        replace(
+            recording, q=recording.q[rows], tau=tau[rows], qd=None if qd is None else qd[rows], t=t[rows], lines=None
+        )
+        for rows in np.split(np.arange(len(t)), np.searchsorted(t, edges[1:-1]))
+    ]
+
+
+def _hypotheses(fit: ChannelFit) -> list[Finding]:
+    """Exchanged and inverted channels, each with its gain of the log-likelihood as its size."""
     findings = [*_effort_exchanges(fit), *_full_exchanges(fit), *_inversions(fit)]
-    if fit.moves:
-        findings += [finding for finding in _full_inversions(fit) if finding.size > SURE_OF_MIRROR]
-    best = max(findings, key=lambda finding: finding.size, default=None)
-    if best is not None and best.size > SURE:
-        # At a stop, efforts of poses look inverted.
-        return [best] if fit.moves or best.kind == "exchanged channels" else []
-    return [*_scales(fit), *_offsets(fit)] if fit.moves else []
+    return [*findings, *_full_inversions(fit)] if fit.moves else findings
+
+
+def _likeliest(parts: list[list[Finding]]) -> list[Finding]:
+    """The hypothesis with the largest gain over all parts, if that is large enough."""
+    gains: dict[tuple, list[Finding]] = {}
+    for finding in chain(*parts):
+        gains.setdefault((finding.kind, finding.joints, finding.what), []).append(finding)
+    sums = [replace(same[0], size=sum(finding.size for finding in same)) for same in gains.values()]
+    sure = [f for f in sums if f.size > (SURE_OF_MIRROR if f.kind == "inverted channel" else SURE)]
+    return sorted(sure, key=lambda finding: -finding.size)[:1]
+
+
+def _merged(parts: list[list[Finding]], arm: Arm) -> list[Finding]:
+    """Warnings that at least half of the parts have, each once, and the joints whose offset no part shows."""
+    found: dict[tuple, list[Finding]] = {}
+    for finding in chain(*parts):
+        if finding.severity == "warning":
+            found.setdefault((finding.kind, finding.joints[0]), []).append(finding)
+    warnings = [same[0] for same in found.values() if 2 * len(same) >= len(parts)]
+    hidden = [{i for finding in part if finding.severity == "note" for i in finding.joints} for part in parts]
+    return [*warnings, *_undetectable(arm, sorted(set.intersection(*hidden)) if hidden else [])]
 
 
 def _poses_in_order(recording: Recording, arm: Arm) -> Recording:
@@ -92,9 +138,8 @@ def _full_exchanges(fit: ChannelFit) -> Iterator[Finding]:
         order = _exchanged(arm.num_joints, i, j)
         qd = None if recording.qd is None else recording.qd[:, order]
         other = replace(recording, q=recording.q[:, order], qd=qd, tau=recording.measured_effort()[:, order])
-        if np.all(_limit_excess(other, arm) <= allowed):
-            gain = ChannelFit(other, arm).log_likelihood - fit.log_likelihood
-            yield _exchange(arm, (i, j), f"all signals of channels {i + 1} and {j + 1}", gain)
+        gain = _gain_of(other, fit) if np.all(_limit_excess(other, arm) <= allowed) else -np.inf
+        yield _exchange(arm, (i, j), f"all signals of channels {i + 1} and {j + 1}", gain)
 
 
 def _exchanged(n: int, i: int, j: int) -> NDArray[np.int_]:
@@ -136,13 +181,14 @@ def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
         signs = np.where(np.arange(arm.num_joints) == i, -1.0, 1.0)
         qd = None if recording.qd is None else recording.qd * signs
         other = replace(recording, q=recording.q * signs, qd=qd, tau=recording.measured_effort() * signs)
-        if np.all(_limit_excess(other, arm) <= allowed):
-            gain = ChannelFit(other, arm).log_likelihood - fit.log_likelihood
-            what = (
-                f"all signals of channel {i + 1} have the wrong sign: the arm's equations fit far better with the other"
-            )
-            advice = "correct the columns of the file and check again"
-            yield Finding("refusal", "inverted channel", arm.joint_names[i], what, advice, (i,), gain)
+        gain = _gain_of(other, fit) if np.all(_limit_excess(other, arm) <= allowed) else -np.inf
+        what = f"all signals of channel {i + 1} have the wrong sign: the arm's equations fit far better with the other"
+        advice = "correct the columns of the file and check again"
+        yield Finding("refusal", "inverted channel", arm.joint_names[i], what, advice, (i,), gain)
+
+
+def _gain_of(other: Recording, fit: ChannelFit) -> float:
+    return ChannelFit(other, fit.arm).log_likelihood - fit.log_likelihood
 
 
 def _limit_margin(arm: Arm) -> NDArray[np.float64]:
@@ -192,14 +238,14 @@ def _offsets(fit: ChannelFit) -> Iterator[Finding]:
     """
     arm, hidden, found = fit.arm, [], {}
     least, tolerated = arm.per_joint(*LEAST_OFFSET), arm.per_joint(*TOLERATED_OFFSET)
-    for i, name in enumerate(arm.joint_names):
+    for i in range(arm.num_joints):
         offset, error = fit.position_offset(i)
         if OFFSET_ERRORS * error > tolerated[i]:
-            hidden.append(name)
+            hidden.append(i)
         elif abs(offset) > max(least[i], OFFSET_ERRORS * error):
             found[i] = (offset, error)
     if found:
-        first, *others = sorted(found, key=lambda i: -_shifted_back(fit, i, found[i][0]).log_likelihood)
+        first, *others = sorted(found, key=lambda i: -_gain_of(_shifted_back(fit.recording, i, found[i][0]), fit))
         sizes = {i: f"{offset:+.2g} {'m' if arm.prismatic[i] else 'rad'}" for i, (offset, _) in found.items()}
         what = f"q{first + 1} has an offset of about {sizes[first]} (standard error {found[first][1]:.2g})"
         if others:
@@ -208,12 +254,16 @@ def _offsets(fit: ChannelFit) -> Iterator[Finding]:
         yield Finding(
             "warning", "position offset", arm.joint_names[first], what, advice, (first, *others), found[first][0]
         )
-    if hidden:
+    yield from _undetectable(arm, hidden)
+
+
+def _undetectable(arm: Arm, joints: list[int]) -> Iterator[Finding]:
+    if joints:
         what = f"an offset of {TOLERATED_OFFSET[0]} rad ({TOLERATED_OFFSET[1]} m) in their positions would not show"
         advice = "this recording cannot tell it from the links' centres of mass; check the zeros of these encoders"
-        yield Finding("note", "undetectable offset", ", ".join(hidden), what, advice)
+        names = ", ".join(arm.joint_names[i] for i in joints)
+        yield Finding("note", "undetectable offset", names, what, advice, tuple(joints))
 
 
-def _shifted_back(fit: ChannelFit, channel: int, offset: float) -> ChannelFit:
-    shift = offset * np.eye(fit.arm.num_joints)[channel]
-    return ChannelFit(replace(fit.recording, q=fit.recording.q - shift), fit.arm)
+def _shifted_back(recording: Recording, channel: int, offset: float) -> Recording:
+    return replace(recording, q=recording.q - offset * np.eye(recording.q.shape[1])[channel])

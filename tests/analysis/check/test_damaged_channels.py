@@ -55,6 +55,19 @@ def test_undamaged_motion_has_no_finding(name, coordinates):
     assert [f for f in check_channels(recording, arm) if f.severity != "note"] == []
 
 
+def test_a_long_motion_is_fitted_in_parts():
+    arm, short, count = load_arm("mtmr"), motion("mtmr"), 6
+    t = np.arange(count * len(short)) / RATE
+    long = Recording(*(np.tile(x, (count, 1)) for x in (short.q, short.tau, short.qd)), t, "actuator", source="long")
+    findings, of_short = check_channels(long, arm), check_channels(short, arm)
+    assert [str(finding) for finding in findings] == [str(finding) for finding in of_short]
+    (refusal,) = check_channels(exchanged(long, 1, 2, "tau"), arm)
+    assert (refusal.kind, refusal.joints) == ("exchanged channels", (1, 2))
+    of_half = long.tau * np.where(t > t[-1] / 2, 2.0, 1.0)[:, None] ** (np.arange(7) == 1)
+    (scale,) = (f for f in check_channels(replace(long, tau=of_half), arm) if f.kind == "effort scale")
+    assert scale.joints == (1,)
+
+
 @pytest.mark.parametrize(("name", "pair"), [("mtmr", (0, 1)), ("mtmr", (5, 6)), ("psm", (4, 5)), ("psm", (1, 2))])
 def test_exchanged_efforts_are_named(name, pair):
     damaged = exchanged(motion(name), *pair, "tau")
