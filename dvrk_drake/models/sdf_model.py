@@ -122,8 +122,8 @@ def _read(path: Path) -> ElementTree.Element:
         root = _parse(read_input(path, ArmError, LARGEST_TEXT))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise ArmError(f"{path}: not a readable SDF: {error}") from error
-    if len(root.findall("model")) != 1:
-        raise ArmError(f"{path}: must hold one <model>")
+    if root.find("model") is None or [e.tag for e in root.iter() if e.tag in ("model", "include")] != ["model"]:
+        raise ArmError(f"{path}: must hold one <model> in <sdf>, with no <model> or <include> in it")
     _check_numbers(path, root)
     for uri in root.iter("uri"):
         # Composed, a model has no folder of its own that Drake could look in.

@@ -134,6 +134,7 @@ def own_arm(folder, change):
         (("<mass>", "<mass>nan "), r"link \S+: <mass> is 'nan .*'; allowed: a finite number"),
         (("<ixx>", "<ixx>inf"), r"link \S+: <ixx> is 'inf.*'; allowed: a finite number"),
         (('multiplier="', 'multiplier="x'), r"joint \S+: multiplier is 'x.*'; allowed: a finite number"),
+        (("</model>", "<model name='a'/></model>"), r"own\.sdf: must hold one <model> in <sdf>, with no <model> or"),
         (("base_link", "bottom_link"), r"own\.yaml: .*own\.sdf: Drake refuses this model: .*base_link"),
     ],
 )

@@ -71,7 +71,7 @@ def changed_content(draw: st.DrawFn, content: object) -> object:
         elif change == "swap":
             other, other_key = draw(st.sampled_from(places))
             container[key], other[other_key] = copy.deepcopy(other[other_key]), copy.deepcopy(value)
-        elif change == "scale" and isinstance(value, int | float):
+        elif change == "scale" and isinstance(value, int | float) and abs(value) < 1e300:
             container[key] = value * draw(st.sampled_from((-1, 0, 1e6, 1e-6, 1.01)))
         elif change == "rename" and isinstance(container, dict):
             container[f"{key}{draw(st.text(max_size=3))}"] = container.pop(key)
