@@ -20,7 +20,7 @@ from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.models.schema_fault import INFINITE, schema_fault
+from dvrk_drake.models.schema_fault import INFINITE, missing_key, schema_fault
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 
 
@@ -143,6 +143,9 @@ class IdentifiedModel:
                 f'{path}: format is "{version}", this version reads "{IdentifiedModel.format}"; identify anew'
             )
         model = typed_content(cls, content, str(path), ModelError, "a model file")
+        # A number that is missing would be 0 without a word.
+        if key := missing_key(cls, content):
+            raise ModelError(f"{path}: {key} is missing")
         try:
             model.check()
         except (ModelError, ArmError) as error:

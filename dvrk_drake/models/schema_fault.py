@@ -73,6 +73,23 @@ def _faults(schema: Any, value: Any, key: str, what: str) -> Iterator[str]:
         yield _wrong(schema, value, key)
 
 
+def missing_key(schema: Any, content: Any, key: str = "") -> str:
+    """The first key that `content`, which fits the schema, lacks, or "". Keys whose default is None are optional."""
+    if content is not None and get_origin(schema) in (Union, types.UnionType):
+        (schema,) = (argument for argument in get_args(schema) if argument is not types.NoneType)
+    inner: Iterator[str] = iter(())
+    if dataclasses.is_dataclass(schema) and isinstance(content, dict):
+        names = {field.name: f"{key}.{field.name}".lstrip(".") for field in dataclasses.fields(schema)}
+        for field in dataclasses.fields(schema):
+            if field.name not in content and field.default is not None:
+                return names[field.name]
+        hints = get_type_hints(schema)
+        inner = (missing_key(hints[name], entry, names[name]) for name, entry in content.items())
+    elif get_origin(schema) is list:
+        inner = (missing_key(get_args(schema)[0], entry, f"{key}[{i}]") for i, entry in enumerate(content))
+    return next(filter(None, inner), "")
+
+
 def _fits(schema: type, value: Any) -> bool:
     """As yaml_load_typed converts, but numbers must be finite."""
     if schema is bool:

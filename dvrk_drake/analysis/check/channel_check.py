@@ -22,6 +22,11 @@ SURE = 20.0
 #: An arm is nearly its own mirror image: inverted channels are accepted only from here on. On the public motions as
 #: recorded they gain up to 46.
 SURE_OF_MIRROR = 100.0
+#: Friction and models of the links disturb efforts at rest: inverted or scaled ones are accepted only from here on. On
+#: the public poses as recorded they gain up to 31 and 19.
+SURE_OF_POSES = 40.0
+#: Hypotheses whose gain is less than this below the largest are named too.
+ALIKE = 10.0
 #: Multiples of the recorded effort that are tried.
 SCALES = (0.5, 2.0)
 #: Friction dissipates the power that the arm's file states within this factor. The public recordings of one PSM on two
@@ -43,8 +48,8 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
     The hypotheses are: the efforts of two channels are exchanged; all signals of two channels are exchanged; the
     effort of a channel, or all its signals, are inverted; the effort of an actuator is a multiple of the true one; the
     position of a channel has an offset. Each is a maximum-a-posteriori fit of `ChannelFit`, compared by its
-    log-likelihood. A wrong scale shows in the power that friction dissipates. Of poses at rest only exchanges are
-    tried: friction and stops hide the rest. A long motion is fitted in parts: their log-likelihoods are added, and a
+    log-likelihood. In a motion, a wrong scale shows in the power that friction dissipates. Poses at rest do not show
+    offsets and inverted positions. A long motion is fitted in parts: their log-likelihoods are added, and a
     warning needs at least half of them.
 
     Args:
@@ -62,9 +67,10 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
         poses = _poses_in_order(recording, arm)
         if len(poses) < LEAST_POSES:
             return []
-        # At a stop, efforts look inverted.
-        refusals = _likeliest([_hypotheses(ChannelFit(poses, arm))])
-        return [finding for finding in refusals if finding.kind == "exchanged channels"]
+        fit = ChannelFit(poses, arm)
+        found = _likeliest([[*_hypotheses(fit), *_scales_at_rest(fit)]], SURE_OF_POSES)
+        # A cable's spring may exceed the weight of a light wrist, and then its effort is opposite to gravity.
+        return [replace(f, severity="warning") if f.kind == "effort sign" else f for f in found]
     hypotheses, others = [], []
     for part in _parts(recording):
         if part.motion(arm):
@@ -95,14 +101,22 @@ def _hypotheses(fit: ChannelFit) -> list[Finding]:
     return [*findings, *_full_inversions(fit)] if fit.moves else findings
 
 
-def _likeliest(parts: list[list[Finding]]) -> list[Finding]:
-    """The hypothesis with the largest gain over all parts, if that is large enough."""
+def _likeliest(parts: list[list[Finding]], sure_of_effort: float = SURE) -> list[Finding]:
+    """The hypothesis with the largest gain over all parts, if that is large enough; it also names those alike.
+
+    `sure_of_effort`: the gain from which a wrong sign or scale of an effort is accepted.
+    """
     gains: dict[tuple, list[Finding]] = {}
     for finding in chain(*parts):
         gains.setdefault((finding.kind, finding.joints, finding.what), []).append(finding)
+    least = {"exchanged channels": SURE, "inverted channel": SURE_OF_MIRROR}
     sums = [replace(same[0], size=sum(finding.size for finding in same)) for same in gains.values()]
-    sure = [f for f in sums if f.size > (SURE_OF_MIRROR if f.kind == "inverted channel" else SURE)]
-    return sorted(sure, key=lambda finding: -finding.size)[:1]
+    sums = sorted(sums, key=lambda finding: -finding.size)
+    best = next((finding for finding in sums if finding.size > least.get(finding.kind, sure_of_effort)), None)
+    if best is None:
+        return []
+    alike = [f.what.partition(":")[0] for f in sums if f is not best and f.size > max(best.size - ALIKE, 0.0)]
+    return [replace(best, advice=f"{best.advice}; nearly as likely: {', '.join(alike)}") if alike else best]
 
 
 def _merged(parts: list[list[Finding]], arm: Arm) -> list[Finding]:
@@ -112,19 +126,30 @@ def _merged(parts: list[list[Finding]], arm: Arm) -> list[Finding]:
         if finding.severity == "warning":
             found.setdefault((finding.kind, finding.joints[0]), []).append(finding)
     warnings = [same[0] for same in found.values() if 2 * len(same) >= len(parts)]
-    hidden = [{i for finding in part if finding.severity == "note" for i in finding.joints} for part in parts]
-    return [*warnings, *_undetectable(arm, sorted(set.intersection(*hidden)) if hidden else [])]
+    hidden, uncertain = (
+        [{i for finding in part if finding.kind == kind for i in finding.joints} for part in parts]
+        for kind in ("undetectable offset", "uncertain effort scale")
+    )
+    in_doubt = set().union(*uncertain) - {joint for kind, joint in found if kind == "effort scale"}
+    in_no_part = set.intersection(*hidden) if hidden else set()
+    return [*warnings, *_uncertain_scale(arm, sorted(in_doubt)), *_undetectable(arm, sorted(in_no_part))]
 
 
 def _poses_in_order(recording: Recording, arm: Arm) -> Recording:
-    """The distinct poses, in joint coordinates, that do not press on a stop or exceed an effort limit."""
+    """The distinct poses, in joint coordinates, that do not press on a stop.
+
+    Efforts beyond a limit stay: they may be those of another joint.
+    """
     poses = average_repeated_poses(recording.in_joint_coordinates(arm), arm)
-    in_order = np.setdiff1d(np.arange(len(poses)), [doubt.row for doubt in find_doubts(poses, arm)])
+    at_stop = [doubt.row for doubt in find_doubts(replace(poses, tau=np.zeros_like(poses.q)), arm)]
+    in_order = np.setdiff1d(np.arange(len(poses)), at_stop)
     return replace(poses, q=poses.q[in_order], tau=poses.measured_effort()[in_order], qd=None, t=None, lines=None)
 
 
 def _effort_exchanges(fit: ChannelFit) -> Iterator[Finding]:
-    for i, j in combinations(map(int, fit.used), 2):
+    for i, j in combinations(sorted(map(int, [*fit.used, *fit.resting])), 2):
+        if i in fit.resting and j in fit.resting:
+            continue
         order = _exchanged(fit.arm.num_joints, i, j)
         gain = fit.gain(fit.in_actuators(np.eye(fit.arm.num_joints)[order]))
         yield _exchange(fit.arm, (i, j), f"tau{i + 1} and tau{j + 1}", gain)
@@ -196,8 +221,11 @@ def _limit_margin(arm: Arm) -> NDArray[np.float64]:
 
 
 def _scales(fit: ChannelFit) -> Iterator[Finding]:
-    """Efforts of actuators at a wrong scale, by the power of friction, or by the fit if the arm's file states none."""
-    power, allowed = fit.dissipation(), _friction_factors(fit)
+    """Efforts of actuators at a wrong scale, by the power of friction, or by the fit if the arm's file states none.
+
+    A note names the actuators whose friction allows a wrong scale of 0.5 or 2 as well.
+    """
+    power, allowed, uncertain = fit.dissipation(), _friction_factors(fit), []
     for i in map(int, fit.used):
         name, ratio = fit.arm.joint_names[i], float(power[i])
         advice = f"check the scale of tau{i + 1} (torque constant, gear ratio, unit) and the condition of the drive"
@@ -206,16 +234,44 @@ def _scales(fit: ChannelFit) -> Iterator[Finding]:
             advice = f"check that tau{i + 1} and the positions are of the same motion"
         elif ratio > 0:
             if 1 / allowed[i] < ratio < allowed[i]:
+                if not 0.5 * allowed[i] < ratio < 2.0 / allowed[i]:
+                    uncertain.append(i)
                 continue
             what = f"friction of its actuator dissipates {ratio:.2g} times the power that the arm's file states"
         else:
-            gains = {s: fit.gain(np.diag(np.where(np.arange(fit.arm.num_joints) == i, s, 1.0))) for s in SCALES}
-            scale = max(gains, key=lambda s: gains[s])
-            if gains[scale] < SURE:
+            scale, gain = _best_scale(fit, i)
+            if gain < SURE:
                 continue
             ratio = 1 / scale
             what = f"effort of its actuator is about {ratio:g} times what the arm's inertia needs"
         yield Finding("warning", "effort scale", name, what, advice, (i,), ratio)
+    yield from _uncertain_scale(fit.arm, uncertain)
+
+
+def _scales_at_rest(fit: ChannelFit) -> Iterator[Finding]:
+    """Efforts of poses at a wrong scale, each with its gain of the log-likelihood as its size."""
+    for i in map(int, fit.used):
+        scale, gain = _best_scale(fit, i)
+        what = f"tau{i + 1} is about {1 / scale:g} times what the arm's weight needs"
+        advice = f"check the scale of tau{i + 1} (torque constant, gear ratio, unit)"
+        yield Finding("warning", "effort scale", fit.arm.joint_names[i], what, advice, (i,), gain)
+
+
+def _best_scale(fit: ChannelFit, channel: int) -> tuple[float, float]:
+    """The scale out of `SCALES` that an effort needs most, and its gain."""
+    gains = {
+        s: fit.gain(fit.in_actuators(np.diag(np.where(np.arange(fit.arm.num_joints) == channel, s, 1.0))))
+        for s in SCALES
+    }
+    return max(gains.items(), key=lambda item: item[1])
+
+
+def _uncertain_scale(arm: Arm, joints: list[int]) -> Iterator[Finding]:
+    if joints:
+        what = "friction is not as in the arm's file, so efforts that are half or twice the true ones would not show"
+        advice = "friction of the day is the likely reason; check the torque constants if it is new"
+        names = ", ".join(arm.joint_names[i] for i in joints)
+        yield Finding("note", "uncertain effort scale", names, what, advice, tuple(joints))
 
 
 def _friction_factors(fit: ChannelFit) -> NDArray[np.float64]:

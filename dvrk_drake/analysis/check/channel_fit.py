@@ -50,7 +50,8 @@ class ChannelFit:
     Attributes:
         recording, arm: what is fitted.
         moves: whether it is a motion.
-        used: (k,) indices of the actuators that move and have an effort; the others are left out.
+        used: (k,) indices of the actuators that move and have an effort; the model explains these.
+        resting: (l,) indices of those with an effort that do not move: a constant explains it.
         log_likelihood: of the recording as it is, up to a constant.
     """
 
@@ -82,7 +83,8 @@ class ChannelFit:
             independent = len(recording)
             moves = np.ptp(arm.transmission.position(self._q), axis=0) > arm.per_joint(*LEAST_RANGE)
         self._independent = min(independent, MOST_INDEPENDENT)
-        self.used = np.flatnonzero(moves & np.any(self._tau != 0, axis=0))
+        measured = np.any(self._tau != 0, axis=0)
+        self.used, self.resting = np.flatnonzero(moves & measured), np.flatnonzero(~moves & measured)
         self.log_likelihood = 0.0
         if len(self.used):
             self._make_columns()
@@ -185,6 +187,9 @@ class ChannelFit:
             x = solve(stacked, np.append(weights, 1.0), np.full(len(mean), 1e-9), non_negative)
             errors = np.maximum(squared_errors(stacked[:-1], x), LEAST_ERROR**2 * efforts)
             weights = self._independent / errors
+        at_rest = tau[:, self.resting]
+        constants = np.sum((at_rest - np.mean(at_rest, axis=0)) ** 2, axis=0)
+        errors = np.append(errors, np.maximum(constants, LEAST_ERROR**2 * np.sum(at_rest**2, axis=0)))
         likelihood = -0.5 * self._independent * float(np.sum(np.log(errors)))
         likelihood -= 0.5 * float(np.sum(precision * (x - mean) ** 2))
         return likelihood, x, np.tensordot(weights, stacked[:-1, :-1, :-1], axes=(0, 0)) + np.diag(precision)

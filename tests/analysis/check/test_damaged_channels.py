@@ -118,15 +118,56 @@ def test_position_offset_is_warned_about(joint, offset):
     assert finding.size == pytest.approx(offset, abs=0.06)
 
 
-@pytest.mark.parametrize("pair", [(0, 1), (1, 2), (3, 4)])
-def test_exchanged_efforts_of_poses_are_named(pair):
+@cache
+def static_poses(still=()):
+    """60 poses of an MTMR with noisy efforts; the joints `still` do not move."""
     arm, generator = load_arm("mtmr"), np.random.default_rng(2)
     q = arm.sample_poses(60, generator, margin=0.1)
+    q[:, list(still)] = q[0, list(still)]
     noise = 0.02 * arm.effort_limits * generator.normal(size=q.shape)
-    poses = Recording(q, holding_torques(arm, q) + noise)
+    return Recording(q, holding_torques(arm, q) + noise)
+
+
+@pytest.mark.parametrize(
+    ("pair", "still"), [((0, 1), ()), ((1, 2), ()), ((3, 4), ()), ((0, 2), (0,)), ((3, 6), (0, 6))]
+)
+def test_exchanged_efforts_of_poses_are_named(pair, still):
+    arm, poses = load_arm("mtmr"), static_poses(still)
     assert check_channels(poses, arm) == []
     found = check_channels(exchanged(poses, *pair, "tau"), arm)
-    assert [(f.kind, f.joints) for f in found] == [("exchanged channels", pair)]
+    assert [(f.severity, f.kind, f.joints) for f in found] == [("refusal", "exchanged channels", pair)]
+
+
+@pytest.mark.parametrize(("factor", "kind"), [(-1.0, "effort sign"), (2.0, "effort scale")])
+def test_wrong_sign_or_scale_of_poses_is_warned_about(factor, kind):
+    poses = static_poses()
+    found = check_channels(replace(poses, tau=poses.tau * factor ** (np.arange(7) == 2)), load_arm("mtmr"))
+    assert [(f.severity, f.kind, f.joints) for f in found] == [("warning", kind, (2,))]
+
+
+def test_a_scale_that_friction_may_hide_is_noted():
+    """On a day with 1.5 times the friction, half the effort dissipates 0.75 times the stated power."""
+    arm, recording = load_arm("mtmr"), motion("mtmr")
+    h = effect_coordinates(arm)["actuator.wrist_roll"]
+    stated = [effect for effect in arm.effects.friction if effect.coordinate == "actuator.wrist_roll"]
+    shapes = sum(
+        e.coefficient * ActuatorEffect(e.coordinate, e.kind, e.scale).column(recording.q @ h, recording.qd @ h)
+        for e in stated
+    )
+    halved = 0.5 * (recording.tau + 0.5 * np.outer(shapes, h)) * (h != 0) + recording.tau * (h == 0)
+    found = check_channels(replace(recording, tau=halved), arm)
+    assert [f.severity for f in found if 6 in f.joints and "scale" in f.kind] == ["note"]
+
+
+@pytest.mark.parametrize("name", ["mtm_2015_good72", "mtm_2015_apr18_all80", "mtmr_2017_sweep40"])
+def test_real_poses_have_no_finding_and_show_exchanges(shared_data, name):
+    path = shared_data / "mtm_static" / f"{name}.csv"
+    if not path.is_file():
+        pytest.skip(f"needs {path}")
+    arm, poses = load_arm("mtmr"), read_recording(path)
+    assert check_channels(poses, arm) == []
+    for pair in [(0, 1), (1, 6), (3, 4), (4, 6)]:
+        assert [f.joints for f in check_channels(exchanged(poses, *pair, "tau"), arm)] == [pair]
 
 
 def test_joints_without_visible_zero_are_noted():
