@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from dvrk_drake.cli.support import add_overwrite, check_output
@@ -57,39 +58,48 @@ def _add_gc_options(group: argparse._ArgumentGroup) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    writers = {"sdf": _write_sdf, "urdf": _write_urdf, "dvrk_gc": _write_gc, "dvrk_kinematic_gc": _write_kinematic}
+    writers = {"sdf": _sdf_writer, "urdf": _urdf_writer, "dvrk_gc": _gc_writer, "dvrk_kinematic_gc": _kinematic_writer}
     outputs = {name: path for name in writers if (path := getattr(options, name)) is not None}
     if not outputs and not options.diff:
         raise DvrkDrakeError(f"nothing to write; name {' or '.join('--' + name.replace('_', '-') for name in writers)}")
     model = _load_model(options.model)
     for path in outputs.values():
         check_output(path, options.model, overwrite=options.overwrite)
-    for name, path in outputs.items():
-        writers[name](model, path, options)
+    # All are computed before the first is written: one that is refused leaves no other behind.
+    for write in [writers[name](model, path, options) for name, path in outputs.items()]:
+        write()
     if options.diff:
         _print_difference(model)
 
 
-def _write_sdf(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
+def _sdf_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
     from dvrk_drake.analysis.export.tables import print_changed_links
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.dynamics.sdf_export import changed_links, write_sdf
 
     arm, bodies = model.load_arm(), model_bodies(model)
-    write_sdf(arm, bodies.links, path, options.model, bodies.rotors)
-    console = make_console()
-    print_changed_links(console, changed_links(arm, bodies.links), bodies)
-    console.print(f"SDF: {path}", soft_wrap=True)
+
+    def write() -> None:
+        write_sdf(arm, bodies.links, path, options.model, bodies.rotors)
+        console = make_console()
+        print_changed_links(console, changed_links(arm, bodies.links), bodies)
+        console.print(f"SDF: {path}", soft_wrap=True)
+
+    return write
 
 
-def _write_urdf(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
+def _urdf_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.dynamics.urdf_export import write_urdf
 
     bodies = model_bodies(model)
-    write_urdf(model.load_arm(), bodies.links, path, options.model, bodies.rotors)
-    print(f"URDF: {path}")
+
+    def write() -> None:
+        write_urdf(model.load_arm(), bodies.links, path, options.model, bodies.rotors)
+        print(f"URDF: {path}")
+
+    return write
 
 
 def _print_difference(model: IdentifiedModel) -> None:
@@ -100,7 +110,7 @@ def _print_difference(model: IdentifiedModel) -> None:
     sys.stdout.write(sdf_difference(model.load_arm(), bodies.links, bodies.rotors))
 
 
-def _write_gc(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
+def _gc_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
     from dvrk_drake.analysis.export.tables import print_compensation
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.dynamics.gravity_compensation import (
@@ -122,20 +132,28 @@ def _write_gc(model: IdentifiedModel, path: str, options: argparse.Namespace) ->
     }
     file = compensation_from_model(model, CompensationOptions(**{k: v for k, v in given.items() if v is not None}))
     arm = model.load_arm()
-    file.save(path, arm.name, f"dvrk-drake export of {options.model}")
-    written = GravityCompensationFile.load(path)
-    print_compensation(make_console(), path, arm, written, largest_differences(written, model))
+
+    def write() -> None:
+        file.save(path, arm.name, f"dvrk-drake export of {options.model}")
+        written = GravityCompensationFile.load(path)
+        print_compensation(make_console(), path, arm, written, largest_differences(written, model))
+
+    return write
 
 
-def _write_kinematic(model: IdentifiedModel, path: str, options: argparse.Namespace) -> None:
+def _kinematic_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
     from dvrk_drake.analysis.export.tables import print_kinematic_compensation
     from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.dynamics.kinematic_compensation import kinematic_compensation
 
     given = {} if options.gc_tolerance is None else {"tolerance": options.gc_tolerance}
     file = kinematic_compensation(model, **given)
-    file.save(path)
-    print_kinematic_compensation(make_console(), path, file)
+
+    def write() -> None:
+        file.save(path)
+        print_kinematic_compensation(make_console(), path, file)
+
+    return write
 
 
 def _compare(options: argparse.Namespace) -> None:

@@ -208,6 +208,8 @@ def _prior(
     """Masses (7,) and first moments (7, 3) in the DH frames of the bodies that the chain's links stand for, at home."""
     context = plant.CreateDefaultContext()
     by_name = {link.link: link.parameters for link in links}
+    if missing := {name for names in _BODIES.values() for name in names} - set(by_name):
+        raise ModelError(f"the SDF has no link {', '.join(sorted(missing))}, as every PSM of the dVRK has")
     others = set(by_name) - {name for names in _BODIES.values() for name in names} - {"counterweight_link"}
     mass, moment = np.zeros(7), np.zeros((7, 3))
     for i, names in {**_BODIES, _LAST: tuple(others)}.items():

@@ -54,7 +54,7 @@ def to_urdf(root: ElementTree.Element, arm: Arm) -> ElementTree.Element:
     """`<robot>` of a composed SDF model.
 
     Raises:
-        ModelError: a joint with a frame of its own, a shape or a joint type that URDF does not have.
+        ModelError: a joint with a frame of its own, or a shape that URDF does not have.
     """
     (model,) = root.findall("model")
     facts = read_sdf_facts(root)
@@ -129,8 +129,6 @@ def _add_joint(
     ranges: Mapping[str, tuple[float, float]],
 ) -> None:
     name, kind = joint.get("name", ""), joint.get("type", "")
-    if kind not in ("revolute", "prismatic", "fixed"):
-        raise ModelError(f"joint {name}: URDF is written of revolute, prismatic and fixed joints, not {kind}")
     if joint.find("pose") is not None:
         raise ModelError(f"joint {name} has a <pose>; URDF has a joint's frame at the child link's only")
     parent, child = _text(joint, "parent"), _text(joint, "child")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ElementTree
 from typing import Literal, get_args
 
@@ -69,14 +70,27 @@ def check_plant(arm: Arm) -> None:
     """Refuses an arm of which no plant can be made, whichever way its loops are closed.
 
     Raises:
-        ArmError: Drake refuses its SDF, or the SDF lacks a frame of a loop.
+        ArmError: Drake refuses its SDF; no joint holds a link; or the SDF lacks a frame of a loop, or one of the frames
+            dh_0, dh_1, ...
     """
     for closure in get_args(Closure):
         try:
             plant = make_arm_plant(arm, closure=closure)
+            _check_links_and_frames(plant, arm)
             plant.CalcMassMatrix(plant.CreateDefaultContext())
         except RuntimeError as error:
             raise ArmError(f"{', '.join(arm.sdf)}: Drake refuses this model: {error}") from error
+
+
+def _check_links_and_frames(plant: MultibodyPlant, arm: Arm) -> None:
+    where = ", ".join(arm.sdf)
+    if floating := [plant.get_body(index).name() for index in plant.GetFloatingBaseBodies()]:
+        raise ArmError(f"{where}: no joint holds {', '.join(sorted(floating))}")
+    instance = plant.GetBodyByName("base_link").model_instance()
+    names = [plant.get_frame(index).name() for index in plant.GetFrameIndices(instance)]
+    numbers = {int(match[1]) for name in names if (match := re.fullmatch(r"dh_(\d+)", name))}
+    if missing := set(range(max(numbers, default=0))) - numbers:
+        raise ArmError(f"{where}: has a frame dh_{max(numbers)}, but no dh_{min(missing)}")
 
 
 def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic") -> MultibodyPlant:
@@ -138,7 +152,9 @@ def _pin(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClosure)
     p_AP, p_BQ = (frame.GetFixedPoseInBodyFrame().translation() for frame in (A, B))
     plant.AddBallConstraint(A.body(), p_AP, B.body(), p_BQ)
     joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
-    (hinge,) = (joint for joint in joints if joint.child_body() is A.body())
+    hinge = next((joint for joint in joints if joint.child_body() is A.body()), None)
+    if hinge is None:
+        raise ArmError(f"{A.body().name()}, which carries the frame {loop.frame_a} of a loop, hangs on no joint")
     p_CH = hinge.frame_on_parent().GetFixedPoseInBodyFrame().translation()
     p_AH = hinge.frame_on_child().GetFixedPoseInBodyFrame().translation()
     plant.AddDistanceConstraint(hinge.parent_body(), p_CH, B.body(), p_BQ, float(np.linalg.norm(p_AP - p_AH)))

@@ -90,12 +90,24 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
     """Reads them from a composed model.
 
     Raises:
-        ArmError: a joint has `<friction>`, which Drake drops silently, or two joints have one name.
+        ArmError: a joint has `<friction>`, which Drake drops silently, is of a type that no arm has, or follows another
+            by a multiple of 0; two joints have one name; there is no base_link, or another link has no mass.
     """
+    if root.find("model/link[@name='base_link']") is None:
+        raise ArmError("the SDF has no link base_link")
+    for link in root.findall("model/link"):
+        # Drake takes 1 kg without a word.
+        if link.get("name") != "base_link" and not float(link.findtext("inertial/mass") or 0.0) > 0:
+            raise ArmError(f"link {link.get('name')} of the SDF needs a positive <inertial><mass>")
     names, mimics, efforts, prismatic = [], {}, {}, set()
     for joint in root.findall("model/joint"):
         name = joint.get("name", "")
-        if joint.get("type") == "fixed":
+        mimic = joint.find(f"{DRAKE}mimic")
+        if (kind := joint.get("type")) not in ("revolute", "prismatic", "fixed"):
+            raise ArmError(f"joint {name} of the SDF has type {kind!r}; allowed: revolute, prismatic, fixed")
+        if kind == "fixed":
+            if mimic is not None:
+                raise ArmError(f"joint {name} of the SDF is fixed, so it cannot follow another joint")
             continue
         if joint.find(".//friction") is not None:
             raise ArmError(f"joint {name} of the SDF has <friction>, which Drake drops silently; model it elsewhere")
@@ -104,13 +116,14 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
         names.append(name)
         if joint.get("type") == "prismatic":
             prismatic.add(name)
-        mimic = joint.find(f"{DRAKE}mimic")
         if mimic is not None:
             mimics[name] = (
                 mimic.get("joint", ""),
                 float(mimic.get("multiplier", "1")),
                 float(mimic.get("offset", "0")),
             )
+            if mimics[name][1] == 0:
+                raise ArmError(f"joint {name} of the SDF follows another with the multiplier 0; make it fixed instead")
         effort = joint.findtext("axis/limit/effort")
         if effort is not None:
             efforts[name] = float(effort)

@@ -1,6 +1,7 @@
 """The dVRK controller's gravity file of a PSM: evaluated in another way, it is our gravity torque."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -108,3 +109,23 @@ def test_command_line(tmp_path, capsys):
     assert "pitch" in capsys.readouterr().out and out.is_file()
     assert main(["export", "mtml", "--dvrk-kinematic-gc", str(tmp_path / "mtml.json")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_an_export_that_is_refused_leaves_no_other_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    model = other_psm()
+    model.effects = [ActuatorEffectEstimate("joint.pitch", "offset", 0.0, 0.1)]
+    model.save("model.yaml")
+    arguments = ["export", "model.yaml", "--sdf", "model.sdf", "--dvrk-kinematic-gc", "gc.json"]
+    assert main([*arguments, "--gc-tolerance", "1e-9"]) == 2
+    assert "cannot hold this model" in capsys.readouterr().err
+    assert os.listdir() == ["model.yaml"]
+    assert main([*arguments, "--gc-tolerance", "10"]) == 0
+    assert {"model.sdf", "gc.json"} < set(os.listdir())
+
+
+def test_an_sdf_without_the_links_of_a_psm_is_refused(monkeypatch):
+    bodies = {0: ("turret_link",), 2: ("back_crank_link",)}
+    monkeypatch.setattr("dvrk_drake.dynamics.kinematic_compensation._BODIES", bodies)
+    with pytest.raises(ModelError, match="the SDF has no link turret_link"):
+        kinematic_compensation(IdentifiedModel.from_arm(load_arm("psm")))

@@ -2,10 +2,12 @@
 
 import math
 import os
+import re
 import tracemalloc
 
 import numpy as np
 import pytest
+import yaml
 from recordings import HEADER, ROW, random_recording
 
 from dvrk_drake.analysis.convert.convert import convert
@@ -115,15 +117,16 @@ def test_aliases_of_aliases_are_refused():
 
 
 def own_arm(folder, change):
-    """An MTM as files of one's own, whose SDF has `change` (old, new) made everywhere."""
+    """An MTM as files of one's own, whose SDF has `change` (regular expression, new) made everywhere."""
     mechanism = (MODELS_FOLDER / "mechanisms/mtm.yaml").read_text()
     url = next(line.split()[1] for line in mechanism.splitlines() if line.startswith("sdf:"))
     (folder / "mechanism.yaml").write_text(mechanism.replace(url, "own.sdf"))
     arm = (MODELS_FOLDER / "arms/mtmr.yaml").read_text().replace("mechanism: mtm", "mechanism: mechanism.yaml")
     (folder / "own.yaml").write_text(arm)
     sdf = (MODELS_FOLDER / "sdf/mtm.sdf").read_text()
-    assert change[0] in sdf
-    (folder / "own.sdf").write_text(sdf.replace(*change))
+    changed = re.sub(*change, sdf, flags=re.DOTALL)
+    assert changed != sdf
+    (folder / "own.sdf").write_text(changed)
     return str(folder / "own.yaml")
 
 
@@ -135,7 +138,17 @@ def own_arm(folder, change):
         (("<ixx>", "<ixx>inf"), r"link \S+: <ixx> is 'inf.*'; allowed: a finite number"),
         (('multiplier="', 'multiplier="x'), r"joint \S+: multiplier is 'x.*'; allowed: a finite number"),
         (("</model>", "<model name='a'/></model>"), r"own\.sdf: must hold one <model> in <sdf>, with no <model> or"),
-        (("base_link", "bottom_link"), r"own\.yaml: .*own\.sdf: Drake refuses this model: .*base_link"),
+        (('type="revolute"', 'type="ball"'), r"own\.yaml: joint \S+ of the SDF has type 'ball'; allowed: revolute"),
+        (("<mass>", "<mass>-"), r"link \S+ of the SDF needs a positive <inertial><mass>"),
+        (("<inertial>.*?</inertial>", ""), r"link \S+ of the SDF needs a positive <inertial><mass>"),
+        (('multiplier="[^"]*"', 'multiplier="0"'), r"joint \S+ of the SDF follows another with the multiplier 0"),
+        (('"dh_2"', '"dh_x"'), r"own\.sdf: has a frame dh_7, but no dh_2"),
+        (
+            (r'<joint name="\w+" type="revolute">(?:(?!</joint>).)*mimic.*?</joint>', ""),
+            r"own\.sdf: no joint holds \w+",
+        ),
+        (("<child>upper_arm_link", "<child>no_link"), r"own\.yaml: .*own\.sdf: Drake refuses this model: .*no_link"),
+        (("base_link", "bottom_link"), r"own\.yaml: the SDF has no link base_link"),
     ],
 )
 def test_an_sdf_that_makes_no_arm_is_refused(change, message, tmp_path):
@@ -165,6 +178,20 @@ def test_a_model_with_a_number_that_is_none_is_refused(key, number, tmp_path, ca
     assert main(["validate", str(path), str(tmp_path / "r.csv")]) == 2
     assert f"{path}: {key} is {number}; allowed: a finite number" in capsys.readouterr().err
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["model.yaml", "r.csv"]
+
+
+@pytest.mark.parametrize("key", ["format", "gravity", "base_parameters[0].value", "joints[6].trust", "provenance.rank"])
+def test_a_model_with_a_missing_key_is_refused(key, tmp_path):
+    path = tmp_path / "model.yaml"
+    IdentifiedModel.from_arm(ARM).save(path)
+    content = yaml.safe_load(path.read_text())
+    holder, (*outer, last) = content, re.findall(r"\w+", key)
+    for part in outer:
+        holder = holder[int(part) if part.isdigit() else part]
+    del holder[last]
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(ModelError, match=re.escape(f"model.yaml: {key} is missing")):
+        IdentifiedModel.load(path)
 
 
 # A large CSV.
