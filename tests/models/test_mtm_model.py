@@ -265,8 +265,8 @@ def test_friction_tag_is_forbidden(tmp_path):
 
     path = tmp_path / "a.sdf"
     path.write_text(
-        '<sdf version="1.9"><model name="a"><link name="base_link"/><joint name="j" type="revolute"><axis><xyz>0 0 1</xyz>'
-        "<dynamics><friction>1</friction></dynamics></axis></joint></model></sdf>"
+        '<sdf version="1.9"><model name="a"><link name="base_link"/><joint name="j" type="revolute">'
+        "<axis><xyz>0 0 1</xyz><dynamics><friction>1</friction></dynamics></axis></joint></model></sdf>"
     )
     with pytest.raises(ArmError, match="joint j of the SDF has <friction>, which Drake drops silently"):
         read_sdf_facts(compose_sdf([str(path)]))
