@@ -11,15 +11,15 @@ from pydrake.lcm import DrakeLcm, DrakeLcmParams
 
 from dvrk_drake.errors import DvrkDrakeError
 
-#: How long a message to oneself may take, on a busy machine [ms].
-_OWN_MESSAGE = 2000
+#: How long messages to oneself may take, on a busy machine, and the time between them: UDP may lose one [s].
+_OWN_MESSAGES, _NEXT_MESSAGE = 5.0, 0.2
 
 
 def open_lcm(url: str = "") -> DrakeLcm:
     """The network at `url`; empty: the environment's LCM_DEFAULT_URL, or LCM's own default.
 
     Raises:
-        DvrkDrakeError: LCM does not know such a network, or a message to oneself does not come back.
+        DvrkDrakeError: LCM does not know such a network, or no message to oneself comes back.
     """
     # Deferred: a network that only publishes needs no thread that wakes for every message.
     network = DrakeLcm(DrakeLcmParams(lcm_url=url, defer_initialization=True))
@@ -28,8 +28,10 @@ def open_lcm(url: str = "") -> DrakeLcm:
         own = lcm.LCM(name)
         channel, heard = f"DVRK_SELF_TEST_{secrets.token_hex(8)}", []
         own.subscribe(channel, lambda channel, data: heard.append(data))
-        own.publish(channel, b"")
-        own.handle_timeout(_OWN_MESSAGE)
+        end = time.monotonic() + _OWN_MESSAGES
+        while not heard and time.monotonic() < end:
+            own.publish(channel, b"")
+            handle_message(own, _NEXT_MESSAGE)
     except (RuntimeError, OSError) as error:
         raise DvrkDrakeError(f'LCM network "{name}" cannot be used: {error}; e.g. udpm://239.255.76.67:7667') from error
     if not heard:

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import lcm
 import numpy as np
 import pytest
 from patience import PATIENCE
@@ -82,6 +83,24 @@ def test_realtime_is_real_time_and_locks_memory():
 def test_a_network_that_does_not_work_is_an_error(url):
     with pytest.raises(DvrkDrakeError, match=f'LCM network "{url}" cannot be used'):
         open_lcm(url)
+
+
+class LossyLcm(lcm.LCM):
+    """Loses the first two messages that any instance publishes."""
+
+    lost = 0
+
+    def publish(self, channel, data):
+        if LossyLcm.lost < 2:
+            LossyLcm.lost += 1
+        else:
+            super().publish(channel, data)
+
+
+def test_a_network_that_loses_a_message_can_be_used(monkeypatch):
+    monkeypatch.setattr("dvrk_drake.processes.lcm_network.lcm.LCM", LossyLcm)
+    assert open_lcm("memq://").get_lcm_url() == "memq://"
+    assert LossyLcm.lost == 2
 
 
 def test_a_network_without_a_route_is_an_error():
