@@ -229,9 +229,7 @@ def ready_controller(
     with closing(ArmLink(arm, url)) as link:
         if reset:
             reset_fault(link, _warn)
-        status, period = first_status(link)
-    if status.gravity_compensation:
-        _warn(f"{arm.name} adds gravity compensation of its own: switch it off, or it is compensated twice")
+        _, period = first_status(link)
     controller = ArmController(arm, model, mode, period, friction, gains)
     if options.realtime:
         for warning in make_realtime():

@@ -173,11 +173,16 @@ def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
 
 
 def _check(status: lcmt_dvrk_status, name: str, session: int, advice: str = "") -> None:
-    """Refuses an arm that was restarted or has a fault."""
+    """Refuses an arm that was restarted, has a fault, or adds gravity compensation of its own."""
     if status.session_id != session:
         raise ControllerError(f"{name} was restarted: look at it, then start again")
     if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
         raise ControllerError(f"{name} has a fault: {status.fault_text}" + (f". {advice}" if advice else ""))
+    if status.gravity_compensation:
+        raise ControllerError(
+            f"{name} adds gravity compensation of its own, and two of them throw the arm upward: switch it off there "
+            "(gravity_compensation in its status)"
+        )
 
 
 #: Hears a status and the time [s], and says the desired state (2n), or None for the controller's own.
@@ -218,8 +223,6 @@ def control(
             acted, before = now, status
         elif now > acted + _PATIENCE:
             why = takeover_reason(status, before, answers)
-            if status.gravity_compensation:
-                why += "; it adds gravity compensation of its own: switch that off"
             raise ControllerError(f"{link.arm.name} lets no command act for {_PATIENCE:g} s; {why}")
         if now >= tell_at:
             tell(live.make(status, now, link.lost))

@@ -254,9 +254,16 @@ def test_statuses_of_the_past_are_not_heard_as_the_present(replays):
 def test_an_arm_that_lets_no_command_act_is_given_up_with_the_reason(controller, monkeypatch):
     monkeypatch.setattr("dvrk_drake.processes.control._PATIENCE", 0.3)
     link = GuardedArm()
-    link.status.gravity_compensation = True
     link.status.effort_measured = list(2 * LIMIT)  # more than commands may use
-    with pytest.raises(
-        ControllerError, match=r"lets no command act for 0.3 s; the last refusal is: .*: switch that off"
-    ):
+    with pytest.raises(ControllerError, match=r"lets no command act for 0.3 s; the last refusal is: "):
         control(link, controller, lambda: False, lambda status: None)
+
+
+def test_an_arm_that_compensates_gravity_itself_gets_no_command(controller):
+    link = GuardedArm()
+    link.status.gravity_compensation = True
+    with pytest.raises(ControllerError, match="adds gravity compensation of its own.*switch it off"):
+        first_status(link)
+    with pytest.raises(ControllerError, match="adds gravity compensation of its own.*switch it off"):
+        control(link, controller, lambda: False, lambda status: None)
+    assert link.commands == []
