@@ -29,8 +29,8 @@ from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, read_sdf_facts
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
-#: A joint that slides further has its limits in another unit [m].
-LONGEST_TRAVEL = 2.0
+#: A joint that slides or turns further has its limits in another unit [m], [rad]; an MTM's roll turns to -8.4 rad.
+LONGEST_TRAVEL, LARGEST_ANGLE = 2.0, 12.6
 
 Part = TypeVar("Part", Mechanism, Instrument)
 
@@ -229,12 +229,14 @@ def _build_arm(
     if missing := set(joints) - set(facts.joint_names):
         raise ArmError(f"{path}: its SDF has no joint {', '.join(sorted(missing))}")
     for joint, limits_of_joint in position_limits.items():
-        _check_limits(path, joint, limits_of_joint, joint in facts.prismatic)
+        _check_limits(path, f"position_limits.{joint}", limits_of_joint, joint in facts.prismatic)
     limits = np.array([position_limits[j] for j in joints])
     gains = Gains(*(getattr(mechanism.gains, k) + getattr(instrument.gains, k) for k in ("kp", "kd", "ki")))
     for which, values in dataclasses.asdict(gains).items():
         if len(values) != len(joints):
             raise ArmError(f"{path}: gains.{which} has {len(values)} numbers, one a joint is {len(joints)}")
+    if fault := gains.fault():
+        raise ArmError(f"{path}: gains.{fault}")
     motion = _motion_settings(path, mechanism, instrument)
     G = np.zeros((len(facts.joint_names), len(joints)))
     c = np.zeros(len(facts.joint_names))
@@ -292,24 +294,23 @@ def _motion_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -
     )
 
 
-def _check_limits(path: Path, joint: str, limits: list[float], prismatic: bool) -> None:
+def _check_limits(path: Path, key: str, limits: list[float], prismatic: bool = False) -> None:
     if len(limits) != 2 or not limits[0] < limits[1] or not np.all(np.isfinite(limits)):
-        raise ArmError(f"{path}: position_limits.{joint} must be [lower, upper], finite, with lower < upper")
-    if prismatic and max(map(abs, limits)) > LONGEST_TRAVEL:
-        raise ArmError(f"{path}: position_limits.{joint} = {limits} must be in m, at most {LONGEST_TRAVEL:g} m")
+        raise ArmError(f"{path}: {key} must be [lower, upper], finite, with lower < upper")
+    largest, unit, other = (LONGEST_TRAVEL, "m", "millimetres") if prismatic else (LARGEST_ANGLE, "rad", "degrees")
+    if max(map(abs, limits)) > largest:
+        raise ArmError(f"{path}: {key} = {limits} must be in {unit}, at most {largest:g} {unit}; are these {other}?")
 
 
 def _coupled_limits(path: Path, description: ArmDescription, mechanism: Mechanism) -> tuple[CoupledLimit, ...]:
     limits = {limit.name: limit for limit in mechanism.coupled_limits}
     for limit in mechanism.coupled_limits:
         _row(path, f"coupled_limits: {limit.name}", limit.coefficients, mechanism.joints)
-        if not limit.lower < limit.upper:
-            raise ArmError(f"{path}: coupled_limits: {limit.name} must have lower < upper")
+        _check_limits(path, f"coupled_limits.{limit.name}", [limit.lower, limit.upper])
     for name, bounds in description.coupled_limits.items():
         if name not in limits:
             raise ArmError(f'{path}: unknown coupled limit "{name}"; known: {", ".join(limits) or "none"}')
-        if len(bounds) != 2 or bounds[0] >= bounds[1]:
-            raise ArmError(f"{path}: coupled_limits.{name} must be [lower, upper] with lower < upper")
+        _check_limits(path, f"coupled_limits.{name}", bounds)
         limits[name] = dataclasses.replace(limits[name], lower=bounds[0], upper=bounds[1])
     return tuple(limits.values())
 

@@ -34,6 +34,14 @@ class Gains:
     kd: list[float] = field(default_factory=list)
     ki: list[float] = field(default_factory=list)
 
+    def fault(self) -> str:
+        """The first gain with a sign that makes a controller unstable, or ""."""
+        for name, least in (("kp", "more than 0"), ("kd", "0 or more"), ("ki", "0 or more")):
+            for i, gain in enumerate(getattr(self, name)):
+                if not (gain > 0 if name == "kp" else gain >= 0):
+                    return f"{name}[{i}] is {gain:g}; allowed: {least}"
+        return ""
+
 
 @dataclass
 class MotionSettings:

@@ -4,6 +4,7 @@ import math
 import os
 import re
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -154,6 +155,29 @@ def own_arm(folder, change):
 def test_an_sdf_that_makes_no_arm_is_refused(change, message, tmp_path):
     with pytest.raises(ArmError, match=message):
         load_arm(own_arm(tmp_path, change))
+
+
+@pytest.mark.parametrize(("name", "gain"), [("kp", 0.0), ("kp", -1.0), ("kd", -1.0), ("ki", -1.0)])
+def test_gains_of_the_wrong_sign_are_refused(name, gain, tmp_path):
+    path = own_arm(tmp_path, ("<!--.*?-->", ""))
+    mechanism = yaml.safe_load((tmp_path / "mechanism.yaml").read_text())
+    mechanism["gains"][name][3] = gain
+    (tmp_path / "mechanism.yaml").write_text(yaml.safe_dump(mechanism))
+    with pytest.raises(ArmError, match=rf"own\.yaml: gains\.{name}\[3\] is {gain:g}; allowed: "):
+        load_arm(path)
+
+
+@pytest.mark.parametrize("key", ["position_limits.outer_yaw", "coupled_limits.parallelogram"])
+def test_limits_in_degrees_are_refused(key, tmp_path):
+    table, name = key.split(".")
+    path = Path(own_arm(tmp_path, ("<!--.*?-->", "")))
+    content = yaml.safe_load(path.read_text())
+    content.setdefault(table, {})[name] = [-40, 65]
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(
+        ArmError, match=rf"own\.yaml: {key} = .* must be in rad, at most 12\.6 rad; are these degrees\?"
+    ):
+        load_arm(str(path))
 
 
 @pytest.mark.parametrize("key", ["base_parameters[3].value", "joints[2].trust", "gravity[0]", "joints[0].rms_fit"])

@@ -262,8 +262,8 @@ def test_an_arm_that_lets_no_command_act_is_given_up_with_the_reason(controller,
 def test_an_arm_that_compensates_gravity_itself_gets_no_command(controller):
     link = GuardedArm()
     link.status.gravity_compensation = True
-    with pytest.raises(ControllerError, match="adds gravity compensation of its own.*switch it off"):
+    with pytest.raises(ControllerError, match=r"adds gravity compensation of its own.*switch it off"):
         first_status(link)
-    with pytest.raises(ControllerError, match="adds gravity compensation of its own.*switch it off"):
+    with pytest.raises(ControllerError, match=r"adds gravity compensation of its own.*switch it off"):
         control(link, controller, lambda: False, lambda status: None)
     assert link.commands == []

@@ -332,6 +332,9 @@ def test_gains_of_a_file_are_what_an_arm_is_held_with(tmp_path):
         ),
         ("kp: fast\n", 'kp is "fast"; allowed: a list of numbers'),
         ("kp: [1, fast]\n", r'kp\[1\] is "fast"; allowed: a number'),
+        ("kp: [1, 0]\nkd: [1, 1]\nki: [0, 0]\n", r"kp\[1\] is 0; allowed: more than 0"),
+        ("kp: [1]\nkd: [-0.1]\nki: [0]\n", r"kd\[0\] is -0\.1; allowed: 0 or more"),
+        ("kp: [1]\nkd: [1]\nki: [-3]\n", r"ki\[0\] is -3; allowed: 0 or more"),
         ("- 1\n", "must be keys and values, not .*; allowed in a file of gains: kp, kd, ki"),
     ],
 )
