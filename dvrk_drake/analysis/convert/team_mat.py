@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -112,7 +113,10 @@ def _team_array(path: Path, content: bytes, variable: str | None) -> tuple[str, 
 
 def _matlab(path: Path, read: Callable[[], _T]) -> _T:
     try:
-        return read()
+        with warnings.catch_warnings():
+            # "returned data may be corrupt"
+            warnings.simplefilter("error", UserWarning)
+            return read()
     except Exception as error:
         # A damaged file makes scipy raise anything: ValueError, OSError, MatReadError, zlib.error, ...
         text = " ".join(str(error).split())

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import struct
+import warnings
+
 import numpy as np
 import pytest
 import scipy.io
@@ -86,6 +89,15 @@ def test_team_mat_of_version_7_3_is_refused_with_a_remedy(tmp_path):
         path.write_bytes(content)
         assert detect_format(path) == "team-mat"
         assert_refused(r"new\.mat: is a MATLAB v7\.3 \(HDF5\) file.*-v7'", read_team_mat, path)
+
+
+def test_team_mat_with_numbers_of_another_machine_is_refused(tmp_path):
+    """MATLAB 4 on a VAX: scipy warns that what it returns may be corrupt."""
+    path = tmp_path / "data.mat"
+    path.write_bytes(struct.pack("<5i", 2000, 8, 2, 0, 2) + b"a\0" + bytes(8 * 2 * 8))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert_refused("not a MATLAB file that can be read: .*may be corrupt", read_team_mat, path)
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "short", "text", "noise"])
