@@ -21,6 +21,9 @@ from dvrk_drake.models.recording import Recording, read_recording, write_recordi
 
 pytestmark = pytest.mark.slow
 
+#: Of the columns in the order of a Recording.
+PREFIXES = ("q", "tau", "qd")
+
 
 @cache
 def motion(name):
@@ -215,3 +218,22 @@ def test_real_motions_have_no_finding(shared_data, name, coordinates):
     if coordinates == "joint":  # as `convert` writes it
         recording = wpi_in_joint_coordinates(read_wpi_csv(path), arm)
     assert [f for f in check_channels(recording, arm) if f.severity != "note"] == []
+
+
+@pytest.mark.parametrize("name", ["psm1_1", "psm1_2", "psm1_3", "psm2_1", "psm2_2"])
+def test_other_arms_of_which_three_joints_moved(shared_data, name):
+    """Two PSMs that no constant of the check was chosen with."""
+    path = shared_data / "psm_three_joints" / f"{name}.csv"
+    if not path.is_file():
+        pytest.skip(f"needs {path}")
+    arm, columns = load_arm("psm"), np.genfromtxt(path, delimiter=",", names=True)
+    blocks = [[columns[f"{prefix}{i}"] if i < 4 else 0.0 * columns["t"] for i in range(1, 8)] for prefix in PREFIXES]
+    recording = Recording(*(np.array(block).T for block in blocks), columns["t"], "joint", source=name)
+    assert [f for f in check_channels(recording, arm) if f.severity != "note"] == []
+    for pair in ((0, 1), (0, 2), (1, 2)):
+        (refusal,) = check_channels(exchanged(recording, *pair, "tau"), arm)
+        assert (refusal.kind, refusal.joints) == ("exchanged channels", pair)
+    for joint in range(3):
+        signs = np.where(np.arange(7) == joint, -1.0, 1.0)
+        (refusal,) = check_channels(replace(recording, tau=recording.tau * signs), arm)
+        assert (refusal.kind, refusal.joints) == ("effort sign", (joint,))
