@@ -22,9 +22,9 @@ SURE = 20.0
 #: An arm is nearly its own mirror image: inverted channels are accepted only from here on. On the public motions as
 #: recorded they gain up to 46.
 SURE_OF_MIRROR = 100.0
-#: Friction and models of the links disturb efforts at rest: inverted or scaled ones are accepted only from here on. On
-#: the public poses as recorded they gain up to 31 and 19.
-SURE_OF_POSES = 40.0
+#: Friction disturbs efforts at rest: there, exchanged ones are accepted from the first on, inverted or scaled ones from
+#: the second. On the public poses as recorded they gain up to 10, 31 and 19.
+SURE_AT_REST, SURE_OF_EFFORT_AT_REST = 30.0, 40.0
 #: Hypotheses whose gain is less than this below the largest are named too.
 ALIKE = 10.0
 #: Multiples of the recorded effort that are tried.
@@ -68,7 +68,7 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
         if len(poses) < LEAST_POSES:
             return []
         fit = ChannelFit(poses, arm)
-        found = _likeliest([[*_hypotheses(fit), *_scales_at_rest(fit)]], SURE_OF_POSES)
+        found = _likeliest([[*_hypotheses(fit), *_scales_at_rest(fit)]], at_rest=True)
         # A cable's spring may exceed the weight of a light wrist, and then its effort is opposite to gravity.
         return [replace(f, severity="warning") if f.kind == "effort sign" else f for f in found]
     hypotheses, others = [], []
@@ -101,15 +101,13 @@ def _hypotheses(fit: ChannelFit) -> list[Finding]:
     return [*findings, *_full_inversions(fit)] if fit.moves else findings
 
 
-def _likeliest(parts: list[list[Finding]], sure_of_effort: float = SURE) -> list[Finding]:
-    """The hypothesis with the largest gain over all parts, if that is large enough; it also names those alike.
-
-    `sure_of_effort`: the gain from which a wrong sign or scale of an effort is accepted.
-    """
+def _likeliest(parts: list[list[Finding]], *, at_rest: bool = False) -> list[Finding]:
+    """The hypothesis with the largest gain over all parts, if that is large enough; it also names those alike."""
     gains: dict[tuple, list[Finding]] = {}
     for finding in chain(*parts):
         gains.setdefault((finding.kind, finding.joints, finding.what), []).append(finding)
-    least = {"exchanged channels": SURE, "inverted channel": SURE_OF_MIRROR}
+    least = {"exchanged channels": SURE_AT_REST if at_rest else SURE, "inverted channel": SURE_OF_MIRROR}
+    sure_of_effort = SURE_OF_EFFORT_AT_REST if at_rest else SURE
     sums = [replace(same[0], size=sum(finding.size for finding in same)) for same in gains.values()]
     sums = sorted(sums, key=lambda finding: -finding.size)
     best = next((finding for finding in sums if finding.size > least.get(finding.kind, sure_of_effort)), None)
