@@ -76,7 +76,7 @@ def changed_content(draw: st.DrawFn, content: object) -> object:
         elif change == "rename" and isinstance(container, dict):
             container[f"{key}{draw(st.text(max_size=3))}"] = container.pop(key)
         else:
-            container[key] = draw(JUNK)
+            container[key] = copy.deepcopy(draw(JUNK))  # a later change must not change what is drawn next
     return content
 
 
