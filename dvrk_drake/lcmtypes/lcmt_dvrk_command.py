@@ -7,8 +7,8 @@ DO NOT MODIFY BY HAND!!!!
 What a controller asks of one arm of a da Vinci Research Kit. Channel: DVRK_COMMAND_<ARM>, e.g. DVRK_COMMAND_MTML.
 
 One command answers one status: read a DVRK_STATUS_<ARM> message, compute, echo its session_id and utime, send.
-The arm obeys a command until 50 ms after status_utime, whenever it came, and then holds its pose by itself, without a
-fault; what it refuses and why is in lcmt_dvrk_status. The rules are those of dvrk_drake/systems/guard/command_guard.py.
+The arm obeys a command until 50 ms after status_utime, whenever it came, and then holds its pose by itself until an
+operator resumes; what it refuses and why is in lcmt_dvrk_status. The rules are those of dvrk_drake/systems/guard/command_guard.py.
 
 Units are SI: rad, rad/s, N m; m, m/s, N on a prismatic joint. Joints are in the dVRK's order; the jaw of a patient
 side manipulator is its last joint, also where ROS gives it a topic of its own.
@@ -85,7 +85,8 @@ class lcmt_dvrk_command(object):
 
         self.reset_fault = False
         """
-        changes from false to true: clear a latched fault; only with control_mode HOLD
+        changes from false to true: clear a latched fault, or resume after the watchdog took over; only with control_mode
+        HOLD
         LCM Type: boolean
         """
 

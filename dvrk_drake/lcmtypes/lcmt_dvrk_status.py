@@ -86,6 +86,8 @@ class lcmt_dvrk_status(object):
     """ another sender is in command; this is a fault as well """
     REFUSAL_SUDDEN_OFF = 16
     """ OFF that does not follow a HOLD of the same sender """
+    REFUSAL_RESUME = 17
+    """ POSITION or EFFORT after the watchdog took over, before an operator resumed; fault_text is why it did """
     FLAG_EFFORT_CLAMPED = 1
     """ joint_flags, bits: the commanded effort was beyond the motor's limit """
     FLAG_RATE_LIMITED = 2
@@ -131,7 +133,8 @@ class lcmt_dvrk_status(object):
 
         self.accepted_modes = 0
         """
-        bit 1 << control_mode for each mode that a command may have now: in a fault only HOLD; OFF only in HOLD and OFF
+        bit 1 << control_mode for each mode that a command may have now: in a fault only HOLD; OFF only in HOLD and OFF.
+        Not POSITION and EFFORT after the watchdog took over, until an operator resumes
         LCM Type: int8_t
         """
 
@@ -149,7 +152,8 @@ class lcmt_dvrk_status(object):
 
         self.fault_text = ""
         """
-        the fault in words with its numbers; empty if there is none
+        the fault in words with its numbers. If fault_code is FAULT_NONE: why the watchdog took over, until an operator
+        resumes. Else empty
         LCM Type: string
         """
 

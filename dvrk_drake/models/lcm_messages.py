@@ -36,6 +36,7 @@ _REFUSALS = {
     lcmt_dvrk_status.REFUSAL_START_OUTSIDE: "starting while the arm is beyond a position limit",
     lcmt_dvrk_status.REFUSAL_OTHER_SENDER: "from a second sender",
     lcmt_dvrk_status.REFUSAL_SUDDEN_OFF: "off without a hold before",
+    lcmt_dvrk_status.REFUSAL_RESUME: "before an operator resumed",
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
@@ -45,12 +46,20 @@ class CommandGuard:
         HOLD --OFF after a HOLD--> OFF --HOLD--> HOLD       any --HOLD--> HOLD, but from FAULT
         HOLD --POSITION, EFFORT--> STARTING --good for start_time--> POSITION, EFFORT
         STARTING --refused, expired--> HOLD
-        POSITION, EFFORT --HOLD, expired, sender's clock jumped--> HOLD; --the other mode--> STARTING
+        POSITION, EFFORT --HOLD--> HOLD; --expired, sender's clock jumped--> HOLD until a resume
+        POSITION, EFFORT --the other mode--> STARTING
         any --fault--> FAULT --HOLD with reset_fault, changed from false to true--> HOLD
 
     **Expiry**: a command is obeyed until `expiry` after the measurement that it answers (its `status_utime`), whenever
-    it came; who answers one measurement again and again gains no time. Then the arm holds, without a fault: nobody
-    need find out what happened before it is safe, and the next sender is watched as the first was.
+    it came; who answers one measurement again and again gains no time. Its age is the larger one of two: by the arm's
+    clock, and by the wall clock, where there is one, the time since it came plus its age then. So a command expires
+    also if the arm's clock is late or was stopped. Then the arm holds.
+
+    **Resume**: when a command in force expired, the sender's clock jumped or `_take_over` was called, the watchdog took
+    over. The guard then refuses POSITION and EFFORT until an operator resumes, in the way in which a fault is reset;
+    `hold_reason` is why. It is no fault: the arm holds, and OFF is allowed. A HOLD command before the silence, and
+    STARTING that ends, need no resume. `GuardSettings.resume_automatically` switches this off; the next sender is then
+    watched as the first was.
 
     **What is refused** (`lcmt_dvrk_status.REFUSAL_*` has the list): what is unreadable, of another arm, size or
     session, not finite, expired when it comes, out of order or sent twice, in a mode that is not accepted now. It does
@@ -75,12 +84,17 @@ class CommandGuard:
     else latches the measured pose; POSITION starts from the held pose; EFFORT starts from the measured effort, and the
     soft wall, for whoever starts inside it, comes on in `start_time`; each at its limited rate.
 
-    **Clocks**: the sender's and the arm's are never compared, only how far each went between two commands; so they need
+    **Clocks**: the sender's clock and the arm's are never compared, only how far each went between two commands; so they need
     not be synchronised, and a jump of either is seen. A jump of the arm's clock forward expires what is in force.
     """
 
     def __init__(
-        self, arm: Arm, session_id: int, settings: GuardSettings | None = None, modes: tuple[int, ...] | None = None
+        self,
+        arm: Arm,
+        session_id: int,
+        settings: GuardSettings | None = None,
+        modes: tuple[int, ...] | None = None,
+        wall_clock: Callable[[], int] | None = None,
     ):
         """A guard in HOLD.
 
@@ -89,6 +103,8 @@ class CommandGuard:
             session_id: not 0; drawn anew whenever the arm starts.
             settings: the defaults of GuardSettings if None.
             modes: which of POSITION and EFFORT are accepted; both if None.
+            wall_clock: monotonic time of the computer [us], by which commands expire as well; None: by the arm's clock
+                only, as for an arm in a simulated Diagram. Copies of the guard share it.
 
         Raises:
             StationError: no session, or settings or an arm's gains that guard nothing.
@@ -101,10 +117,13 @@ class CommandGuard:
         self.arm_name, self.num_joints, self.session_id = arm.name, arm.num_joints, session_id
         self.state = lcmt_dvrk_status.STATE_HOLD
         self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
+        #: Why the watchdog took over, until an operator resumes; or "".
+        self.hold_reason = ""
         self.refusal_code = lcmt_dvrk_status.REFUSAL_NONE
         self.counts = GuardCounts()
         self._modes = tuple(_ACTIVE) if modes is None else modes
         self._expiry = round(1e6 * self.settings.expiry)
+        self._wall_clock = wall_clock
         self._stream = CommandStream(self._expiry, round(1e6 * self.settings.clock_tolerance))
         self._force = CommandInForce()
         self._powered = True
@@ -131,7 +150,7 @@ class CommandGuard:
         modes = [lcmt_dvrk_command.HOLD]
         if self.state in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_HOLD):
             modes.append(lcmt_dvrk_command.OFF)
-        if self.state != lcmt_dvrk_status.STATE_OFF:
+        if self.state != lcmt_dvrk_status.STATE_OFF and not self.hold_reason:
             modes.extend(self._modes)
         return sum(1 << mode for mode in modes)
 
@@ -220,9 +239,32 @@ class CommandGuard:
         return self._follower.target if self._measured.q is None else self._measured.q
 
     def _expire(self, utime: int) -> None:
-        if self._is_watched_or_in_force() and utime - self._force.status_utime > self._expiry:
-            self.counts.expired += self.state != lcmt_dvrk_status.STATE_STARTING
-            self._hold()
+        if not self._is_watched_or_in_force():
+            return
+        age, clock = utime - self._force.status_utime, "the arm's clock"
+        if self._wall_clock is not None and (by_wall := self._wall_clock() - self._force.wall_utime) > age:
+            age, clock = by_wall, "the wall clock"
+        if age <= self._expiry:
+            return
+        if self.state == lcmt_dvrk_status.STATE_STARTING:
+            self._hold()  # nothing acted
+            return
+        self.counts.expired += 1
+        self._take_over(
+            f"the last command expired: {1e-3 * age:.1f} ms old by {clock}, {1e-3 * self._expiry:g} ms are allowed"
+        )
+
+    def _take_over(self, reason: str) -> None:
+        """Goes to HOLD until an operator resumes; has no effect in OFF and in FAULT.
+
+        Args:
+            reason: in words; the first one stays until the resume.
+        """
+        if self.state in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_FAULT):
+            return
+        self._hold()
+        if not self.settings.resume_automatically:
+            self.hold_reason = self.hold_reason or reason
 
     def _refusal_now(self, command: lcmt_dvrk_command, utime: int) -> int:
         """REFUSAL_* of a command that is good by itself, given who sent what before and what the arm is doing."""
@@ -232,12 +274,16 @@ class CommandGuard:
         if code == lcmt_dvrk_status.REFUSAL_OTHER_SENDER:
             both = f"senders {before} and {command.sender_id} command at the same time"
             self.report_fault(both, lcmt_dvrk_status.FAULT_DUPLICATE_SENDER)
-        elif code == lcmt_dvrk_status.REFUSAL_CLOCK_JUMP and self._is_watched_or_in_force():
+        elif code == lcmt_dvrk_status.REFUSAL_CLOCK_JUMP and self.state == lcmt_dvrk_status.STATE_STARTING:
             self._hold()
+        elif code == lcmt_dvrk_status.REFUSAL_CLOCK_JUMP and self._is_watched_or_in_force():
+            self._take_over(f"the clock of sender {command.sender_id} jumped")
         if code != lcmt_dvrk_status.REFUSAL_NONE:
             return code
         if self.state == lcmt_dvrk_status.STATE_FAULT and command.control_mode != lcmt_dvrk_command.HOLD:
             return lcmt_dvrk_status.REFUSAL_FAULT
+        if self.hold_reason and command.control_mode in _ACTIVE:
+            return lcmt_dvrk_status.REFUSAL_RESUME
         if command.control_mode < 0 or not self.accepted_modes >> command.control_mode & 1:
             return lcmt_dvrk_status.REFUSAL_BAD_MODE
         if command.control_mode in _ACTIVE and self.state != _ACTIVE[command.control_mode]:
@@ -251,11 +297,14 @@ class CommandGuard:
         mode, force = command.control_mode, self._force
         goes_on = self.state == lcmt_dvrk_status.STATE_STARTING and mode == force.command.control_mode
         force.take(command)
+        if self._wall_clock is not None:
+            force.wall_utime = self._wall_clock() - (utime - command.status_utime)
         if mode == lcmt_dvrk_command.OFF:
             self.state, self._powered = lcmt_dvrk_status.STATE_OFF, False
         elif mode == lcmt_dvrk_command.HOLD:
             if resets:
                 self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
+                self.hold_reason = ""
             if self.fault_code == lcmt_dvrk_status.FAULT_NONE:
                 self._hold()
         elif self.state == _ACTIVE[mode]:

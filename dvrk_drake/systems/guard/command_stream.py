@@ -69,6 +69,7 @@ class CommandInForce:
         command: itself.
         position: (n,) and so on, its numbers.
         status_utime: of the measurement that it answers [us].
+        wall_utime: time of that measurement by the guard's wall clock, if it has one [us].
         good_since: since when its stream has been good [us].
     """
 
@@ -77,6 +78,7 @@ class CommandInForce:
     velocity: Vector = field(default_factory=lambda: np.zeros(0))
     effort: Vector = field(default_factory=lambda: np.zeros(0))
     status_utime: int = 0
+    wall_utime: int = 0
     good_since: int = 0
 
     def take(self, command: lcmt_dvrk_command) -> None:

@@ -45,6 +45,7 @@ class GuardSettings:
             faster, and while efforts act it is braked above.
         following_error: how far from its commanded position a joint may be, as a fraction of its range.
         following_time: how late the arm's position controller may follow [s]; a PD controller: Kd/Kp.
+        resume_automatically: whether commands may act again after the watchdog took over, without an operator's reset.
     """
 
     expiry: float = 0.05
@@ -59,6 +60,7 @@ class GuardSettings:
     traverse_time: float = 0.5
     following_error: float = 0.15
     following_time: float = 0.2
+    resume_automatically: bool = False
 
     def __post_init__(self) -> None:
         self.check()
@@ -69,6 +71,10 @@ class GuardSettings:
         Raises:
             StationError: one is outside its range.
         """
+        if not isinstance(self.resume_automatically, bool):
+            raise StationError(
+                f"guard settings: resume_automatically must be true or false; got {self.resume_automatically}"
+            )
         for name, (lowest, highest) in _ALLOWED.items():
             if not lowest <= (value := getattr(self, name)) <= highest:
                 raise StationError(f"guard settings: {name} must be {lowest:g} to {highest:g}; got {value}")

@@ -43,7 +43,8 @@ class DvrkCommandSender(LeafSystem):
     - `effort` (n) and `desired_state` (2n: q, then v): what is asked for.
     - `control_mode` (1): lcmt_dvrk_command.HOLD, POSITION, EFFORT or OFF; anything else is HOLD. Unconnected: EFFORT if
       `effort` is connected, else POSITION if `desired_state` is, else HOLD.
-    - `reset_fault` (1): not zero: asks to clear a fault; the mode is then HOLD.
+    - `reset_fault` (1): not zero: asks to clear a fault, or to resume after the watchdog took over; the mode is then
+      HOLD.
     - `lcmt_dvrk_command`: the message. It is HOLD whenever what is asked for is not connected or not finite.
     """
 

@@ -6,6 +6,7 @@ from guard_bench import ARM, LIMIT, Bench, N, Q, modes
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.systems.guard.settings import GuardSettings
 
 
 def test_two_senders_at_once_are_a_latched_fault():
@@ -30,7 +31,7 @@ def test_the_other_sender_is_noticed_while_only_holding_and_while_refused():
 
 
 def test_a_sender_may_follow_one_that_is_silent_but_starts_anew():
-    bench = Bench().started()
+    bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
     bench.tick(51)
     assert bench.send(sender=6) == Status.REFUSAL_NONE
     assert bench.guard.state == Status.STATE_STARTING

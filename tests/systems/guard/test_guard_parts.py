@@ -225,4 +225,11 @@ def test_each_setting_has_a_default_and_bounds(name):
 
 
 def test_every_setting_has_bounds():
-    assert set(vars(GuardSettings())) == set(SETTINGS)
+    assert set(vars(GuardSettings())) == {*SETTINGS, "resume_automatically"}
+
+
+@pytest.mark.parametrize("value", ["false", 1, None])
+def test_an_operator_resumes_unless_it_is_set_otherwise(value):
+    assert GuardSettings().resume_automatically is False
+    with pytest.raises(StationError, match="guard settings: resume_automatically must be true or false; got"):
+        GuardSettings(resume_automatically=value)

@@ -8,6 +8,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import decode
 from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.guard.settings import GuardSettings
 
 
 @pytest.mark.parametrize(
@@ -75,7 +76,7 @@ def test_out_of_order_and_duplicates_are_refused_and_gaps_are_counted():
 
 @pytest.mark.parametrize("jump", [-MS - 1, -3600 * 10**6, 51 * MS, 3600 * 10**6])
 def test_a_jump_of_the_senders_clock_ends_in_a_hold_and_a_new_start(jump):
-    bench = Bench().started()
+    bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
     base = bench.utime - 10**15
     assert bench.send(utime=base + jump) == Status.REFUSAL_CLOCK_JUMP
     assert bench.guard.state == Status.STATE_HOLD
@@ -94,7 +95,7 @@ def test_a_senders_clock_may_be_off_by_the_tolerance(lead):
 
 
 def test_the_arms_clock_jumping_forward_expires_and_backward_is_a_fault():
-    bench = Bench().started()
+    bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
     bench.utime += 3600 * 10**6
     assert bench.tick().control_mode == Command.HOLD
     bench.started()

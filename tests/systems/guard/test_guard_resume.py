@@ -1,0 +1,258 @@
+"""After the watchdog took over: an operator must resume. Expiry by the wall clock: stalls of the bridge and the sender."""
+
+import copy
+
+import numpy as np
+import pytest
+from guard_bench import MS, Bench, N, Q, modes
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.systems.guard.settings import GuardSettings
+from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
+
+MODES = pytest.mark.parametrize("mode", [Command.EFFORT, Command.POSITION])
+WAITING = modes(Command.OFF, Command.HOLD)
+EXPIRED = "the last command expired: 51.0 ms old by the arm's clock, 50 ms are allowed"
+
+
+def expire(bench):
+    bench.tick(51)
+
+
+def jump(bench):
+    assert bench.send(bench.output.control_mode, utime=bench.utime) == Status.REFUSAL_CLOCK_JUMP
+
+
+def call(bench):
+    bench.guard._take_over("the period is 20 ms")
+
+
+TAKEOVERS = [(expire, EXPIRED), (jump, "the clock of sender 5 jumped"), (call, "the period is 20 ms")]
+
+
+def waits(bench, reason):
+    """Whether the guard holds and takes no command that acts, whoever sends it and however long."""
+    guard, pose = bench.guard, bench.tick().position
+    assert (guard.state, guard.fault_code, guard.hold_reason) == (Status.STATE_HOLD, Status.FAULT_NONE, reason)
+    for sender in (5, 6):
+        bench.tick(60)
+        # The first one may come after a jump of its clock.
+        bench.send(Command.HOLD, sender=sender)
+        for mode in 150 * [Command.EFFORT, Command.POSITION]:
+            bench.tick()
+            assert bench.send(mode, sender=sender) == Status.REFUSAL_RESUME
+            assert guard.state == Status.STATE_HOLD
+    output = bench.tick()
+    assert (output.control_mode, guard.accepted_modes, guard.sender_id) == (Command.HOLD, WAITING, 0)
+    np.testing.assert_array_equal(output.position, pose)
+    status = Status()
+    fill_in_guard(status, guard)
+    assert (status.fault_text, status.fault_code, status.accepted_modes) == (reason, Status.FAULT_NONE, WAITING)
+    return True
+
+
+@MODES
+@pytest.mark.parametrize(("take_over", "reason"), TAKEOVERS)
+@pytest.mark.parametrize("operator", [6, 7])
+def test_the_arm_is_held_until_an_operator_resumes(mode, take_over, reason, operator):
+    """The operator's command comes from the last sender or from a new one."""
+    bench = Bench().started(mode)
+    take_over(bench)
+    assert waits(bench, reason)
+    bench.tick(60)
+    bench.run(Command.HOLD, 3, sender=operator)
+    assert bench.guard.hold_reason == reason
+    bench.run(Command.HOLD, 1, sender=operator, reset_fault=True)
+    assert bench.guard.hold_reason == ""
+    assert bench.guard.accepted_modes == WAITING | modes(Command.EFFORT, Command.POSITION)
+    bench.run(mode, 250, sender=operator)
+    assert bench.guard.state == Status.STATE_STARTING
+    bench.run(mode, 1, sender=operator)
+    assert bench.output.control_mode == mode
+
+
+def test_a_flag_that_was_always_true_does_not_resume():
+    bench = Bench().started()
+    expire(bench)
+    bench.run(Command.HOLD, 5, sender=6, reset_fault=True)
+    assert bench.guard.hold_reason == EXPIRED
+
+
+@MODES
+@pytest.mark.parametrize("take_over", [take_over for take_over, _ in TAKEOVERS])
+def test_an_explicit_setting_resumes_automatically(mode, take_over):
+    bench = Bench(settings=GuardSettings(resume_automatically=True)).started(mode)
+    take_over(bench)
+    assert (bench.guard.state, bench.guard.hold_reason) == (Status.STATE_HOLD, "")
+    bench.tick(60)
+    bench.run(mode, 250, sender=6)
+    assert bench.guard.state == Status.STATE_STARTING
+    bench.run(mode, 1, sender=6)
+    assert bench.output.control_mode == mode
+
+
+@MODES
+def test_an_orderly_end_and_a_start_that_ends_need_no_resume(mode):
+    bench = Bench().started(mode)
+    bench.run(Command.HOLD, 1)
+    bench.tick(200)
+    assert (bench.guard.hold_reason, bench.guard.counts.expired) == ("", 0)
+    bench.run(mode, 100)
+    bench.tick(60)  # a start that expires
+    bench.run(mode, 100)
+    assert bench.send(mode, utime=bench.utime) == Status.REFUSAL_CLOCK_JUMP
+    assert (bench.guard.state, bench.guard.hold_reason) == (Status.STATE_HOLD, "")
+
+
+def test_the_first_reason_stays():
+    bench = Bench().started()
+    expire(bench)
+    call(bench)
+    assert bench.guard.hold_reason == EXPIRED
+
+
+def test_motors_that_are_off_and_a_fault_stay_as_they_are():
+    bench = Bench()
+    bench.run(Command.HOLD, 1)
+    bench.run(Command.OFF, 1)
+    call(bench)
+    assert (bench.guard.state, bench.tick().control_mode, bench.guard.hold_reason) == (
+        Status.STATE_OFF,
+        Command.OFF,
+        "",
+    )
+    bench = Bench()
+    bench.guard.report_fault("the amplifier is hot", has_power=False)
+    call(bench)
+    assert (bench.guard.state, bench.tick().control_mode, bench.guard.hold_reason) == (
+        Status.STATE_FAULT,
+        Command.OFF,
+        "",
+    )
+
+
+def test_an_arm_that_waits_may_be_switched_off_and_waits_after_that():
+    bench = Bench().started()
+    expire(bench)
+    bench.run(Command.HOLD, 1)
+    assert bench.run(Command.OFF, 1).control_mode == Command.OFF
+    bench.run(Command.HOLD, 1)
+    assert bench.guard.hold_reason == EXPIRED
+    assert bench.send() == Status.REFUSAL_RESUME
+
+
+def test_one_reset_clears_a_fault_and_what_was_before_it():
+    bench = Bench().started()
+    expire(bench)
+    bench.guard.report_fault("the amplifier is hot")
+    status = Status()
+    fill_in_guard(status, bench.guard)
+    assert status.fault_text == "the amplifier is hot"
+    bench.run(Command.HOLD, 1)
+    bench.run(Command.HOLD, 1, reset_fault=True)
+    assert (bench.guard.fault_code, bench.guard.hold_reason) == (Status.FAULT_NONE, "")
+
+
+# Expiry by the wall clock
+
+
+class WallBench(Bench):
+    """A bench with a wall clock, which goes on with the arm's clock unless it is stalled."""
+
+    def __init__(self, **arguments):
+        self.stalled = 0
+        self.utime = 0  # before the guard is made
+        super().__init__(wall_clock=lambda: self.utime + self.stalled - 10**14, **arguments)
+
+    def stall(self, milliseconds):
+        """The process of the guard is stopped, and the arm's clock with it: nothing is received, no step is made."""
+        self.stalled += round(milliseconds * MS)
+
+
+@MODES
+@pytest.mark.parametrize("first", ["receive", "step"])
+@pytest.mark.parametrize(
+    ("milliseconds", "goes_on"), [(20, True), (48, True), (48.001, False), (50, False), (200, False), (1000, False)]
+)
+def test_a_stall_of_the_bridge_expires_what_is_in_force_by_the_wall_clock(mode, first, milliseconds, goes_on):
+    """Whether a command or a step comes first after it; with a command that was 1 ms old when it came."""
+    bench = WallBench().started(mode)
+    assert bench.send(mode, status_utime=bench.utime - MS) == Status.REFUSAL_NONE
+    bench.stall(milliseconds)
+    bench.utime += MS
+    if first == "receive":
+        assert bench.send(mode) == (Status.REFUSAL_NONE if goes_on else Status.REFUSAL_RESUME)
+    bench.q = Q + 1e-3
+    bench.output = output = bench.step()
+    guard = bench.guard
+    if goes_on:
+        assert (output.control_mode, guard.counts.expired, guard.hold_reason) == (mode, 0, "")
+        assert first == "receive" or bench.send(mode) == Status.REFUSAL_NONE
+        bench.tick()
+        bench.run(mode, 200)
+        return
+    assert (output.control_mode, guard.state, guard.counts.expired) == (Command.HOLD, Status.STATE_HOLD, 1)
+    age = milliseconds + 2
+    reason = f"the last command expired: {age:.1f} ms old by the wall clock, 50 ms are allowed"
+    assert waits(bench, reason)
+
+
+@MODES
+@pytest.mark.parametrize(("milliseconds", "goes_on"), [(20, True), (50, True), (51, False), (200, False), (1000, False)])
+def test_a_stall_of_the_sender_expires_what_is_in_force_by_the_arms_clock(mode, milliseconds, goes_on):
+    bench = WallBench().started(mode)
+    bench.run(mode, 1)  # received one tick before the time that the bench has now
+    bench.tick(milliseconds - 1)
+    code = bench.send(mode)
+    assert code == (Status.REFUSAL_NONE if goes_on else Status.REFUSAL_RESUME)
+    assert bench.tick().control_mode == (mode if goes_on else Command.HOLD)
+    assert goes_on == (bench.guard.hold_reason == "")
+
+
+def test_a_command_that_answers_an_old_measurement_has_that_age_by_the_wall_clock_as_well():
+    bench = WallBench().started()
+    assert bench.send(status_utime=bench.utime - 40 * MS) == Status.REFUSAL_NONE
+    bench.stall(10)
+    bench.step()
+    assert bench.guard.state == Status.STATE_EFFORT
+    bench.stall(0.001)
+    bench.step()
+    assert bench.guard.state == Status.STATE_HOLD
+
+
+def test_a_stall_while_starting_starts_anew_and_needs_no_resume():
+    bench = WallBench()
+    bench.run(Command.EFFORT, 200)
+    bench.stall(60)
+    bench.tick()
+    assert (bench.guard.state, bench.guard.hold_reason, bench.guard.counts.expired) == (Status.STATE_HOLD, "", 0)
+    bench.run(Command.EFFORT, 250)
+    assert bench.guard.state == Status.STATE_STARTING
+
+
+def test_the_arms_clock_expires_a_command_also_where_the_wall_clock_stands_still():
+    bench = Bench(wall_clock=lambda: 0).started()
+    bench.tick(49)
+    assert bench.output.control_mode == Command.EFFORT
+    assert bench.tick().control_mode == Command.HOLD
+    assert bench.guard.hold_reason == EXPIRED
+
+
+def test_a_held_pose_does_not_expire():
+    bench = WallBench()
+    bench.run(Command.HOLD, 1)
+    bench.stall(1000)
+    bench.q = Q - 0.01
+    np.testing.assert_array_equal(bench.tick().position, Q)
+    assert bench.guard.hold_reason == ""
+
+
+def test_copies_share_the_wall_clock_and_nothing_else():
+    bench = WallBench().started()
+    other = copy.deepcopy(bench.guard)
+    bench.stall(60)
+    bench.tick()
+    assert (bench.guard.state, other.state, other.hold_reason) == (Status.STATE_HOLD, Status.STATE_EFFORT, "")
+    other.step(bench.utime, bench.utime, Q, np.zeros(N), bench.effort)
+    assert other.hold_reason == bench.guard.hold_reason != ""
