@@ -89,11 +89,11 @@ class DynamicRegressor:
 
         Column j is the torque of a unit acceleration of joint j at rest and without gravity.
         """
-        q, rest, _ = self._checked_motion(q, np.zeros_like(q, dtype=float), np.zeros_like(q, dtype=float))
-        phi = self._checked_parameters(parameters)
+        q, _, _ = self._checked_motion(q, np.zeros_like(q, dtype=float), np.zeros_like(q, dtype=float))
         n = self.arm.num_joints
-        columns = [self._torque((q, rest, np.tile(unit, (len(q), 1))), np.zeros(3), phi) for unit in np.eye(n)]
-        return np.stack(columns, axis=2)
+        poses, vd = np.repeat(q, n, axis=0), np.tile(np.eye(n), (len(q), 1))
+        columns = self._torque((poses, np.zeros_like(vd), vd), np.zeros(3), self._checked_parameters(parameters))
+        return columns.reshape(-1, n, n).transpose(0, 2, 1)
 
     def _torque(
         self, motion: tuple[NDArray, NDArray, NDArray], gravity: NDArray, parameters: NDArray

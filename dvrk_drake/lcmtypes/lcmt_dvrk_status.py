@@ -30,7 +30,10 @@ class lcmt_dvrk_status(object):
     STATE_EFFORT = 4
     """ effort commands act """
     STATE_FAULT = 5
-    """ as HOLD, or as OFF if the measurement is lost, until a command resets it """
+    """
+    as HOLD, until a command resets it. After a fault of a measurement, efforts hold the other joints, and joints with
+    FLAG_IMPLAUSIBLE get the gravity effort of their last valid pose. Motors that were without power stay so
+    """
     FAULT_NONE = 0
     """ fault_code; a fault is latched, only a command with reset_fault clears it: none """
     FAULT_DUPLICATE_SENDER = 1
@@ -45,6 +48,10 @@ class lcmt_dvrk_status(object):
     """ for bridges: whatever the arm itself reports, told in fault_text """
     FAULT_FOLLOWING = 6
     """ a joint was too far from where position commands led it: something is in its way """
+    FAULT_IMPLAUSIBLE = 7
+    """ a measurement is not plausible: it jumps, is frozen, or contradicts another one """
+    FAULT_OSCILLATION = 8
+    """ the commanded efforts oscillate """
     REFUSAL_NONE = 0
     """
     refusal_code, why a command was not taken: none was refused so far. A refused command does not act and does not keep
@@ -88,6 +95,8 @@ class lcmt_dvrk_status(object):
     """ OFF that does not follow a HOLD of the same sender """
     REFUSAL_RESUME = 17
     """ POSITION or EFFORT after the watchdog took over, before an operator resumed; fault_text is why it did """
+    REFUSAL_START_GRAVITY = 21
+    """ starting with efforts while the measured effort is not the gravity effort of the pose """
     FLAG_EFFORT_CLAMPED = 1
     """ joint_flags, bits: the commanded effort was beyond the motor's limit """
     FLAG_RATE_LIMITED = 2
@@ -98,6 +107,8 @@ class lcmt_dvrk_status(object):
     """ the same for a limit of a sum of joints that this one is in """
     FLAG_SPEED_LIMIT = 16
     """ faster than allowed while efforts act, and braked """
+    FLAG_IMPLAUSIBLE = 32
+    """ its position is not plausible: it has no feedback, but the gravity effort of its last valid pose """
 
     def __init__(self):
         self.utime = 0

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, SESSION, N, Q
+from guard_bench import ARM, LIMIT, SESSION, N, Q, Weightless
 from patience import PATIENCE
 
 from dvrk_drake.cli import main
@@ -25,7 +25,7 @@ class GuardedArm:
 
     def __init__(self):
         self.arm, self.lost, self.utime = ARM, 0, 10**9
-        self.guard, self.commands, self.status = CommandGuard(ARM, SESSION), [], Status()
+        self.guard, self.commands, self.status = CommandGuard(ARM, SESSION, Weightless()), [], Status()
         self.before_step = lambda: None
         self.status.arm_name, self.status.num_joints = ARM.name, N
         self.status.position, self.status.velocity = list(Q), [0.0] * N
@@ -49,7 +49,7 @@ class GuardedArm:
         self.guard.receive(command, self.utime)
 
     def restart(self):
-        self.guard, self.status.sequence = CommandGuard(ARM, SESSION + 1), 0
+        self.guard, self.status.sequence = CommandGuard(ARM, SESSION + 1, Weightless()), 0
 
 
 @pytest.fixture(scope="module")

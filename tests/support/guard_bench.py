@@ -6,6 +6,8 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.guard.monitors import PeriodMonitor
+from dvrk_drake.systems.guard.plausibility import Plausibility
 
 ARM = load_arm("mtml")
 N = ARM.num_joints
@@ -20,19 +22,64 @@ def modes(*allowed):
     return sum(1 << mode for mode in allowed)
 
 
-class Bench:
-    """A guard at rest with a clock; the measured state is set by the test."""
+class Weightless:
+    """A model without weight and inertia, for tests of a guard whose arm does not move by its efforts."""
 
-    def __init__(self, arm=ARM, **arguments):
+    def gravity_effort(self, q):
+        return np.zeros(len(q))
+
+    def mass_matrix(self, q):
+        return np.zeros((len(q), len(q)))
+
+
+class Heavy(Weightless):
+    """A model whose gravity effort is a known function of the pose, up to 0.2 of each effort limit."""
+
+    def gravity_effort(self, q):
+        return 0.2 * LIMIT * np.cos(q)
+
+
+class Unchecked(Plausibility):
+    """Finds everything plausible: an arm on the bench is where the test puts it."""
+
+    def check(self, dt, q, v, effort, commanded):
+        self.gravity, self._poses = self.model.gravity_effort(q), (q, q)
+        return ""
+
+
+class Untimed(PeriodMonitor):
+    """Finds every period short enough."""
+
+    def add(self, period):
+        return ""
+
+
+class Bench:
+    """A guard at rest with a clock; the measured state is set by the test.
+
+    Its checks of measurements and of its own period are off unless the test is about them.
+    """
+
+    def __init__(self, arm=ARM, *, q=Q, model=Weightless(), checks=False, **arguments):
         self.arm = arm
-        self.guard = CommandGuard(arm, SESSION, **arguments)
+        self.guard = CommandGuard(arm, SESSION, model, **arguments)
+        if not checks:
+            settings = self.guard.settings
+            self.guard._plausibility = Unchecked(arm, model, settings.plausibility, self.guard.limits.speed)
+            self.guard._period = Untimed(settings)
         self.utime = 1_700_000_000_000_000
-        self.q = Q.copy() if arm is ARM else 0.5 * (arm.position_lower + arm.position_upper)
+        self.q = np.array(q) if arm is ARM else 0.5 * (arm.position_lower + arm.position_upper)
         self.v, self.effort = np.zeros(arm.num_joints), 0.05 * arm.effort_limits
         self.sequence = 0
         self.age = 0  # of the measurement [us]
         self.follows = False  # positions, at once
         self.output = self.step()
+
+    def at_rest(self):
+        """The measured effort becomes the model's gravity effort."""
+        self.effort = self.guard._plausibility.model.gravity_effort(self.q)
+        self.tick()
+        return self
 
     def step(self):
         return self.guard.step(self.utime, self.utime - self.age, self.q, self.v, self.effort)

@@ -4,6 +4,8 @@ from concurrent.futures import Executor, Future
 
 import numpy as np
 
+from guard_bench import Weightless
+
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
@@ -86,7 +88,7 @@ class GuardedArm(StickyArm):
 
     def __init__(self, *arguments):
         super().__init__(*arguments)
-        self.guard = CommandGuard(self.arm, 7)
+        self.guard = CommandGuard(self.arm, 7, Weightless())
         self._step_guard()
 
     def status(self):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from dvrk_drake.errors import StationError
@@ -13,6 +14,8 @@ from dvrk_drake.systems.guard.command_stream import CommandInForce, CommandStrea
 from dvrk_drake.systems.guard.follower import Follower, GuardOutput
 from dvrk_drake.systems.guard.limits import GuardLimits, Vector
 from dvrk_drake.systems.guard.measurement import Measurement
+from dvrk_drake.systems.guard.monitors import OscillationMonitor, PeriodMonitor
+from dvrk_drake.systems.guard.plausibility import ArmModel, Plausibility
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 if TYPE_CHECKING:
@@ -20,6 +23,9 @@ if TYPE_CHECKING:
 
 #: No longer time between two steps is made up for in rate limits [s].
 _LONGEST_STEP = 0.01
+
+#: States in which a position controller leads the arm to a target.
+_REGULATED = (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_POSITION)
 
 _ACTIVE = {
     lcmt_dvrk_command.POSITION: lcmt_dvrk_status.STATE_POSITION,
@@ -92,6 +98,7 @@ class CommandGuard:
         self,
         arm: Arm,
         session_id: int,
+        model: ArmModel,
         settings: GuardSettings | None = None,
         modes: tuple[int, ...] | None = None,
         wall_clock: Callable[[], int] | None = None,
@@ -101,6 +108,8 @@ class CommandGuard:
         Args:
             arm: whose limits are kept.
             session_id: not 0; drawn anew whenever the arm starts.
+            model: of the arm, mounted as it is, e.g. `ControlModel(IdentifiedModel.from_arm(arm))`; an identified model
+                detects more.
             settings: the defaults of GuardSettings if None.
             modes: which of POSITION and EFFORT are accepted; both if None.
             wall_clock: monotonic time of the computer [us], by which commands expire as well; None: by the arm's clock
@@ -123,11 +132,13 @@ class CommandGuard:
         self.counts = GuardCounts()
         self._modes = tuple(_ACTIVE) if modes is None else modes
         self._expiry = round(1e6 * self.settings.expiry)
-        self._wall_clock = wall_clock
+        self._wall_clock, self._stepped = wall_clock, 0
         self._stream = CommandStream(self._expiry, round(1e6 * self.settings.clock_tolerance))
         self._force = CommandInForce()
         self._powered = True
         self._measured = Measurement(arm.num_joints, round(1e6 * self.settings.measurement_age))
+        self._plausibility = Plausibility(arm, model, self.settings.plausibility, self.limits.speed)
+        self._period, self._oscillation = PeriodMonitor(self.settings), OscillationMonitor(self.settings, arm)
         self._follower = Follower(self.limits)
         self.output = self._output(0.0)
 
@@ -135,7 +146,16 @@ class CommandGuard:
         # A Drake context copies its state before every update, so this must be quick. No array is changed in place.
         other = object.__new__(CommandGuard)
         other.__dict__.update(self.__dict__)
-        for name in ("counts", "_stream", "_force", "_follower", "_measured"):
+        for name in (
+            "counts",
+            "_stream",
+            "_force",
+            "_follower",
+            "_measured",
+            "_plausibility",
+            "_period",
+            "_oscillation",
+        ):
             part = getattr(self, name)
             twin = object.__new__(type(part))
             twin.__dict__.update(part.__dict__)
@@ -163,6 +183,11 @@ class CommandGuard:
     def last_command(self) -> lcmt_dvrk_command:
         """The last accepted command."""
         return self._force.command
+
+    @property
+    def gravity_effort(self) -> Vector:
+        """(n,) gravity effort of the model at the last good measurement [N m, N]."""
+        return self._plausibility.gravity
 
     def receive(self, command: lcmt_dvrk_command | None, utime: int) -> int:
         """Takes one command, or None for a message that was none, that arrived at `utime` [us].
@@ -202,17 +227,20 @@ class CommandGuard:
             self._stream.forget()
         if problem:
             self.report_fault(problem, lcmt_dvrk_status.FAULT_CLOCK)
-        lost = self._measured.q is None
-        if problem := self._measured.take(utime - measured_utime, q, v, effort):
-            self.report_fault(problem, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=False)
-        elif lost:
-            self._follower.target = self._q()
+        self._measure(measured_utime, q, v, effort)
+        self._watch_period(dt)
         self._expire(utime)
         if self.state == lcmt_dvrk_status.STATE_EFFORT and (excess := self.limits.beyond(self._q())):
             self.report_fault(excess, lcmt_dvrk_status.FAULT_POSITION_LIMIT)
-        if self.state == lcmt_dvrk_status.STATE_POSITION and (away := self._follower.astray(self._q())):
+        if self.state in _REGULATED and (away := self._follower.astray(self._q())):
             self.report_fault(away, lcmt_dvrk_status.FAULT_FOLLOWING)
         self.output = self._output(min(max(dt, 0.0), _LONGEST_STEP))
+        if self.state == lcmt_dvrk_status.STATE_EFFORT:
+            joint = self._oscillation.add(self.output.effort, min(max(dt, 0.0), _LONGEST_STEP))
+            if joint is not None:
+                text = f"{self.limits.names[joint]}: the commanded effort oscillates"
+                self.report_fault(text, lcmt_dvrk_status.FAULT_OSCILLATION)
+                self.output = self._output(0.0)
         return self.output
 
     def report_fault(self, text: str, code: int = lcmt_dvrk_status.FAULT_DRIVER, *, has_power: bool = True) -> None:
@@ -230,6 +258,34 @@ class CommandGuard:
             self.state, self._powered = lcmt_dvrk_status.STATE_FAULT, powered
             self.fault_code, self.fault_text = code, text
         self._powered &= has_power
+
+    def _measure(self, measured_utime: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> None:
+        """Takes a measurement and checks it; what is wrong with it ends in HOLD or FAULT."""
+        measured, plausibility = self._measured, self._plausibility
+        first = measured.q is None
+        if problem := measured.take(measured_utime, q, v, effort):
+            if first or measured.bad > self.settings.plausibility.bad_samples:
+                # An arm that was never measured has no pose that it could be held at.
+                self.report_fault(problem, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=not first)
+                plausibility.reject_all()
+            elif self._is_watched_or_in_force():
+                self._take_over(problem)
+            return
+        if first:
+            self._follower.latch(measured.q, np.zeros(self.num_joints))  # it stands so far
+        if not self._powered:
+            plausibility.restart()
+        commanded = self.output.effort if self.state == lcmt_dvrk_status.STATE_EFFORT else None
+        if measured.dt > 0 or first:
+            if fault := plausibility.check(measured.dt, measured.q, measured.v, measured.effort, commanded):
+                self.report_fault(fault, lcmt_dvrk_status.FAULT_IMPLAUSIBLE)
+
+    def _watch_period(self, dt: float) -> None:
+        if self._wall_clock is not None:
+            now = self._wall_clock()
+            dt, self._stepped = 1e-6 * (now - self._stepped) if self._stepped else 0.0, now
+        if self._period.add(dt) and self._is_watched_or_in_force():
+            self._take_over(self._period.fault)
 
     def _is_watched_or_in_force(self) -> bool:
         return self.state in (lcmt_dvrk_status.STATE_STARTING, *_ACTIVE.values())
@@ -282,12 +338,14 @@ class CommandGuard:
             return code
         if self.state == lcmt_dvrk_status.STATE_FAULT and command.control_mode != lcmt_dvrk_command.HOLD:
             return lcmt_dvrk_status.REFUSAL_FAULT
-        if self.hold_reason and command.control_mode in _ACTIVE:
+        if (self.hold_reason or self._period.fault) and command.control_mode in _ACTIVE:
             return lcmt_dvrk_status.REFUSAL_RESUME
         if command.control_mode < 0 or not self.accepted_modes >> command.control_mode & 1:
             return lcmt_dvrk_status.REFUSAL_BAD_MODE
         if command.control_mode in _ACTIVE and self.state != _ACTIVE[command.control_mode]:
-            return self.limits.refusal_to_start(command, self._q(), self._measured.effort)
+            return self.limits.refusal_to_start(
+                command, self._q(), self._measured.effort, self._plausibility.gravity
+            )
         return lcmt_dvrk_status.REFUSAL_NONE
 
     def _accept(self, command: lcmt_dvrk_command, utime: int) -> None:
@@ -305,6 +363,9 @@ class CommandGuard:
             if resets:
                 self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
                 self.hold_reason = ""
+                if self._plausibility.invalid.any() or not self._follower.is_near(self._q()):
+                    self._follower.latch(self._q(), self._measured.v)
+                self._plausibility.restart()
             if self.fault_code == lcmt_dvrk_status.FAULT_NONE:
                 self._hold()
         elif self.state == _ACTIVE[mode]:
@@ -320,6 +381,7 @@ class CommandGuard:
         if mode == lcmt_dvrk_command.POSITION:
             self._follower.begin_position()
         else:
+            self._oscillation.restart()
             self._follower.begin_effort(self._measured.effort, self._q(), self._measured.v)
 
     def _hold(self) -> None:
@@ -330,7 +392,7 @@ class CommandGuard:
             and self._powered
         )
         if not (regulated or (self.state == lcmt_dvrk_status.STATE_POSITION and self._follower.is_near(q))):
-            self._follower.target = q.copy()
+            self._follower.latch(q, self._measured.v)
         self.state, self._powered = lcmt_dvrk_status.STATE_HOLD, True
 
     def _output(self, dt: float) -> GuardOutput:
@@ -338,9 +400,14 @@ class CommandGuard:
         q = self._q()
         if not self._powered:
             return follower.off(q)
+        if self.state == lcmt_dvrk_status.STATE_FAULT and self._plausibility.invalid.any():
+            valid = ~self._plausibility.invalid
+            gravity = self._plausibility.model.gravity_effort(np.where(valid, q, self._plausibility.last_valid))
+            v = np.zeros(self.num_joints) if self._measured.bad else self._measured.v
+            return follower.hold_valid_joints(q, v, valid, gravity)
         if self.state == lcmt_dvrk_status.STATE_POSITION:
             return follower.follow_position(force.position, force.velocity, dt)
         if self.state == lcmt_dvrk_status.STATE_EFFORT and self._measured.utime is not None:
             share = 1e-6 * (self._measured.utime - force.good_since) / self.settings.start_time - 1.0
             return follower.follow_effort(force.effort, q, self._measured.v, dt, min(max(share, 0.0), 1.0))
-        return follower.hold()
+        return follower.hold(dt)

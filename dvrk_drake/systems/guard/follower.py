@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dvrk_drake.lcmtypes import lcmt_dvrk_command
-from dvrk_drake.systems.guard.limits import Flags, GuardLimits, Vector
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.systems.guard.limits import Flags, GuardLimits, Mask, Vector, clip
 
 
 @dataclass
@@ -45,9 +45,32 @@ class Follower:
         """No power, at the measured q."""
         return self._output(lcmt_dvrk_command.OFF, q)
 
-    def hold(self) -> GuardOutput:
-        """At the target."""
+    def latch(self, q: Vector, v: Vector) -> None:
+        """Makes the measured q the target; an arm that moves at v may go on until it has been braked."""
+        self.target = q.copy()
+        self._laggard = q + self._limits.following_time * v
+
+    def hold(self, dt: float) -> GuardOutput:
+        """At the target, `dt` seconds on."""
+        self._follow_late(dt)
         return self._output(lcmt_dvrk_command.HOLD, self.target)
+
+    def hold_valid_joints(self, q: Vector, v: Vector, valid: Mask, gravity: Vector) -> GuardOutput:
+        """Efforts that hold the joints with a `valid` (n,) position, and leave the others with their `gravity` effort.
+
+        Args:
+            q, v: measured (n,) [rad, m, rad/s, m/s].
+            valid: joints with a valid position; the others get no feedback.
+            gravity: (n,) effort that the pose needs, with the last valid positions of the other joints [N m, N].
+        """
+        limits = self._limits
+        largest, least = limits.fault_effort, limits.fault_effort / 3
+        upper = np.minimum(np.maximum(largest, gravity + least), limits.effort_limits)
+        lower = np.maximum(np.minimum(-largest, gravity - least), -limits.effort_limits)
+        effort = gravity + np.where(valid, limits.kp * (self.target - q) - limits.kd * v, 0.0)
+        effort = clip(effort, lower, upper)
+        flags = np.where(valid, 0, lcmt_dvrk_status.FLAG_IMPLAUSIBLE).astype(np.int8)
+        return self._output(lcmt_dvrk_command.EFFORT, q, effort=effort, flags=flags)
 
     def is_near(self, q: Vector) -> bool:
         """Whether q is as near to the target as position commands must be to a pose from which they start."""
@@ -60,9 +83,12 @@ class Follower:
     def follow_position(self, position: Vector, velocity: Vector, dt: float) -> GuardOutput:
         """`dt` seconds on towards a position, with a feed-forward velocity [rad, m, rad/s, m/s]."""
         self.target, flags = self._limits.limit_position(position, self.target, dt)
-        self._laggard = self._laggard + min(dt / self._limits.following_time, 1.0) * (self.target - self._laggard)
+        self._follow_late(dt)
         velocity = self._limits.limit_velocity(velocity, self.target, flags)
         return self._output(lcmt_dvrk_command.POSITION, self.target, velocity=velocity, flags=flags)
+
+    def _follow_late(self, dt: float) -> None:
+        self._laggard = self._laggard + min(dt / self._limits.following_time, 1.0) * (self.target - self._laggard)
 
     def astray(self, q: Vector) -> str:
         """The joint that follows its target worst, in words, if it is further from it than allowed; or "".
@@ -84,7 +110,7 @@ class Follower:
     def begin_effort(self, effort: Vector, q: Vector, v: Vector) -> None:
         """Effort commands act from now on, from the measured effort at q, v [N m, N, rad, m, rad/s, m/s]."""
         limit = self._limits.command_limits
-        self._effort = np.clip(effort, -limit, limit)
+        self._effort = clip(effort, -limit, limit)
         # What the walls add at once where efforts begin to act; it is taken back, less and less.
         self._kick = self._limits.restrain_effort(self._effort, q, v)[0] - self._effort
 
@@ -93,7 +119,7 @@ class Follower:
         self._effort, flags = self._limits.follow_effort(effort, self._effort, dt)
         restrained, walls = self._limits.restrain_effort(self._effort, q, v)
         limit = self._limits.effort_limits
-        applied = np.clip(restrained - (1.0 - begun) * self._kick, -limit, limit)
+        applied = clip(restrained - (1.0 - begun) * self._kick, -limit, limit)
         return self._output(lcmt_dvrk_command.EFFORT, q, effort=applied, flags=flags | walls)
 
     def _output(

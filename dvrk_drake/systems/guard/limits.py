@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
@@ -16,11 +16,19 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 Flags = NDArray[np.int8]
+Mask = NDArray[np.bool_]
 
 _ROUNDING = 1e-12
 
+_CLAMPED, _RATE_LIMITED = np.int8(lcmt_dvrk_status.FLAG_EFFORT_CLAMPED), np.int8(lcmt_dvrk_status.FLAG_RATE_LIMITED)
+
 #: How many times the gains of the position controller, which 1 kHz permits, a soft wall may have; more chatters.
 _WALL_GAIN = 4.0
+
+
+def clip(x: Vector, lower: ArrayLike, upper: ArrayLike) -> Vector:
+    """Returns x (n,) within lower and upper; np.clip takes several times as long for a few numbers."""
+    return np.minimum(np.maximum(x, lower), upper)
 
 
 class GuardLimits:
@@ -59,6 +67,7 @@ class GuardLimits:
         self.names = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
         width = self.upper - self.lower
         self.margin = np.minimum(settings.margin, settings.margin_fraction * width)
+        self._middle, self._allowed = 0.5 * (self.upper + self.lower), 0.5 * (width + self.margin)
         self.start_position = self.margin[:n]
         self.start_effort = settings.start_effort * self.effort_limits
         self.speed = width[:n] / settings.traverse_time
@@ -66,27 +75,36 @@ class GuardLimits:
         self.following_time = settings.following_time
         self._effort_rate = self.effort_limits / settings.effort_rise_time
         self._wall_effort = np.array([max(self.effort_limits[row != 0] / np.abs(row[row != 0])) for row in self.A])
-        self._look_ahead = np.divide(arm.gains.kd, arm.gains.kp)
+        self.kp, self.kd = np.array(arm.gains.kp), np.array(arm.gains.kd)
+        self.fault_effort = settings.fault_effort * self.effort_limits
+        self._start_gravity = settings.plausibility.start_gravity * self.effort_limits
+        self._look_ahead = self.kd / self.kp
         self._wall_look_ahead = np.array([max(self._look_ahead[row != 0]) for row in self.A])
-        softest = 2 * self._wall_effort[:, None] * self.A**2 / (_WALL_GAIN * np.array(arm.gains.kp))
+        softest = 2 * self._wall_effort[:, None] * self.A**2 / (_WALL_GAIN * self.kp)
         self.wall_width = np.maximum(self.margin, softest.max(axis=1))
+        self._free = 0.5 * width - self.wall_width
         self._wall_flags = np.full(len(self.A), lcmt_dvrk_status.FLAG_COUPLED_LIMIT, np.int8)
         self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT
 
     def beyond(self, q: Vector) -> str:
         """The worst position limit that the pose q (n,) is beyond by more than half of its margin, in words; or ""."""
         c = self.A @ q
-        excess = np.maximum(c - self.upper, self.lower - c) / self.margin
-        k = int(np.argmax(excess))
-        if not excess[k] > 0.5:
+        excess = np.abs(c - self._middle) - self._allowed
+        k = int(excess.argmax())
+        if not excess[k] > 0:
             return ""
         return f"{self.names[k]} = {c[k]:.4g} is beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}"
 
-    def refusal_to_start(self, command: lcmt_dvrk_command, q: Vector, effort: Vector) -> int:
-        """REFUSAL_START_* of a command that would begin to act at the measured q and effort (n,), or REFUSAL_NONE."""
+    def refusal_to_start(self, command: lcmt_dvrk_command, q: Vector, effort: Vector, gravity: Vector) -> int:
+        """REFUSAL_START_* of a command that would begin to act at the measured q and effort (n,), or REFUSAL_NONE.
+
+        `gravity` (n,) is the model's gravity effort at q.
+        """
         if command.control_mode == lcmt_dvrk_command.EFFORT:
             if self.beyond(q):
                 return lcmt_dvrk_status.REFUSAL_START_OUTSIDE
+            if np.any(np.abs(effort - gravity) > self._start_gravity):
+                return lcmt_dvrk_status.REFUSAL_START_GRAVITY
             far = np.abs(np.asarray(command.effort) - effort) > self.start_effort
             far |= np.abs(effort) > self.command_limits + self.start_effort
         else:
@@ -100,11 +118,10 @@ class GuardLimits:
 
         All are (n,) [N m, N] and finite; `last` is inside the effort limits.
         """
-        clamped = np.clip(command, -self.command_limits, self.command_limits)
+        clamped = clip(command, -self.command_limits, self.command_limits)
         step = self._effort_rate * dt
-        effort = np.clip(clamped, last - step, last + step)
-        flags = np.where(clamped != command, lcmt_dvrk_status.FLAG_EFFORT_CLAMPED, 0).astype(np.int8)
-        flags[effort != clamped] |= lcmt_dvrk_status.FLAG_RATE_LIMITED
+        effort = clip(clamped, last - step, last + step)
+        flags = (clamped != command) * _CLAMPED | (effort != clamped) * _RATE_LIMITED
         return effort, flags
 
     def restrain_effort(self, effort: Vector, q: Vector, v: Vector) -> tuple[Vector, Flags]:
@@ -114,31 +131,36 @@ class GuardLimits:
         """
         limit = self.effort_limits
         flags = np.zeros(len(effort), np.int8)
-        braking = 4 * limit * np.sign(v) * np.clip(np.abs(v) / self.speed - 1, 0, 0.5)
-        flags[braking != 0] |= lcmt_dvrk_status.FLAG_SPEED_LIMIT
+        added = np.zeros(len(effort))
         c = self.A @ q + self._wall_look_ahead * (self.A @ v)
-        to_upper, to_lower = (self.upper - c) / self.wall_width, (c - self.lower) / self.wall_width
-        walls = 2 * self._wall_effort * (np.clip(1 - to_lower, 0, 1) - np.clip(1 - to_upper, 0, 1))
-        for k in np.flatnonzero(walls):
-            flags[self.A[k] != 0] |= self._wall_flags[k]
-        return np.clip(effort - braking + walls @ self.A, -limit, limit), flags
+        if (np.abs(c - self._middle) > self._free).any():
+            to_upper, to_lower = (self.upper - c) / self.wall_width, (c - self.lower) / self.wall_width
+            walls = 2 * self._wall_effort * (clip(1 - to_lower, 0, 1) - clip(1 - to_upper, 0, 1))
+            added = walls @ self.A
+            for k in np.flatnonzero(walls):
+                flags[self.A[k] != 0] |= self._wall_flags[k]
+        too_fast = np.abs(v) / self.speed - 1
+        if (too_fast > 0).any():
+            added = added - 4 * limit * np.sign(v) * clip(too_fast, 0.0, 0.5)
+            flags[too_fast > 0] |= lcmt_dvrk_status.FLAG_SPEED_LIMIT
+        return clip(effort + added, -limit, limit), flags
 
     def limit_position(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:
         """Target (n,) for `command`, `dt` seconds after the target `last`, and the flags of the joints."""
         step = self.speed * dt
-        target = np.clip(command, last - step, last + step)
+        target = clip(command, last - step, last + step)
         flags = np.where(target != command, lcmt_dvrk_status.FLAG_RATE_LIMITED, 0).astype(np.int8)
         inside, limited = self._inside(target, last)
         return inside, flags | limited
 
     def limit_velocity(self, command: Vector, target: Vector, flags: Flags) -> Vector:
         """Feed-forward velocity (n,) at `target`: the command's where its position is followed as it is, else zero."""
-        velocity = np.where(flags == 0, np.clip(command, -self.speed, self.speed), 0.0)
+        velocity = np.where(flags == 0, clip(command, -self.speed, self.speed), 0.0)
         wanted = self._look_ahead * velocity
         ahead, _ = self._inside(target + wanted, target)
         cut = ahead != target + wanted
         part = np.divide(ahead - target, wanted, out=np.ones_like(wanted), where=cut & (wanted != 0))
-        return velocity * np.clip(part, 0, 1)
+        return velocity * clip(part, 0, 1)
 
     def _inside(self, target: Vector, last: Vector) -> tuple[Vector, Flags]:
         """`target` kept inside the limits, or no further outside than `last`; joint flags."""
@@ -146,12 +168,12 @@ class GuardLimits:
         flags = np.zeros(n, np.int8)
         c = self.A @ last
         lower, upper = np.minimum(self.lower, c), np.maximum(self.upper, c)
-        inside = np.clip(target, lower[:n], upper[:n])
+        inside = clip(target, lower[:n], upper[:n])
         flags[inside != target] |= lcmt_dvrk_status.FLAG_POSITION_LIMIT
         for k in range(n, len(self.A)):
             row = self.A[k]
             change = row @ inside - c[k]
-            allowed = np.clip(change, lower[k] - c[k], upper[k] - c[k])
+            allowed = clip(change, lower[k] - c[k], upper[k] - c[k])
             if allowed != change:
                 # The joints of this limit go the same part of their way, so that they stop on it together.
                 part = np.where(row != 0, allowed / change, 1.0)

@@ -21,19 +21,27 @@ class Measurement:
     Attributes:
         num_joints: n.
         oldest: above this age it is none [us].
-        utime: when it was told last; None: not yet.
-        q: positions (n,) [rad, m]; None: not known, or not any more.
+        utime: when the last step was; None: not yet.
+        q: last good positions (n,) [rad, m]; None: there were none yet.
         v: velocities (n,) [rad/s, m/s].
         effort: what the motors apply (n,) [N m, N].
+        dt: from the good measurement before to the last one [s].
+        bad: number of measurements since the last good one.
     """
 
     num_joints: int
     oldest: int
     utime: int | None = None
     q: Vector | None = None
-    v: Vector = field(default_factory=lambda: np.zeros(0))
-    effort: Vector = field(default_factory=lambda: np.zeros(0))
+    v: Vector = field(init=False)
+    effort: Vector = field(init=False)
+    dt: float = 0.0
+    bad: int = 0
+    _measured_utime: int = 0
     _steps_at_one_time: int = 0
+
+    def __post_init__(self) -> None:
+        self.v = self.effort = np.zeros(self.num_joints)
 
     def advance(self, utime: int) -> tuple[float, str]:
         """Goes on to `utime`: the time that has passed [s], and what is wrong with the clock, in words, or ""."""
@@ -44,14 +52,16 @@ class Measurement:
             return dt, f"the arm's clock went back by {-dt:.6f} s"
         return dt, "the arm's clock stands still" if self._steps_at_one_time > _MOST_STEPS_AT_ONE_TIME else ""
 
-    def take(self, age: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> str:
-        """Takes what was measured `age` [us] ago; why it is none, in words, or ""."""
+    def take(self, measured_utime: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> str:
+        """Takes what was measured at `measured_utime` [us]; why it is none, in words, or ""."""
+        assert self.utime is not None
+        age = self.utime - measured_utime
         q, v, effort = (np.array(numbers, float) for numbers in (q, v, effort))
+        self.bad += 1
         if not 0 <= age <= self.oldest:
-            self.q = None
             return f"the measurement is {1e-6 * age:.3f} s old; allowed is 0 to {1e-6 * self.oldest:g} s"
         if not (q.shape == v.shape == effort.shape == (self.num_joints,) and is_finite(q, v, effort)):
-            self.q = None
             return f"the measured positions, velocities or efforts are not {self.num_joints} finite numbers each"
-        self.q, self.v, self.effort = q, v, effort
+        self.dt = 0.0 if self.q is None else 1e-6 * (measured_utime - self._measured_utime)
+        self.q, self.v, self.effort, self._measured_utime, self.bad = q, v, effort, measured_utime, 0
         return ""

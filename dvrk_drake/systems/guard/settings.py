@@ -3,7 +3,7 @@
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from dvrk_drake.errors import StationError
 
@@ -22,6 +22,47 @@ _ALLOWED = {
     "following_error": (0.01, 0.5),
     "following_time": (0.01, 1.0),
 }
+
+
+@dataclass
+class PlausibilitySettings:
+    """Tolerances of the plausibility checks of measurements, see `dvrk_drake.systems.guard.plausibility`.
+
+    Attributes:
+        position_tolerance: by which positions may step, and disagree with the velocities, beyond what follows
+            [rad; a tenth of the number in m on a prismatic joint]; three encoder counts are added.
+        jitter: by which the time between two measurements may be wrong [s].
+        velocity_delay: largest delay of the velocity estimate [s].
+        velocity_memory: time constant with which positions and velocities are compared [s].
+        frozen_effort: change of effort under which a position must change, as a fraction of the effort limit.
+        frozen_time: for which a position may stay the same under that change [s].
+        frozen_speed: at which a joint takes the time that it is given to move by an encoder count [rad/s, m/s].
+        response: effort that the motion does not explain, as a fraction of the effort limit.
+        response_time: time constant of the filters of effort and acceleration [s].
+        response_memory: time constant with which unexplained effort that lasts is accepted as an error of the model [s].
+        start_gravity: difference of measured effort and gravity effort at which efforts may start, as a fraction of the
+            effort limit.
+        silent_effort: commanded effort that must show in the measured one, as a fraction of the effort limit.
+        silent_time: within which it must [s].
+        detection_time: age of the pose that is taken as valid when a fault is found [s].
+        bad_samples: number of measurements in a row that may be late or not finite while the arm holds.
+    """
+
+    position_tolerance: float = 0.01
+    jitter: float = 0.02
+    velocity_delay: float = 0.03
+    velocity_memory: float = 0.3
+    frozen_effort: float = 0.45
+    frozen_time: float = 0.01
+    frozen_speed: float = 0.1
+    response: float = 1.5
+    response_time: float = 0.03
+    response_memory: float = 0.2
+    start_gravity: float = 0.25
+    silent_effort: float = 0.3
+    silent_time: float = 0.02
+    detection_time: float = 0.03
+    bad_samples: int = 20
 
 
 @dataclass
@@ -45,7 +86,14 @@ class GuardSettings:
             faster, and while efforts act it is braked above.
         following_error: how far from its commanded position a joint may be, as a fraction of its range.
         following_time: how late the arm's position controller may follow [s]; a PD controller: Kd/Kp.
+        fault_effort: that held joints may use after a fault of a measurement, as a fraction of the effort limit; where
+            gravity needs nearly as much or more, a third of it beyond the gravity effort.
+        slow_period: largest median of the last 100 periods between two steps of the guard [s].
+        longest_period: largest time between two steps of the guard [s].
+        oscillation: RMS of the alternating part of the commanded effort, as a fraction of the effort limit.
+        oscillation_time: time constant of that RMS [s].
         resume_automatically: whether commands may act again after the watchdog took over, without an operator's reset.
+        plausibility: tolerances of the checks of measurements.
     """
 
     expiry: float = 0.05
@@ -60,7 +108,13 @@ class GuardSettings:
     traverse_time: float = 0.5
     following_error: float = 0.15
     following_time: float = 0.2
+    fault_effort: float = 0.3
+    slow_period: float = 0.005
+    longest_period: float = 0.04
+    oscillation: float = 0.45
+    oscillation_time: float = 1.0
     resume_automatically: bool = False
+    plausibility: PlausibilitySettings = field(default_factory=PlausibilitySettings)
 
     def __post_init__(self) -> None:
         self.check()

@@ -12,6 +12,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import decode
 from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.guard.command_stream import is_finite
 from dvrk_drake.systems.lcm.arm_clock import ArmClock
 
 #: Messages kept from one update to the next; more is a flood, of which the newest are looked at.
@@ -50,7 +51,8 @@ class DvrkCommandReceiver(LeafSystem):
     - `control_mode` (1): lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT, what is in force.
     - `desired_state` (2n): where that position controller shall go; the measured pose at rest while efforts act.
     - `effort` (n): what the motors shall apply: zero when off, the guarded command in EFFORT (with the
-      arm's own gravity compensation inside the effort limits), else `position_control_effort`.
+      arm's own gravity compensation inside the effort limits), else `position_control_effort`, or the gravity effort of
+      the last good measurement where that is not finite.
     - `guard`: the CommandGuard, to be read only.
 
     The measurement is always fresh. The guard is abstract state; it is updated once a period of the clock, and
@@ -131,7 +133,10 @@ class DvrkCommandReceiver(LeafSystem):
             gravity = self._gravity.Eval(context) if self._gravity.HasValue(context) else 0.0
             output.SetFromVector(np.clip(told.effort + gravity, -self._effort_limits, self._effort_limits))
         else:
-            output.SetFromVector(self._position_control.Eval(context))
+            effort = self._position_control.Eval(context)
+            # A position controller whose measurement is lost for a few periods has no effort that could be applied.
+            effort = effort if is_finite(effort) else self.GetGuard(context).gravity_effort
+            output.SetFromVector(np.clip(effort, -self._effort_limits, self._effort_limits))
 
     def _calc_guard(self, context: Context, output: AbstractValue) -> None:
         output.set_value(self.GetGuard(context))

@@ -21,6 +21,7 @@ class DvrkDriver:
         status_period: in which the arm says what it measures, and controllers answer [s].
         control_modes: what the arm accepts beside hold and off: position, effort.
         gravity_compensation: the arm adds its own gravity compensation to commanded efforts, as a dVRK does on request.
+        model: file of the identified model with which the guard checks measurements; empty: what the arm's SDF states.
         guard: what its command guard allows.
     """
 
@@ -28,6 +29,7 @@ class DvrkDriver:
     status_period: float = 1e-3
     control_modes: list[str] = field(default_factory=lambda: ["position", "effort"])
     gravity_compensation: bool = False
+    model: str = ""
     guard: GuardSettings = field(default_factory=GuardSettings)
 
     def __post_init__(self) -> None:

@@ -6,6 +6,7 @@ from pydrake.lcm import DrakeLcmInterface
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.lcm import LcmPublisherSystem
 
+from dvrk_drake.dynamics.control_model import ControlModel
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
@@ -36,24 +37,34 @@ class SimDvrkDriver(Diagram):
         - lcmt_dvrk_status
 
     Ports as in DvrkCommandReceiver and DvrkStatusSender. The position controller, which holds the arm whenever no
-    command acts, is a GravityPidController that knows the arm's true gravity; a real arm's has friction instead.
+    command acts, is a GravityPidController with the model's gravity; a real arm's has friction instead.
     """
 
-    def __init__(self, arm: Arm, driver: DvrkDriver, *, start_utime: int = 0) -> None:
-        """Of `arm`.
+    def __init__(
+        self, arm: Arm, driver: DvrkDriver, *, model: IdentifiedModel | None = None, start_utime: int = 0
+    ) -> None:
+        """Driver of `arm`.
 
         Args:
             arm: as it is simulated, mounting included.
             driver: its configuration.
+            model: with which the guard checks measurements, and which the position controller compensates; the
+                driver's if None, or else what the arm's SDF states.
             start_utime: the arm's clock at time zero of the context [us].
+
+        Raises:
+            ModelError: the driver's model cannot be read, or is of another arm.
         """
         super().__init__()
         clock = ArmClock(start_utime, driver.status_period)
-        guard = CommandGuard(arm, draw_id(), driver.guard, driver.accepted_modes())
+        if model is None:
+            model = IdentifiedModel.load(driver.model) if driver.model else IdentifiedModel.from_arm(arm)
+        guard_model = ControlModel(model, with_gravity=not driver.gravity_compensation)
+        guard = CommandGuard(arm, draw_id(), guard_model, driver.guard, driver.accepted_modes())
         builder = DiagramBuilder()
         self._receiver = builder.AddNamedSystem("command_receiver", DvrkCommandReceiver(arm, guard, clock))
         position_controller = builder.AddNamedSystem(
-            "position_controller", GravityPidController(IdentifiedModel.from_arm(arm), period=clock.period)
+            "position_controller", GravityPidController(model, period=clock.period)
         )
         status_sender = builder.AddNamedSystem(
             "status_sender",
@@ -101,6 +112,7 @@ def apply_driver_config(
     lcm: DrakeLcmInterface,
     builder: DiagramBuilder,
     *,
+    model: IdentifiedModel | None = None,
     start_utime: int = 0,
     subscribe: bool = True,
 ) -> SimDvrkDriver:
@@ -111,6 +123,7 @@ def apply_driver_config(
         station: in `builder`, with its effort input free.
         lcm: whose `HandleSubscriptions` is called by somebody else, e.g. an LcmInterfaceSystem or a loop.
         builder: of the Diagram.
+        model: see SimDvrkDriver.
         start_utime: the arm's clock at time zero of the context [us].
         subscribe: take commands from `lcm`, which over UDP keeps the newest one between two calls of
             `HandleSubscriptions`. False: somebody else gives every message to `SimDvrkDriver.Receive`.
@@ -119,7 +132,7 @@ def apply_driver_config(
         The driver that was added.
     """
     arm, name = station.arm, station.arm.name.lower()
-    sim_driver = builder.AddSystem(SimDvrkDriver(arm, driver, start_utime=start_utime))
+    sim_driver = builder.AddSystem(SimDvrkDriver(arm, driver, model=model, start_utime=start_utime))
     if subscribe:
         lcm.Subscribe(command_channel(arm), sim_driver.Receive)
     for port in ("state_estimated", "effort_measured"):

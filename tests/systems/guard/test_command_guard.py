@@ -4,7 +4,7 @@ import copy
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, MS, Bench, N, Q, modes
+from guard_bench import ARM, LIMIT, MS, Bench, N, Q, modes, Weightless
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -177,7 +177,7 @@ def test_modes_can_be_restricted():
 
 
 def test_a_guard_that_has_measured_nothing_moves_nothing():
-    guard = CommandGuard(ARM, 1)
+    guard = CommandGuard(ARM, 1, Weightless())
     assert (guard.state, guard.fault_code, guard.sender_id) == (Status.STATE_HOLD, Status.FAULT_NONE, 0)
     assert (guard.fault_text, guard.refusal_code) == ("", Status.REFUSAL_NONE)
     assert guard.output.control_mode == Command.HOLD
@@ -281,9 +281,7 @@ def test_positions_start_from_the_held_pose():
 
 
 def test_a_wall_comes_on_evenly_while_a_start_time_passes():
-    bench = Bench()
-    bench.q[0] = ARM.position_upper[0]
-    bench.tick()
+    bench = Bench(q=[ARM.position_upper[0], *Q[1:]])
     bench.effort = np.zeros(N)
     bench.run(Command.EFFORT, 250)
     for k in range(260):

@@ -23,17 +23,17 @@ def at(q=Q):
 
 def test_off_and_hold_give_neither_velocity_nor_effort():
     follower = at()
-    for output, mode, position in ((follower.off(Q + 1), Command.OFF, Q + 1), (follower.hold(), Command.HOLD, Q)):
+    for output, mode, position in ((follower.off(Q + 1), Command.OFF, Q + 1), (follower.hold(1e-3), Command.HOLD, Q)):
         assert output.control_mode == mode
         np.testing.assert_array_equal(output.position, position)
         for zero in (output.velocity, output.effort, output.joint_flags):
             np.testing.assert_array_equal(zero, STILL)
             zero[:] = 1
         output.position[:] = 9.0
-    np.testing.assert_array_equal(follower.hold().position, Q)
-    np.testing.assert_array_equal(follower.hold().velocity, STILL)
-    np.testing.assert_array_equal(follower.hold().effort, STILL)
-    assert np.all(Follower(LIMITS).hold().position == 0.0)
+    np.testing.assert_array_equal(follower.hold(1e-3).position, Q)
+    np.testing.assert_array_equal(follower.hold(1e-3).velocity, STILL)
+    np.testing.assert_array_equal(follower.hold(1e-3).effort, STILL)
+    assert np.all(Follower(LIMITS).hold(1e-3).position == 0.0)
 
 
 @pytest.mark.parametrize("joint", range(N))
@@ -71,7 +71,7 @@ def test_a_target_moves_towards_the_command_at_its_rate():
     np.testing.assert_allclose(output.velocity, 0.01 * LIMITS.speed, atol=1e-12)
     # Whoever changes the output does not change the target.
     output.position[:] = 9.0
-    np.testing.assert_allclose(follower.hold().position, goal, atol=1e-12)
+    np.testing.assert_allclose(follower.hold(1e-3).position, goal, atol=1e-12)
 
 
 @pytest.mark.parametrize("joint", range(N))

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, MS, SESSION, Bench, N, Q, modes
+from guard_bench import ARM, LIMIT, MS, SESSION, Bench, N, Q, modes, Weightless
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
@@ -93,7 +93,7 @@ def test_whoever_changes_the_output_does_not_change_the_guard():
 
 def test_a_session_that_an_empty_command_has_is_refused():
     with pytest.raises(StationError, match="session_id must not be 0"):
-        CommandGuard(ARM, 0)
+        CommandGuard(ARM, 0, Weightless())
 
 
 # What is configured
@@ -129,13 +129,13 @@ def test_settings_that_are_changed_afterwards_are_refused():
     settings = GuardSettings()
     settings.expiry = 9.0
     with pytest.raises(StationError, match="guard settings: expiry must be"):
-        CommandGuard(ARM, SESSION, settings)
+        CommandGuard(ARM, SESSION, Weightless(), settings)
 
 
 def test_an_arm_that_nothing_holds_is_refused():
     gains = dataclasses.replace(ARM.gains, kp=[0.0, *ARM.gains.kp[1:]])
     with pytest.raises(StationError, match=r"MTML: all gains\.kp must be positive"):
-        CommandGuard(dataclasses.replace(ARM, gains=gains), SESSION)
+        CommandGuard(dataclasses.replace(ARM, gains=gains), SESSION, Weightless())
 
 
 def test_a_fraction_of_the_effort_limits_clamps_commands_and_refuses_a_start_that_would_drop_the_arm():
@@ -186,10 +186,7 @@ def test_a_start_with_a_velocity_that_leads_away_is_refused():
 
 def test_efforts_that_begin_to_act_inside_the_wall_begin_without_a_kick():
     for side in (1, -1):
-        bench = Bench()
-        bench.q = Q.copy()
-        bench.q[0] = (UPPER if side > 0 else LOWER)[0]
-        bench.tick()
+        bench = Bench(q=[(UPPER if side > 0 else LOWER)[0], *Q[1:]])
         bench.run(Command.EFFORT, 250)
         last, steps = bench.effort[0], []
         for _ in range(300):
@@ -206,9 +203,7 @@ def test_a_wall_that_one_starts_beside_is_there_at_once():
     q[0] = UPPER[0] - 0.05
     efforts = []
     for acting in (1, 500):
-        bench = Bench()
-        bench.q = q.copy()
-        bench.tick()
+        bench = Bench(q=q)
         bench.run(Command.EFFORT, 250 + acting)
         bench.q = q + 0.04 * np.eye(N)[0]
         efforts.append(bench.run(Command.EFFORT, 30, effort=list(LIMIT)).effort[0])

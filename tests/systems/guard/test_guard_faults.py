@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, Bench, N, Q, modes
+from guard_bench import ARM, LIMIT, SESSION, Bench, Heavy, N, Q, Weightless, modes
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 
@@ -78,42 +79,56 @@ def test_the_coupled_limit_faults_too():
     assert bench.guard.fault_text == "parallelogram = -0.36 is beyond -0.33..0.68"
 
 
+BAD = GuardSettings().plausibility.bad_samples
+
+
 @pytest.mark.parametrize("which", ["q", "v", "effort"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e9])
-def test_a_lost_measurement_turns_the_motors_off_until_a_reset(which, value):
-    bench = Bench().started()
+def test_bad_measurements_end_in_a_hold_and_then_in_a_fault_that_keeps_the_gravity_effort(which, value):
+    bench = Bench(model=Heavy()).at_rest().started()
     good = getattr(bench, which)
     setattr(bench, which, np.where(np.arange(N) == 3, value, good))
+    for _ in range(BAD):
+        output = bench.tick()
+        assert (output.control_mode, bench.guard.state) == (Command.HOLD, Status.STATE_HOLD)
+        np.testing.assert_array_equal(output.position, Q)
     output = bench.tick()
-    assert (output.control_mode, bench.guard.fault_code) == (Command.OFF, Status.FAULT_MEASUREMENT)
-    assert np.all(np.isfinite(output.position))
-    # A reset while it is still lost faults again.
+    assert (output.control_mode, bench.guard.fault_code) == (Command.EFFORT, Status.FAULT_MEASUREMENT)
+    np.testing.assert_allclose(output.effort, Heavy().gravity_effort(Q), rtol=0, atol=1e-12)
+    assert np.all(output.joint_flags & Status.FLAG_IMPLAUSIBLE)
+    # A reset while it is still bad faults again.
     healthy = {"position": list(Q), "effort": [0.0] * N}
     for reset in (False, True):
         bench.send(Command.HOLD, reset_fault=reset, **healthy)
-        assert bench.tick().control_mode == Command.OFF
-    # Found again, at another pose: off until reset, then held where it is.
+        assert bench.tick().control_mode == Command.EFFORT
+    # Good again, at another pose: unchanged until a reset, then held where it is.
     setattr(bench, which, good)
     bench.q = Q - 0.03
-    assert bench.tick(100).control_mode == Command.OFF
+    output = bench.tick(100)
+    assert output.control_mode == Command.EFFORT
+    np.testing.assert_allclose(output.effort, Heavy().gravity_effort(Q), rtol=0, atol=1e-12)
     bench.run(Command.HOLD, 1)
     output = bench.run(Command.HOLD, 1, reset_fault=True)
-    assert output.control_mode == Command.HOLD
+    assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_NONE)
     np.testing.assert_array_equal(output.position, Q - 0.03)
 
 
-def test_a_reset_just_before_the_measurement_is_found_again_holds_the_pose_that_is_found():
-    bench = Bench().started()
-    bench.q = Q * np.nan
-    bench.tick()
-    healthy = {"position": list(Q)}
-    bench.send(Command.HOLD, **healthy)
-    bench.tick()
-    bench.send(Command.HOLD, reset_fault=True, **healthy)
-    bench.q = Q - 0.03  # it fell meanwhile
-    output = bench.tick()
-    assert output.control_mode == Command.HOLD
-    np.testing.assert_array_equal(output.position, Q - 0.03)
+def test_a_few_bad_measurements_while_holding_change_nothing():
+    bench = Bench()
+    for _ in range(3):
+        bench.q = Q * np.nan
+        assert bench.tick(BAD).control_mode == Command.HOLD
+        bench.q = Q.copy()
+        bench.tick()
+    assert (bench.guard.state, bench.guard.hold_reason) == (Status.STATE_HOLD, "")
+    np.testing.assert_array_equal(bench.output.position, Q)
+
+
+def test_bad_measurements_before_any_good_one_leave_the_motors_without_power():
+    guard = CommandGuard(ARM, SESSION, Weightless())
+    output = guard.step(0, 0, Q * np.nan, 0 * Q, 0 * Q)
+    assert (output.control_mode, guard.fault_code) == (Command.OFF, Status.FAULT_MEASUREMENT)
+    assert np.all(np.isfinite(output.position))
 
 
 def test_a_fault_while_off_stays_off():
@@ -137,28 +152,26 @@ def test_nobody_turns_the_motors_off_in_a_fault_but_whoever_resets_it_first():
 
 
 @pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])
-def test_a_measurement_that_is_too_old_is_none(mode):
+def test_a_measurement_that_is_too_old_is_bad(mode):
     bench = Bench()
     bench.run(mode, 260)
     bench.age = 20_000
     assert bench.run(mode, 1).control_mode == mode
     bench.age = 20_001
-    output = bench.tick()
-    assert (output.control_mode, bench.guard.fault_code) == (Command.OFF, Status.FAULT_MEASUREMENT)
-    assert bench.guard.fault_text == "the measurement is 0.020 s old; allowed is 0 to 0.02 s"
-    # It goes on elsewhere: held there after a reset, not where it was.
-    bench.age, bench.q = 0, Q - 0.03
     bench.tick()
-    bench.run(Command.HOLD, 1)
-    output = bench.run(Command.HOLD, 1, reset_fault=True)
-    assert output.control_mode == Command.HOLD
-    np.testing.assert_array_equal(output.position, Q - 0.03)
+    assert bench.guard.state == Status.STATE_HOLD
+    old = "the measurement is 0.020 s old; allowed is 0 to 0.02 s"
+    assert bench.guard.hold_reason == ("" if mode == Command.HOLD else old)
+    output = bench.tick(BAD)
+    assert (output.control_mode, bench.guard.fault_code) == (Command.EFFORT, Status.FAULT_MEASUREMENT)
+    assert bench.guard.fault_text == old
 
 
-def test_a_measurement_from_the_future_is_none():
+def test_a_measurement_from_the_future_is_bad():
     bench = Bench().started()
     bench.age = -1
-    assert bench.tick().control_mode == Command.OFF
+    assert bench.tick().control_mode == Command.HOLD
+    bench.tick(BAD)
     assert bench.guard.fault_code == Status.FAULT_MEASUREMENT
 
 

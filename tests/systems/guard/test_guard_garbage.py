@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, Bench, N, Q
+from guard_bench import ARM, LIMIT, Bench, N, Q, Weightless
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -108,7 +108,7 @@ def test_fuzzed_bytes_never_act():
 
 
 def test_settings_are_taken():
-    settings = dataclasses.replace(CommandGuard(ARM, 1).settings, start_time=0.1, expiry=0.02)
+    settings = dataclasses.replace(CommandGuard(ARM, 1, Weightless()).settings, start_time=0.1, expiry=0.02)
     bench = Bench(settings=settings)
     bench.run(Command.EFFORT, 101)
     assert bench.guard.state == Status.STATE_EFFORT

@@ -14,6 +14,17 @@ from dvrk_drake.systems.guard.settings import GuardSettings
 # Measurements
 
 GOOD = np.arange(3.0)
+MS, NOW = 1000, 10**9
+
+
+def measurement():
+    """A good one of three joints, now."""
+    measured = Measurement(3, 20_000)
+    measured.advance(NOW)
+    assert measured.take(NOW, GOOD, GOOD, GOOD) == ""
+    assert measured.dt == 0.0
+    return measured
+
 
 
 def test_a_clock_tells_how_much_time_has_passed():
@@ -37,31 +48,41 @@ def test_a_clock_that_stands_still_is_noticed():
 
 @pytest.mark.parametrize(("age", "good"), [(-1, False), (0, True), (20_000, True), (20_001, False)])
 def test_a_measurement_has_an_age(age, good):
-    measured = Measurement(3, 20_000)
-    assert measured.take(0, GOOD, GOOD, GOOD) == ""
-    problem = measured.take(age, GOOD + 1, GOOD + 2, GOOD + 3)
+    measured = measurement()
+    problem = measured.take(NOW - age, GOOD + 1, GOOD + 2, GOOD + 3)
     assert (problem == "") == good
-    if good:
-        for kept, told in ((measured.q, 1), (measured.v, 2), (measured.effort, 3)):
-            np.testing.assert_array_equal(kept, GOOD + told)
-    else:
-        assert measured.q is None and "allowed is 0 to 0.02 s" in problem
+    assert measured.bad == (not good)
+    for kept, added in ((measured.q, 1), (measured.v, 2), (measured.effort, 3)):
+        np.testing.assert_array_equal(kept, GOOD + added if good else GOOD)
+    assert good or "allowed is 0 to 0.02 s" in problem
 
 
 @pytest.mark.parametrize("which", range(3))
 @pytest.mark.parametrize("bad", [np.zeros(2), np.zeros(4), np.zeros((1, 3)), [0, np.nan, 0], [1e6, 0, 0], [0, 0, -1e6]])
 def test_a_measurement_is_that_many_finite_numbers(which, bad):
-    measured = Measurement(3, 20_000)
-    measured.take(0, GOOD, GOOD, GOOD)
+    measured = measurement()
     vectors = [GOOD, GOOD, GOOD]
     vectors[which] = bad
-    assert measured.take(0, *vectors) == "the measured positions, velocities or efforts are not 3 finite numbers each"
-    assert measured.q is None
+    for count in (1, 2):
+        text = "the measured positions, velocities or efforts are not 3 finite numbers each"
+        assert measured.take(NOW, *vectors) == text
+        assert measured.bad == count
+    np.testing.assert_array_equal(measured.q, GOOD)
+    assert measured.take(NOW, GOOD, GOOD, GOOD) == ""
+    assert measured.bad == 0
+
+
+def test_the_time_between_measurements_is_that_of_the_good_ones():
+    measured = measurement()
+    measured.advance(NOW + 7 * MS)
+    measured.take(NOW + 2 * MS, GOOD * np.nan, GOOD, GOOD)
+    measured.take(NOW + 5 * MS, GOOD, GOOD, GOOD)
+    assert measured.dt == pytest.approx(5e-3, abs=1e-12)
 
 
 def test_a_measurement_is_a_copy():
-    measured, q = Measurement(3, 20_000), GOOD.copy()
-    measured.take(0, q, q, q)
+    measured, q = measurement(), GOOD.copy()
+    measured.take(NOW, q, q, q)
     q[:] = 9.0
     np.testing.assert_array_equal(measured.q, GOOD)
 
@@ -73,7 +94,6 @@ def test_numbers_below_a_million_are_finite(number, finite):
 
 # Streams of commands
 
-MS = 1000
 
 
 class Stream:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from guard_bench import ARM, MS, SESSION, Bench
+from guard_bench import ARM, MS, SESSION, Bench, Weightless
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -55,7 +55,7 @@ def test_a_command_that_answers_an_old_status_is_stale():
     assert bench.send(status_utime=bench.utime - 50 * MS - 1) == Status.REFUSAL_STALE
     assert bench.send(status_utime=bench.utime + 1) == Status.REFUSAL_STALE  # no such status was ever sent
     assert bench.send(status_utime=0) == Status.REFUSAL_STALE
-    unborn = CommandGuard(ARM, SESSION)
+    unborn = CommandGuard(ARM, SESSION, Weightless())
     assert unborn.receive(bench.command(), bench.utime) == Status.REFUSAL_STALE
 
 

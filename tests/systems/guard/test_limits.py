@@ -99,7 +99,7 @@ def start(mode, q=Q, measured=HALF, **fields):
     command.position, command.velocity, command.effort = list(Q), [0.0] * N, list(HALF)
     for name, value in fields.items():
         setattr(command, name, list(value))
-    return LIMITS.refusal_to_start(command, q, measured)
+    return LIMITS.refusal_to_start(command, q, measured, gravity=measured)
 
 
 @pytest.mark.parametrize("joint", range(N))

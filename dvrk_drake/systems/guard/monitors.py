@@ -1,0 +1,71 @@
+"""Monitors of what the guard does itself: how often it is stepped, and whether its efforts oscillate."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from dvrk_drake.models.arm import Arm
+    from dvrk_drake.systems.guard.limits import Vector
+    from dvrk_drake.systems.guard.settings import GuardSettings
+
+#: Periods of which the median is taken.
+_PERIODS = 100
+
+#: Time constant [s] of the mean effort that is subtracted: what alternates slower than about 1 Hz is motion.
+_MEAN_TIME = 0.2
+
+
+class PeriodMonitor:
+    """Median and worst of the last 100 periods between two steps of the guard.
+
+    Attributes:
+        fault: what is wrong with the last periods, in words; "" if nothing is.
+    """
+
+    def __init__(self, settings: GuardSettings) -> None:
+        """No period so far."""
+        self._slow_period, self._longest_period = settings.slow_period, settings.longest_period
+        # A bit for each of the last periods, set if it was slow: an int is quick to copy, shift and count.
+        self._slow = 0
+        self.fault = ""
+
+    def add(self, period: float) -> str:
+        """Adds one period [s] and returns `fault`."""
+        self._slow = (self._slow << 1 | (period > self._slow_period)) & ((1 << _PERIODS) - 1)
+        self.fault = ""
+        if period > self._longest_period:
+            self.fault = f"the guard was not stepped for {1e3 * period:.0f} ms; allowed are {1e3 * self._longest_period:g}"
+        elif self._slow.bit_count() > _PERIODS // 2:
+            self.fault = f"the guard's period has a median above the allowed {1e3 * self._slow_period:g} ms"
+        return self.fault
+
+
+class OscillationMonitor:
+    """RMS of the alternating part of the efforts that the guard commands, with first-order filters.
+
+    x = tau - filter(tau),   rms = sqrt(filter(x^2)) <= oscillation * limit
+    """
+
+    def __init__(self, settings: GuardSettings, arm: Arm) -> None:
+        """Monitor for the joints of `arm`."""
+        self._scale, self._time = 1.0 / (settings.oscillation * arm.effort_limits), settings.oscillation_time
+        self.restart()
+
+    def restart(self) -> None:
+        """Begins anew."""
+        self._mean: Vector | None = None
+
+    def add(self, effort: Vector, dt: float) -> int | None:
+        """Adds an effort (n,) [N m, N] that was commanded for `dt` [s]; returns the joint that oscillates, or None."""
+        scaled = self._scale * effort
+        if self._mean is None:
+            self._mean, self._square = scaled, np.zeros_like(scaled)
+            return None
+        alternating = scaled - self._mean
+        self._mean = self._mean + dt / _MEAN_TIME * alternating
+        self._square = self._square + dt / self._time * (alternating * alternating - self._square)
+        worst = int(self._square.argmax())
+        return worst if self._square[worst] > 1.0 else None

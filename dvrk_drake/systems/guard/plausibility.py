@@ -1,0 +1,299 @@
+"""Plausibility checks of measurements that are finite and fresh but may be wrong: stuck, jumping, inconsistent sensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.systems.guard.settings import PlausibilitySettings
+
+if TYPE_CHECKING:
+    from dvrk_drake.models.arm import Arm
+
+Vector = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: The mass matrix is evaluated again after this time [s]: it changes slowly, and one evaluation costs as much as a tick.
+_MASS_MATRIX_PERIOD = 0.05
+
+#: Encoder counts by which measured positions may deviate beyond the tolerances.
+_COUNTS = 3.0
+
+
+class ArmModel(Protocol):
+    """What the guard needs of a model of the arm; `dvrk_drake.dynamics.control_model.ControlModel` is one."""
+
+    def gravity_effort(self, q: Vector) -> Vector:
+        """Returns the effort (n,) [N m, N] that holds the arm at q (n,) [rad, m]."""
+
+    def mass_matrix(self, q: Vector) -> NDArray[np.float64]:
+        """Returns the mass matrix (n, n) at q (n,)."""
+
+
+@dataclass(slots=True)
+class Sample:
+    """One measurement of n joints with what belongs to it; SI units, prismatic joints in m and N.
+
+    Attributes:
+        dt: time since the measurement before [s].
+        q, v: (n,) measured positions and velocities.
+        step: (n,) change of position since the measurement before.
+        speed: (n,) larger magnitude of the velocities of both measurements.
+        effort: (n,) measured effort of the motors.
+        net_effort: (n,) measured effort without the model's gravity effort.
+        commanded: (n,) effort that the guard commanded before, or None while it commands positions.
+    """
+
+    dt: float
+    q: Vector
+    v: Vector
+    step: Vector
+    speed: Vector
+    effort: Vector
+    net_effort: Vector
+    commanded: Vector | None
+
+
+class Check(Protocol):
+    """One plausibility check. It keeps no state of its own: a guard is copied at every update of a Drake context.
+
+    Attributes:
+        text: what is wrong with a joint that the check finds.
+        about_position: whether the joint has no valid position then.
+    """
+
+    text: str
+    about_position: bool
+
+    def begin(self, sample: Sample) -> Any:
+        """Returns the state before `sample`, the first one."""
+
+    def check(self, sample: Sample, state: Any) -> tuple[Any, Mask]:
+        """Returns the next state and which joints (n,) are implausible."""
+
+
+class PositionJump:
+    """Position steps that no joint can make: |dq| > tolerance + (dt + jitter) min(|v|, 1.5 speed limit)."""
+
+    text, about_position = "the position jumps", True
+
+    def __init__(self, settings: PlausibilitySettings, tolerance: Vector, speed_limit: Vector) -> None:
+        """Check with a tolerance [rad, m] for joints that have speed limits [rad/s, m/s], both (n,)."""
+        self._tolerance, self._fastest, self._jitter = tolerance, 1.5 * speed_limit, settings.jitter
+
+    def begin(self, sample: Sample) -> None:
+        """No state."""
+
+    def check(self, sample: Sample, state: None) -> tuple[None, Mask]:
+        """See `Check.check`."""
+        reach = (sample.dt + self._jitter) * np.minimum(sample.speed, self._fastest)
+        return None, np.abs(sample.step) > self._tolerance + reach
+
+
+class VelocityConsistency:
+    """Velocities that disagree with the change of position.
+
+    The difference e of the change of position and the integrated velocity fades with the time constant T,
+
+        e' = (1 - dt/T) e + dq - v dt,    |e| <= tolerance + delay s,
+
+    where s is the largest recent speed, fading likewise: a velocity that is estimated with a delay deviates while the
+    joint accelerates.
+    """
+
+    text, about_position = "position and velocity disagree", True
+
+    def __init__(self, settings: PlausibilitySettings, tolerance: Vector) -> None:
+        """Check with a tolerance (n,) [rad, m]."""
+        self._tolerance, self._delay, self._memory = tolerance, settings.velocity_delay, settings.velocity_memory
+
+    def begin(self, sample: Sample) -> tuple[Vector, Vector]:
+        """Difference e and speed s, both (n,)."""
+        return np.zeros_like(sample.q), sample.speed
+
+    def check(self, sample: Sample, state: tuple[Vector, Vector]) -> tuple[tuple[Vector, Vector], Mask]:
+        """See `Check.check`."""
+        keep = max(1.0 - sample.dt / self._memory, 0.0)
+        error = keep * state[0] + sample.step - sample.dt * sample.v
+        speed = np.maximum(keep * state[1], sample.speed)
+        return (error, speed), np.abs(error) > self._tolerance + self._delay * speed
+
+
+class FrozenPosition:
+    """Positions that stay exactly the same while the effort on the joint changes.
+
+    Motor encoders sit in front of cables and structure that give way. So an effort that changes by a good part of its
+    limit turns the encoder by at least a count, also where a joint presses against a stop or is held by a hand.
+    """
+
+    text, about_position = "the position does not change although the effort does", True
+
+    def __init__(self, settings: PlausibilitySettings, effort_limits: Vector, counts: Vector) -> None:
+        """Check for joints with effort limits [N m, N] and encoder counts [rad, m], both (n,)."""
+        self._allowed = settings.frozen_effort * effort_limits
+        self._least_time = settings.frozen_time + counts / settings.frozen_speed
+
+    def begin(self, sample: Sample) -> tuple[Vector, Vector]:
+        """Effort at the last change of position, and the time since then, both (n,)."""
+        return sample.net_effort, np.zeros_like(sample.q)
+
+    def check(self, sample: Sample, state: tuple[Vector, Vector]) -> tuple[tuple[Vector, Vector], Mask]:
+        """See `Check.check`."""
+        stands = sample.step == 0
+        effort = np.where(stands, state[0], sample.net_effort)
+        still = stands * (state[1] + sample.dt)
+        return (effort, still), (np.abs(sample.net_effort - effort) > self._allowed) & (still > self._least_time)
+
+
+class Response:
+    """Accelerations that do not follow from the efforts.
+
+    The unexplained effort r = filter(tau - G(q)) - M(q) filter(vd) holds friction, the forces of hands and obstacles,
+    the model's errors, and whatever is wrong with sensors or motors. With a first-order filter of time constant T,
+    filter(vd) = (v - filter(v)) / T needs no differentiation. A part that lasts is taken as an error of the model and
+    subtracted. Coriolis terms are left out; they are small at the speeds that the guard allows.
+    """
+
+    text, about_position = "the motion does not follow from the effort", True
+
+    def __init__(self, settings: PlausibilitySettings, effort_limits: Vector, model: ArmModel) -> None:
+        """Check for joints with effort limits (n,) [N m, N]."""
+        self._allowed, self._time = settings.response * effort_limits, settings.response_time
+        self._memory, self._model = settings.response_memory, model
+
+    def begin(self, sample: Sample) -> tuple[Vector, Vector, Vector, NDArray[np.float64], float]:
+        """Filtered effort, filtered velocity, lasting effort (n,), M / T (n, n), and its age [s]."""
+        M = self._model.mass_matrix(sample.q) / self._time
+        return sample.net_effort, sample.v, sample.net_effort, M, 0.0
+
+    def check(self, sample: Sample, state: tuple) -> tuple[tuple, Mask]:
+        """See `Check.check`."""
+        effort, velocity, lasting, M, age = state
+        age += sample.dt
+        if age > _MASS_MATRIX_PERIOD:
+            M, age = self._model.mass_matrix(sample.q) / self._time, 0.0
+        gain = min(sample.dt / self._time, 1.0)
+        effort = effort + gain * (sample.net_effort - effort)
+        velocity = velocity + gain * (sample.v - velocity)
+        unexplained = effort - M @ (sample.v - velocity) - lasting
+        lasting = lasting + min(sample.dt / self._memory, 1.0) * unexplained
+        return (effort, velocity, lasting, M, age), np.abs(unexplained) > self._allowed
+
+
+class SilentEffort:
+    """Measured efforts that do not show what is commanded: a sensor that reads zero, or a motor without power."""
+
+    text, about_position = "the measured effort does not show the commanded one", False
+
+    def __init__(self, settings: PlausibilitySettings, effort_limits: Vector) -> None:
+        """Check for joints with effort limits (n,) [N m, N]."""
+        self._commanded, self._time = settings.silent_effort * effort_limits, settings.silent_time
+        self._least = 0.1 * self._commanded
+
+    def begin(self, sample: Sample) -> Vector:
+        """Time (n,) for which the commanded effort has not shown [s]."""
+        return np.zeros_like(sample.q)
+
+    def check(self, sample: Sample, state: Vector) -> tuple[Vector, Mask]:
+        """See `Check.check`."""
+        if sample.commanded is None:
+            state = np.zeros_like(state)
+        else:
+            hidden = np.abs(sample.commanded) > self._commanded
+            hidden &= np.where(sample.commanded > 0, sample.effort, -sample.effort) < self._least
+            state = hidden * (state + sample.dt)
+        return state, state > self._time
+
+
+class Plausibility:
+    """All checks of an arm's measurements, one sample at a time.
+
+    Attributes:
+        gravity: (n,) the model's gravity effort at the last sample [N m, N].
+        invalid: (n,) joints without a valid position since the last `restart`.
+        fault: what was implausible in the last sample, in words; "" if nothing was.
+        last_valid: (n,) pose of the last sample, or an earlier one for `invalid` joints [rad, m].
+    """
+
+    def __init__(self, arm: Arm, model: ArmModel, settings: PlausibilitySettings, speed_limit: Vector) -> None:
+        """Checks for `arm`.
+
+        Args:
+            arm: with n joints.
+            model: of that arm, mounted as it is.
+            settings: tolerances.
+            speed_limit: (n,) that the guard keeps [rad/s, m/s].
+        """
+        self.model, self._names = model, arm.joint_names
+        resolution = arm.effects.encoder.resolution if arm.effects.encoder is not None else {}
+        counts = np.abs(arm.transmission.inverse().matrix) @ [resolution.get(name, 0.0) for name in arm.joint_names]
+        tolerance = arm.per_joint(settings.position_tolerance, 0.1 * settings.position_tolerance) + _COUNTS * counts
+        self._detection_time = settings.detection_time
+        self._checks: tuple[Check, ...] = (
+            PositionJump(settings, tolerance, speed_limit),
+            VelocityConsistency(settings, tolerance),
+            FrozenPosition(settings, arm.effort_limits, counts),
+            Response(settings, arm.effort_limits, model),
+            SilentEffort(settings, arm.effort_limits),
+        )
+        self._none = np.zeros(arm.num_joints, bool)
+        self.gravity = self.last_valid = np.zeros(arm.num_joints)
+        self._poses, self._pose_age = (self.last_valid, self.last_valid), 0.0
+        self.restart()
+
+    def restart(self) -> None:
+        """Begins anew with the next sample."""
+        self.invalid, self.fault = self._none, ""
+        self._before: tuple[Vector, Vector] | None = None
+
+    def check(self, dt: float, q: Vector, v: Vector, effort: Vector, commanded: Vector | None) -> str:
+        """Checks one measurement; all arrays are (n,) and finite, and not changed in place.
+
+        Args:
+            dt: since the measurement before [s].
+            q, v, effort: measured positions, velocities and efforts.
+            commanded: effort that the guard commanded before, or None.
+
+        Returns:
+            `fault`.
+        """
+        self.gravity, self.fault = self.model.gravity_effort(q), ""
+        if self._before is None:
+            sample = Sample(dt, q, v, np.zeros_like(q), np.abs(v), effort, effort - self.gravity, commanded)
+            self._states = [check.begin(sample) for check in self._checks]
+            self._poses, self._pose_age = (q, q), 0.0
+        else:
+            q_before, speed_before = self._before
+            speed = np.abs(v)
+            fastest = np.maximum(speed, speed_before)
+            sample = Sample(dt, q, v, q - q_before, fastest, effort, effort - self.gravity, commanded)
+            states = []
+            for check, state in zip(self._checks, self._states, strict=True):
+                state, joints = check.check(sample, state)
+                states.append(state)
+                if joints.any():
+                    self._find(check, joints)
+            self._states = states
+            self._pose_age += dt
+            if self._pose_age > self._detection_time:
+                self._poses, self._pose_age = (self._poses[1], q), 0.0
+        self._before = q, np.abs(v)
+        return self.fault
+
+    def reject_all(self) -> None:
+        """Takes all joints as without a valid position, for measurements that are lost."""
+        self._reject(~self._none)
+
+    def _find(self, check: Check, joints: Mask) -> None:
+        if not self.fault:
+            self.fault = f"{', '.join(self._names[j] for j in np.flatnonzero(joints))}: {check.text}"
+        if check.about_position:
+            self._reject(joints)
+
+    def _reject(self, joints: Mask) -> None:
+        # What is found now began before: the pose of then is the last one that is valid.
+        self.last_valid = np.where(joints & ~self.invalid, self._poses[0], self.last_valid)
+        self.invalid = self.invalid | joints

@@ -1,0 +1,194 @@
+"""A simulated arm with real sensors whose measurements can fail, behind its driver, under a controller that moves it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.trajectories import PiecewisePolynomial
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.processes.arm_controller import ArmController
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.sim_dvrk_driver import SimDvrkDriver
+
+PERIOD = 1e-3
+#: Time for which the desired pose rests at first, while the guard watches the controller [s].
+_AT_REST = 0.8
+
+#: Sensor faults of one joint: (q, v, effort, q when it began, time since then, scale) -> what is measured. The scale is 1
+#: on a joint that turns [rad] and 0.1 on one that slides [m].
+FAULTS = {
+    "encoder stuck": lambda q, v, effort, q0, t, scale: (q0, 0.0, effort),
+    "position stuck": lambda q, v, effort, q0, t, scale: (q0, v, effort),
+    "position jumps": lambda q, v, effort, q0, t, scale: (q + 0.3 * scale, v, effort),
+    "position drifts": lambda q, v, effort, q0, t, scale: (q + 0.5 * scale * t, v, effort),
+    "encoder inverted": lambda q, v, effort, q0, t, scale: (2 * q0 - q, -v, effort),
+    "velocity inverted": lambda q, v, effort, q0, t, scale: (q, -v, effort),
+    "velocity zero": lambda q, v, effort, q0, t, scale: (q, 0.0, effort),
+    "velocity offset": lambda q, v, effort, q0, t, scale: (q, v + scale, effort),
+    "effort zero": lambda q, v, effort, q0, t, scale: (q, v, 0.0),
+    "not finite": lambda q, v, effort, q0, t, scale: (np.nan, v, effort),
+}
+
+
+class FaultySensors(LeafSystem):
+    """Passes a state (2n) and an effort (n) on; the measurement of one joint fails from a time on."""
+
+    def __init__(self, arm):
+        super().__init__()
+        n = arm.num_joints
+        self.fault, self.joint, self.begin, self._q = None, 0, np.inf, None
+        self._scale = arm.per_joint(1.0, 0.1)
+        state, effort = self.DeclareVectorInputPort("state", 2 * n), self.DeclareVectorInputPort("effort", n)
+        self.DeclareVectorOutputPort("state_measured", 2 * n, lambda c, out: out.SetFromVector(self.measure(c)[0]))
+        self.DeclareVectorOutputPort("effort_measured", n, lambda c, out: out.SetFromVector(self.measure(c)[1]))
+        self._ports = state, effort
+
+    def measure(self, context):
+        state, effort = (np.array(port.Eval(context)) for port in self._ports)
+        t, j, n = context.get_time(), self.joint, len(effort)
+        if t >= self.begin:
+            self._q = state[j] if self._q is None else self._q
+            state[j], state[n + j], effort[j] = FAULTS[self.fault](
+                state[j], state[n + j], effort[j], self._q, t - self.begin, self._scale[j]
+            )
+        return state, effort
+
+
+def wave(arm, seconds, speed, seed=0):
+    """A smooth motion (2n: q, then v) of all joints about the middle of their ranges, that begins at rest.
+
+    Joints swing as far as 0.35 of their range and as fast as `speed` (a tenth of it if they slide) allow, each at a
+    frequency of its own.
+    """
+    times = np.arange(0.0, seconds + 0.1, 0.02)
+    middle, half = 0.5 * (arm.position_upper + arm.position_lower), 0.5 * (arm.position_upper - arm.position_lower)
+    for limit in arm.coupled_limits:
+        row = np.array([limit.coefficients.get(name, 0.0) for name in arm.joint_names])
+        middle = middle + row / (row @ row) * (0.5 * (limit.lower + limit.upper) - row @ middle)
+        half = np.where(row != 0, np.minimum(half, 0.5 * (limit.upper - limit.lower)), half)
+    omega = np.random.default_rng(seed).uniform(1.0, 2.5, arm.num_joints)
+    amplitude = np.minimum(0.35 * half, speed * arm.per_joint(1.0, 0.1) / omega)
+    fade = np.clip((times - _AT_REST) / 1.5, 0.0, 1.0)
+    q = middle + (fade**2 * (3 - 2 * fade))[:, None] * amplitude * np.sin(np.outer(times, omega))
+    path = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times, q.T, True)
+    return path
+
+
+@dataclass
+class Outcome:
+    """What a fault of one joint did to the simulated arm; revolute joints in rad, prismatic ones in m.
+
+    Attributes:
+        detected: time from the fault to its detection [s]; inf if it was not detected.
+        text: the guard's.
+        before, after: largest movement of the joint from the fault to its detection, and from then on.
+        speed: largest speed of any joint after detection, 50 ms and more, divided by 1 rad/s or 0.1 m/s.
+        effort: largest effort of any joint after detection, as a fraction of its limit.
+    """
+
+    detected: float
+    text: str
+    before: float
+    after: float
+    speed: float
+    effort: float
+
+
+class FaultyArm:
+    """The arm, its driver and one of four controllers, in one Diagram stepped every millisecond.
+
+    Attributes:
+        sensors: whose measurements can be made to fail.
+    """
+
+    def __init__(self, name, use, *, speed=0.5, effects=True, driver=None, seconds=8.0, seed=0):
+        """use: "effort" (PID and gravity along a path), "gravity" (gravity compensation), "position", or "hold"."""
+        self.arm = arm = load_arm(name)
+        n = arm.num_joints
+        known = arm.effects.cables + arm.effects.springs if effects else []
+        model = IdentifiedModel.from_arm(arm, known)
+        builder = DiagramBuilder()
+        effects = arm.effects if effects else None
+        self.station = builder.AddSystem(ArmStation(arm, effects=effects, seed=seed))
+        self.driver = builder.AddSystem(SimDvrkDriver(arm, driver or DvrkDriver(), model=model))
+        self.sensors = builder.AddSystem(FaultySensors(arm))
+        connect = builder.Connect
+        station = lambda port: self.station.GetOutputPort(f"{arm.name.lower()}.{port}")
+        connect(station("state_estimated"), self.sensors.GetInputPort("state"))
+        connect(station("effort_measured"), self.sensors.GetInputPort("effort"))
+        state, effort = (self.sensors.GetOutputPort(port) for port in ("state_measured", "effort_measured"))
+        connect(state, self.driver.GetInputPort("state_estimated"))
+        connect(effort, self.driver.GetInputPort("effort_measured"))
+        connect(self.driver.GetOutputPort("effort_commanded"), self.station.GetInputPort(f"{arm.name.lower()}.effort_commanded"))
+        path = wave(arm, seconds, speed, seed)
+        self.start = path.value(0.0).ravel()
+        velocity = path.MakeDerivative()
+        self._desired = lambda t: np.concatenate([path.value(t), velocity.value(t)]).ravel()
+        self._controller = None
+        if use in ("effort", "gravity"):
+            mode = "hold" if use == "effort" else "gravity"
+            self._controller = ArmController(arm, model, mode, PERIOD)
+        elif use == "position":
+            self._sender = builder.AddSystem(DvrkCommandSender(arm))
+            connect(self.driver.GetOutputPort("lcmt_dvrk_status"), self._sender.GetInputPort("lcmt_dvrk_status"))
+            connect(self._sender.get_output_port(), self.driver.GetInputPort("lcmt_dvrk_command"))
+        self._use = use
+        self.simulator = Simulator(builder.Build())
+        self.context = self.simulator.get_mutable_context()
+        self.station.set_positions(self.station.GetMyMutableContextFromRoot(self.context), self.start)
+        self.simulator.Initialize()
+        self.ticks = 0
+
+    @property
+    def guard(self):
+        return self.driver.GetGuard(self.driver.GetMyContextFromRoot(self.context))
+
+    def step(self):
+        time = PERIOD * self.ticks
+        if self._controller is not None:
+            status = self.driver.GetOutputPort("lcmt_dvrk_status").Eval(self.driver.GetMyContextFromRoot(self.context))
+            desired = self._desired(time) if self._use == "effort" else None
+            self.driver.Receive(self._controller.answer(status, time, desired).encode())
+        elif self._use == "position":
+            context = self._sender.GetMyMutableContextFromRoot(self.context)
+            self._sender.GetInputPort("desired_state").FixValue(context, self._desired(time))
+        self.ticks += 1
+        self.simulator.AdvanceTo(PERIOD * self.ticks)
+
+    def state(self):
+        port = self.station.GetOutputPort(f"{self.arm.name.lower()}.state_true")
+        return np.split(np.array(port.Eval(self.station.GetMyContextFromRoot(self.context))), 2)
+
+    def effort(self):
+        port = self.driver.GetOutputPort("effort_commanded")
+        return np.array(port.Eval(self.driver.GetMyContextFromRoot(self.context)))
+
+    def fail(self, fault, joint, at, seconds=1.5, patience=1.5):
+        """Runs until `at` [s], makes the measurement of a joint fail, and returns the Outcome."""
+        while self.ticks * PERIOD < at:
+            self.step()
+        assert self.guard.state != Status.STATE_FAULT, self.guard.fault_text
+        self.sensors.fault, self.sensors.joint, self.sensors.begin = fault, joint, self.ticks * PERIOD
+        start, before, ended = self.state()[0][joint], 0.0, self.ticks
+        while self.guard.state != Status.STATE_FAULT and (self.ticks - ended) * PERIOD < patience:
+            self.step()
+            before = max(before, abs(self.state()[0][joint] - start))
+        if self.guard.state != Status.STATE_FAULT:
+            return Outcome(np.inf, "", before, 0.0, 0.0, 0.0)
+        detected, found = (self.ticks - ended) * PERIOD, self.state()[0][joint]
+        after = speed = effort = 0.0
+        scale = self.arm.per_joint(1.0, 0.1)
+        for k in range(round(seconds / PERIOD)):
+            self.step()
+            q, v = self.state()
+            after = max(after, abs(q[joint] - found))
+            effort = max(effort, np.max(np.abs(self.effort()) / self.arm.effort_limits))
+            if k >= 50:
+                speed = max(speed, np.max(np.abs(v) / scale))
+        return Outcome(detected, self.guard.fault_text, before, after, speed, effort)
