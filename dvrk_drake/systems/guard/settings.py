@@ -3,30 +3,17 @@
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from dvrk_drake.errors import StationError
-
-#: Lowest and highest value of each: outside, the guard would guard nothing, or nobody could command.
-_ALLOWED = {
-    "expiry": (0.002, 1.0),
-    "measurement_age": (0.001, 0.1),
-    "start_time": (0.05, 10.0),
-    "clock_tolerance": (0.001, 1.0),
-    "start_effort": (0.001, 0.25),
-    "margin": (0.001, 0.3),
-    "margin_fraction": (0.001, 0.25),
-    "effort_fraction": (0.01, 1.0),
-    "effort_rise_time": (0.002, 10.0),
-    "traverse_time": (0.1, 100.0),
-    "following_error": (0.01, 0.5),
-    "following_time": (0.01, 1.0),
-}
+from dvrk_drake.models.schema_fault import number_fault, within
 
 
 @dataclass
 class GuardSettings:
     """What a command guard allows.
+
+    The range of each setting stands beside it; outside, the guard would guard nothing, or nobody could command.
 
     Attributes:
         expiry: age at which a command is not obeyed any more, counted from the measurement that it answers [s]; and
@@ -47,18 +34,18 @@ class GuardSettings:
         following_time: how late the arm's position controller may follow [s]; a PD controller: Kd/Kp.
     """
 
-    expiry: float = 0.05
-    measurement_age: float = 0.02
-    start_time: float = 0.25
-    clock_tolerance: float = 0.05
-    start_effort: float = 0.1
-    margin: float = 0.05
-    margin_fraction: float = 0.05
-    effort_fraction: float = 1.0
-    effort_rise_time: float = 0.02
-    traverse_time: float = 0.5
-    following_error: float = 0.15
-    following_time: float = 0.2
+    expiry: float = field(default=0.05, metadata=within(0.002, 1.0, "s"))
+    measurement_age: float = field(default=0.02, metadata=within(0.001, 0.1, "s"))
+    start_time: float = field(default=0.25, metadata=within(0.05, 10.0, "s"))
+    clock_tolerance: float = field(default=0.05, metadata=within(0.001, 1.0, "s"))
+    start_effort: float = field(default=0.1, metadata=within(0.001, 0.25))
+    margin: float = field(default=0.05, metadata=within(0.001, 0.3, "rad"))
+    margin_fraction: float = field(default=0.05, metadata=within(0.001, 0.25))
+    effort_fraction: float = field(default=1.0, metadata=within(0.01, 1.0))
+    effort_rise_time: float = field(default=0.02, metadata=within(0.002, 10.0, "s"))
+    traverse_time: float = field(default=0.5, metadata=within(0.1, 100.0, "s"))
+    following_error: float = field(default=0.15, metadata=within(0.01, 0.5))
+    following_time: float = field(default=0.2, metadata=within(0.01, 1.0, "s"))
 
     def __post_init__(self) -> None:
         self.check()
@@ -69,6 +56,5 @@ class GuardSettings:
         Raises:
             StationError: one is outside its range.
         """
-        for name, (lowest, highest) in _ALLOWED.items():
-            if not lowest <= (value := getattr(self, name)) <= highest:
-                raise StationError(f"guard settings: {name} must be {lowest:g} to {highest:g}; got {value}")
+        if fault := number_fault(self):
+            raise StationError(f"guard settings: {fault}")
