@@ -14,6 +14,7 @@ from dvrk_drake.dynamics.effect_shapes import effect_shapes, nominal_weight
 from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES, LinkInertia, pseudo_inertia
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.schema_fault import number_fault
 
 #: An actuator that needs no more than this at so many poses bears no weight [N m, N].
 LEAST_WEIGHT, WEIGHING_POSES = 1e-9, 20
@@ -101,11 +102,13 @@ class DynamicModel:
 def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
     """Raises ModelError unless the section fits the arm, has bodies that can exist, and settings for every actuator."""
     arm = regressor.arm
+    if fault := number_fault(section):
+        raise ModelError(f"dynamics.{fault}")
     if [link.link for link in section.links] != [link.link for link in regressor.links]:
         raise ModelError(f"dynamics.links must be, in this order: {', '.join(link.link for link in regressor.links)}")
     for link in section.links:
-        if len(link.parameters) != len(PARAMETER_NAMES) or not np.all(np.isfinite(link.parameters)):
-            raise ModelError(f"dynamics: {link.link} must have ten finite numbers: {', '.join(PARAMETER_NAMES)}")
+        if len(link.parameters) != len(PARAMETER_NAMES):
+            raise ModelError(f"dynamics: {link.link} must have ten numbers: {', '.join(PARAMETER_NAMES)}")
         least = float(np.linalg.eigvalsh(pseudo_inertia(link.parameters))[0])
         if not least > 0:
             raise ModelError(
@@ -113,15 +116,11 @@ def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
             )
     if [rotor.actuator for rotor in section.rotors] != list(arm.joint_names):
         raise ModelError(f"dynamics.rotors must be, in this order: {', '.join(arm.joint_names)}")
-    if not all(0 <= rotor.value < np.inf for rotor in section.rotors):
-        raise ModelError("dynamics: rotor inertias must be finite numbers from 0")
     _check_effects(arm, section)
     settings = section.signals
     for which, values in (("acceleration_cut_off", settings.acceleration_cut_off), ("delay", settings.effort_delay)):
-        if len(values) != arm.num_joints or not np.all(np.isfinite(values)):
-            raise ModelError(f"dynamics.signals: {which} must have {arm.num_joints} finite numbers")
-    if not min(settings.effort_cut_off, settings.position_cut_off, *settings.acceleration_cut_off) > 0:
-        raise ModelError("dynamics.signals: cut-offs must be positive")
+        if len(values) != arm.num_joints:
+            raise ModelError(f"dynamics.signals: {which} must have {arm.num_joints} numbers")
 
 
 def _check_effects(arm: Arm, section: DynamicSection) -> None:
@@ -129,5 +128,5 @@ def _check_effects(arm: Arm, section: DynamicSection) -> None:
         where = f"dynamics.effects[{i}]"
         if fault := effect_fault(arm, estimate.effect):
             raise ModelError(f"{where}: {fault}")
-        if not np.isfinite(estimate.value) or (estimate.effect.dissipative and estimate.value < 0):
-            raise ModelError(f"{where}: value is {estimate.value:g}; a finite number, of friction 0 or more")
+        if estimate.effect.dissipative and estimate.value < 0:
+            raise ModelError(f"{where}: value is {estimate.value:g}; of friction 0 or more")

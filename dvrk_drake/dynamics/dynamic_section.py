@@ -4,6 +4,18 @@
 from dataclasses import dataclass, field
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
+from dvrk_drake.models.arm_schema import GRAVITIES
+from dvrk_drake.models.schema_fault import within
+
+#: What a fit finds: beyond the largest arm by orders of magnitude, as parameters that a recording does not tell are
+#: found anywhere, and their standard errors are larger still.
+ESTIMATES = within(-1e5, 1e5, "kg, kg m or kg m^2")
+COEFFICIENTS = within(-1e6, 1e6, "N m, N m s/rad or N m/rad")
+STANDARD_ERRORS = within(0.0, 1e9)
+RMS_EFFORTS = within(0.0, 1e6, "N m or N")
+#: Of numbers that rounding may put beyond 0 or 1.
+SHARES = within(-1e-6, 1.0 + 1e-6)
+_CUT_OFFS = within(0.01, 1e5, "Hz")
 
 
 @dataclass
@@ -17,10 +29,10 @@ class LinkEstimate:
     """
 
     link: str = ""
-    parameters: list[float] = field(default_factory=list)
-    least_eigenvalue: float = 0.0
-    standard_errors: list[float] = field(default_factory=list)
-    mass_told: float = 0.0
+    parameters: list[float] = field(default_factory=list, metadata=ESTIMATES)
+    least_eigenvalue: float = field(default=0.0, metadata=ESTIMATES)
+    standard_errors: list[float] = field(default_factory=list, metadata=STANDARD_ERRORS)
+    mass_told: float = field(default=0.0, metadata=SHARES)
     bounds: list[str] = field(default_factory=list)
 
 
@@ -33,9 +45,9 @@ class MotionParameterEstimate:
 
     name: str = ""
     unit: str = ""
-    value: float = 0.0
-    standard_error: float = 0.0
-    told: float = 0.0
+    value: float = field(default=0.0, metadata=ESTIMATES)
+    standard_error: float = field(default=0.0, metadata=STANDARD_ERRORS)
+    told: float = field(default=0.0, metadata=SHARES)
 
 
 @dataclass
@@ -44,7 +56,7 @@ class CorrelatedEstimates:
 
     first: str = ""
     second: str = ""
-    correlation: float = 0.0
+    correlation: float = field(default=0.0, metadata=within(-1.0 - 1e-6, 1.0 + 1e-6))
 
 
 @dataclass
@@ -52,8 +64,8 @@ class RotorEstimate:
     """Inertia of a motor's rotor at its actuator [kg m^2; kg of a prismatic one]."""
 
     actuator: str = ""
-    value: float = 0.0
-    standard_error: float = 0.0
+    value: float = field(default=0.0, metadata=within(0.0, 1e4, "kg m^2 or kg"))
+    standard_error: float = field(default=0.0, metadata=STANDARD_ERRORS)
 
 
 @dataclass
@@ -62,9 +74,9 @@ class ActuatorEffectEstimate:
 
     coordinate: str = ""
     kind: str = ""
-    scale: float = 0.0
-    value: float = 0.0
-    standard_error: float = 0.0
+    scale: float = field(default=0.0, metadata=within(1e-9, 1e4, also=(0.0,)))
+    value: float = field(default=0.0, metadata=COEFFICIENTS)
+    standard_error: float = field(default=0.0, metadata=STANDARD_ERRORS)
 
     @property
     def effect(self) -> ActuatorEffect:
@@ -87,20 +99,20 @@ class ActuatorStatistics:
     """
 
     name: str = ""
-    rms_effort: float = 0.0
-    rms_fit: float = 0.0
-    rms_cross_validation: float = 0.0
-    rms_repeatability: float = 0.0
+    rms_effort: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_fit: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_cross_validation: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_repeatability: float = field(default=0.0, metadata=RMS_EFFORTS)
 
 
 @dataclass
 class SignalSettings:
     """How signals were treated: cut-offs of zero-phase low-passes [Hz], delays of the efforts [s], per actuator."""
 
-    position_cut_off: float = 50.0
-    acceleration_cut_off: list[float] = field(default_factory=list)
-    effort_cut_off: float = 0.0
-    effort_delay: list[float] = field(default_factory=list)
+    position_cut_off: float = field(default=50.0, metadata=_CUT_OFFS)
+    acceleration_cut_off: list[float] = field(default_factory=list, metadata=_CUT_OFFS)
+    effort_cut_off: float = field(default=0.0, metadata=_CUT_OFFS)
+    effort_delay: list[float] = field(default_factory=list, metadata=within(-1.0, 1.0, "s"))
 
 
 @dataclass
@@ -112,12 +124,12 @@ class DynamicSection:
     can tell of links and rotors, `correlations` which of them this one did not tell apart.
     """
 
-    gravity: list[float] = field(default_factory=list)
+    gravity: list[float] = field(default_factory=list, metadata=GRAVITIES)
     links: list[LinkEstimate] = field(default_factory=list)
     rotors: list[RotorEstimate] = field(default_factory=list)
     effects: list[ActuatorEffectEstimate] = field(default_factory=list)
     actuators: list[ActuatorStatistics] = field(default_factory=list)
     signals: SignalSettings = field(default_factory=SignalSettings)
-    gravity_expected: list[float] = field(default_factory=list)
+    gravity_expected: list[float] = field(default_factory=list, metadata=GRAVITIES)
     base_parameters: list[MotionParameterEstimate] = field(default_factory=list)
     correlations: list[CorrelatedEstimates] = field(default_factory=list)

@@ -1,6 +1,7 @@
 """What an identification leaves behind: parameters with their uncertainty, and where they came from. Stored as YAML."""
 
 # No postponed annotations here: yaml_load_typed reads the types at run time.
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -13,15 +14,25 @@ from pydrake.common.yaml import yaml_dump_typed
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, effect_fault
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
+from dvrk_drake.dynamics.dynamic_section import (
+    ESTIMATES,
+    RMS_EFFORTS,
+    STANDARD_ERRORS,
+    ActuatorEffectEstimate,
+    DynamicSection,
+)
 from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.models.schema_fault import INFINITE, missing_key, schema_fault
+from dvrk_drake.models.schema_fault import missing_key, schema_fault, within
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
+
+#: Measured positions, which may be beyond the limits of a joint.
+_POSITIONS = within(-50.0, 50.0, "rad or m")
 
 
 @dataclass
@@ -29,8 +40,8 @@ class BaseParameterEstimate:
     """A base parameter [kg m, or kg of a mass]; `distinguishable`: its size exceeds two standard errors."""
 
     name: str = ""
-    value: float = 0.0
-    standard_error: float = 0.0
+    value: float = field(default=0.0, metadata=ESTIMATES)
+    standard_error: float = field(default=0.0, metadata=STANDARD_ERRORS)
     distinguishable: bool = False
 
 
@@ -46,18 +57,18 @@ class JointStatistics:
     """
 
     name: str = ""
-    rms_zero_torque: float = 0.0
-    rms_fit: float = 0.0
-    rms_leave_one_out: float = 0.0
-    rms_zero_torque_undoubted: float = 0.0
-    rms_fit_undoubted: float = 0.0
-    rms_leave_one_out_undoubted: float = 0.0
-    rms_cross_validation_undoubted: float = 0.0
-    num_doubted: int = 0
-    trust: float = 1.0
-    position_lower: float = 0.0
-    position_upper: float = 0.0
-    coverage: float = 0.0
+    rms_zero_torque: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_fit: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_leave_one_out: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_zero_torque_undoubted: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_fit_undoubted: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_leave_one_out_undoubted: float = field(default=0.0, metadata=RMS_EFFORTS)
+    rms_cross_validation_undoubted: float = field(default=0.0, metadata=RMS_EFFORTS)
+    num_doubted: int = field(default=0, metadata=within(0, 10**9))
+    trust: float = field(default=1.0, metadata=within(0.0, 1.0))
+    position_lower: float = field(default=0.0, metadata=_POSITIONS)
+    position_upper: float = field(default=0.0, metadata=_POSITIONS)
+    coverage: float = field(default=0.0, metadata=within(0.0, 10.0))
 
 
 @dataclass
@@ -66,10 +77,10 @@ class Provenance:
 
     recording: str = ""
     sha256: str = ""
-    poses: int = 0
+    poses: int = field(default=0, metadata=within(0, 10**9))
     method: str = ""
-    rank: int = 0
-    condition_number: float = field(default=0.0, metadata={INFINITE: True})
+    rank: int = field(default=0, metadata=within(0, 10**6))
+    condition_number: float = field(default=0.0, metadata=within(0.0, 1e100, also=(math.inf,)))
     version: str = ""
 
 
@@ -101,7 +112,7 @@ class IdentifiedModel:
 
     format: str = "dvrk_drake identified model 2"
     arm: str = ""
-    gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81])
+    gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81], metadata=GRAVITIES)
     base_parameters: list[BaseParameterEstimate] = field(default_factory=list)
     effects: list[ActuatorEffectEstimate] = field(default_factory=list)
     joints: list[JointStatistics] = field(default_factory=list)
@@ -182,8 +193,6 @@ class IdentifiedModel:
         for name, verdict in self.validation.verdicts.items() if self.validation else ():
             if verdict not in get_args(Verdict):
                 raise ModelError(f'validation.verdicts.{name} is "{verdict}"; allowed: {", ".join(get_args(Verdict))}')
-        if not np.all((self.trust >= 0) & (self.trust <= 1)):
-            raise ModelError("trust must be between 0 and 1")
         if self.dynamics is not None:
             DynamicModel(arm, self.dynamics)
             if self.effects or self.dynamics.gravity != self.gravity:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TypeVar
@@ -15,6 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_schema import (
+    ANGLE_WIDTHS,
+    ANGLES,
+    COUPLINGS,
+    EFFORTS,
+    GRAVITIES,
+    TRAVEL_WIDTHS,
+    TRAVELS,
     ArmDescription,
     BoundingShapes,
     CoupledLimit,
@@ -26,11 +33,18 @@ from dvrk_drake.models.arm_schema import (
 )
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.linear_map import LinearMap
+from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, within
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, read_sdf_facts
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
-#: A joint that slides or turns further has its limits in another unit [m], [rad]; an MTM's roll turns to -8.4 rad.
-LONGEST_TRAVEL, LARGEST_ANGLE = 2.0, 12.6
+#: Length of the gravity vector, at most [m/s^2].
+LARGEST_GRAVITY = 30.0
+#: A gain is too large if this position error [rad, m] demands the whole effort limit of the joint: kp at once, kd if
+#: the error arises within 0.1 s, ki if it lasts for 0.1 s.
+_LEAST_ERROR = (1e-4, 1e-5)
+#: A gain is too small if an error of the whole range of the joint demands less than this share of its effort limit: kp
+#: at once, kd if the error arises within 1 s, ki if it lasts for 1 s.
+_LEAST_SHARE = {"kp": 1e-2, "kd": 1e-4, "ki": 1e-4}
 
 Part = TypeVar("Part", Mechanism, Instrument)
 
@@ -68,21 +82,102 @@ class Arm:
     tree_joint_names: tuple[str, ...]
     sdf: tuple[str, ...]
     mirrored_links: dict[str, tuple[str, ...]]
-    position_lower: NDArray[np.float64]
-    position_upper: NDArray[np.float64]
-    effort_limits: NDArray[np.float64]
+    position_lower: NDArray[np.float64] = field(metadata=within(-12.6, 12.6, "rad or m"))
+    position_upper: NDArray[np.float64] = field(metadata=within(-12.6, 12.6, "rad or m"))
+    effort_limits: NDArray[np.float64] = field(metadata={RANGE: EFFORTS})
     prismatic: NDArray[np.bool_]
     coupled_limits: tuple[CoupledLimit, ...]
     linkage: LinearMap
     transmission: LinearMap
     loop_closures: tuple[LoopClosure, ...]
-    gravity: NDArray[np.float64]
+    gravity: NDArray[np.float64] = field(metadata=GRAVITIES)
     gains: Gains
-    friction_coordinates: dict[str, NDArray[np.float64]]
+    friction_coordinates: dict[str, NDArray[np.float64]] = field(metadata=COUPLINGS)
     motion: MotionSettings
-    effort_cut_off: float
+    effort_cut_off: float = field(metadata=within(0.1, 1000.0, "Hz"))
     bounding_shapes: tuple[BoundingShapes, ...]
     effects: ArmEffects
+
+    def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Checks all numbers: finite, in the range of their field, in order, one per joint.
+
+        Arrays and gains can be changed afterwards, so the command guard and the controller check again.
+
+        Raises:
+            ArmError: names the first number that is refused, and what is allowed.
+        """
+        if fault := next(filter(None, self._faults()), ""):
+            raise ArmError(fault)
+
+    def gains_fault(self, gains: Gains) -> str:
+        """The first gain that is not for this arm, with what is allowed; or "".
+
+        A gain must be large enough to move its joint, and so small that the resolution of the position measurement does
+        not demand the whole effort limit, see `_LEAST_SHARE` and `_LEAST_ERROR`.
+        """
+        if fault := _count_fault("gains.", vars(gains), self.joint_names):
+            return fault
+        if fault := number_fault(gains):
+            return f"gains.{fault}"
+        width = self.position_upper - self.position_lower
+        least_error = self.per_joint(*_LEAST_ERROR)
+        for name, rate in (("kp", 1.0), ("kd", 10.0), ("ki", 0.1)):
+            lowest = _LEAST_SHARE[name] * self.effort_limits / width
+            highest = self.effort_limits / (rate * least_error)
+            for i, gain in enumerate(getattr(gains, name)):
+                allowed = Range(float(lowest[i]), float(highest[i]), also=() if name == "kp" else (0.0,))
+                if fault := allowed.fault(f"gains.{name}[{i}]", float(gain)):
+                    return f"{fault} for the range and effort limit of {self.joint_names[i]}"
+        return ""
+
+    def _faults(self) -> Iterator[str]:
+        arrays = ("position_lower", "position_upper", "effort_limits", "prismatic")
+        yield _count_fault("", {name: getattr(self, name) for name in arrays}, self.joint_names)
+        for i, name in enumerate(self.joint_names):
+            limits = float(self.position_lower[i]), float(self.position_upper[i])
+            yield _limits_fault(f"position_limits.{name}", *limits, slides=bool(self.prismatic[i]))
+            yield EFFORTS.fault(f"effort limit of joint {name}", float(self.effort_limits[i]))
+        yield self.gains_fault(self.gains)
+        for limit in self.coupled_limits:
+            yield self._coupled_limit_fault(limit)
+        for name, row in self.friction_coordinates.items():
+            if not np.any(row):
+                yield f"friction_coordinates.{name} has no coefficient other than 0"
+        yield number_fault(self)
+        _checked_gravity(self.gravity)
+        if len(self.coupled_limits) > 1 and not self._can_meet_coupled_limits():
+            yield "coupled_limits: no pose inside position_limits meets them all"
+
+    def _coupled_limit_fault(self, limit: CoupledLimit) -> str:
+        key = f"coupled_limits.{limit.name}"
+        row = np.array([limit.coefficients.get(name, 0.0) for name in self.joint_names])
+        coupled = row != 0
+        if not np.any(coupled):
+            return f"{key}: coefficients are all 0; allowed: a joint with another coefficient at least"
+        slides = bool(np.all(self.prismatic[coupled]))
+        if fault := number_fault(limit):
+            return f"{key}.{fault}"
+        if fault := _limits_fault(key, limit.lower, limit.upper, slides):
+            return fault
+        ends = np.sort(row * [self.position_lower, self.position_upper], axis=0).sum(axis=1)
+        if ends[1] < limit.lower or ends[0] > limit.upper:
+            return (
+                f"{key}: no pose inside position_limits meets {limit.lower:g}..{limit.upper:g}; "
+                f"allowed: limits that overlap {ends[0]:.4g}..{ends[1]:.4g}"
+            )
+        return ""
+
+    def _can_meet_coupled_limits(self) -> bool:
+        from scipy.optimize import linprog  # slow to import, and few arms have two coupled limits
+
+        A, lower, upper = self.limit_matrix()
+        n = self.num_joints
+        bounds = np.column_stack([lower[:n], upper[:n]])
+        inequalities = np.vstack([A[n:], -A[n:]]), np.concatenate([upper[n:], -lower[n:]])
+        return bool(linprog(np.zeros(n), *inequalities, bounds=bounds).success)
 
     @property
     def num_joints(self) -> int:
@@ -150,6 +245,22 @@ def _mounted(arm: Arm, gravity: tuple[float, ...]) -> Arm:
     if np.allclose(arm.gravity, gravity, rtol=0, atol=1e-12):
         return arm
     return dataclasses.replace(arm, gravity=np.array(gravity))
+
+
+def _limits_fault(key: str, lower: float, upper: float, slides: bool) -> str:
+    positions, widths = (TRAVELS, TRAVEL_WIDTHS) if slides else (ANGLES, ANGLE_WIDTHS)
+    if fault := positions.fault(f"{key}[0]", lower) or positions.fault(f"{key}[1]", upper):
+        return fault
+    if not lower < upper:
+        return f"{key} is [{lower:g}, {upper:g}]; allowed: [lower, upper] with lower < upper"
+    return widths.fault(f"{key}: upper - lower", upper - lower)
+
+
+def _count_fault(key: str, values: Mapping[str, Sequence[float] | NDArray], joints: Sequence[str]) -> str:
+    for name, numbers in values.items():
+        if np.shape(numbers) != (len(joints),):
+            return f"{key}{name} has {np.size(numbers)} numbers, one a joint is {len(joints)}: {', '.join(joints)}"
+    return ""
 
 
 def known_arms() -> list[str]:
@@ -228,15 +339,8 @@ def _build_arm(
         raise ArmError(f"{path}: position_limits must name exactly {', '.join(mechanism.joints)}")
     if missing := set(joints) - set(facts.joint_names):
         raise ArmError(f"{path}: its SDF has no joint {', '.join(sorted(missing))}")
-    for joint, limits_of_joint in position_limits.items():
-        _check_limits(path, f"position_limits.{joint}", limits_of_joint, joint in facts.prismatic)
-    limits = np.array([position_limits[j] for j in joints])
+    limits = np.array([_lower_and_upper(path, f"position_limits.{j}", position_limits[j]) for j in joints])
     gains = Gains(*(getattr(mechanism.gains, k) + getattr(instrument.gains, k) for k in ("kp", "kd", "ki")))
-    for which, values in dataclasses.asdict(gains).items():
-        if len(values) != len(joints):
-            raise ArmError(f"{path}: gains.{which} has {len(values)} numbers, one a joint is {len(joints)}")
-    if fault := gains.fault():
-        raise ArmError(f"{path}: gains.{fault}")
     motion = _motion_settings(path, mechanism, instrument)
     G = np.zeros((len(facts.joint_names), len(joints)))
     c = np.zeros(len(facts.joint_names))
@@ -267,7 +371,7 @@ def _build_arm(
             for name, terms in instrument.friction_coordinates.items()
         },
         motion=motion,
-        effort_cut_off=_checked_cut_off(path, mechanism),
+        effort_cut_off=mechanism.effort_cut_off,
         bounding_shapes=tuple(part.bounding_shapes for part in (mechanism, instrument) if part.sdf),
         effects=_checked_effects(path, mechanism.effects.joined(instrument.effects), joints),
     )
@@ -284,8 +388,6 @@ def _motion_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -
                 raise ArmError(f"{path}: motion.{which} has {len(values)} numbers for {len(part.joints)} joints")
             both[which] += values or [default] * len(part.joints)
     known = {**mechanism.motion.known_effects, **instrument.motion.known_effects}
-    if not all(0 < travel < np.inf for travel in mechanism.motion.presliding_travels):
-        raise ArmError(f"{path}: motion.presliding_travels must be positive numbers")
     return dataclasses.replace(
         mechanism.motion,
         acceleration_cut_off=both["acceleration_cut_off"],
@@ -294,33 +396,22 @@ def _motion_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -
     )
 
 
-def _check_limits(path: Path, key: str, limits: list[float], prismatic: bool = False) -> None:
-    if len(limits) != 2 or not limits[0] < limits[1] or not np.all(np.isfinite(limits)):
-        raise ArmError(f"{path}: {key} must be [lower, upper], finite, with lower < upper")
-    largest, unit, other = (LONGEST_TRAVEL, "m", "millimetres") if prismatic else (LARGEST_ANGLE, "rad", "degrees")
-    if max(map(abs, limits)) > largest:
-        raise ArmError(f"{path}: {key} = {limits} must be in {unit}, at most {largest:g} {unit}; are these {other}?")
+def _lower_and_upper(path: Path, key: str, limits: list[float]) -> list[float]:
+    if len(limits) != 2:
+        raise ArmError(f"{path}: {key} is {limits}; allowed: [lower, upper]")
+    return limits
 
 
 def _coupled_limits(path: Path, description: ArmDescription, mechanism: Mechanism) -> tuple[CoupledLimit, ...]:
     limits = {limit.name: limit for limit in mechanism.coupled_limits}
     for limit in mechanism.coupled_limits:
-        _row(path, f"coupled_limits: {limit.name}", limit.coefficients, mechanism.joints)
-        _check_limits(path, f"coupled_limits.{limit.name}", [limit.lower, limit.upper])
+        _row(path, f"coupled_limits.{limit.name}", limit.coefficients, mechanism.joints)
     for name, bounds in description.coupled_limits.items():
         if name not in limits:
             raise ArmError(f'{path}: unknown coupled limit "{name}"; known: {", ".join(limits) or "none"}')
-        _check_limits(path, f"coupled_limits.{name}", bounds)
-        limits[name] = dataclasses.replace(limits[name], lower=bounds[0], upper=bounds[1])
+        lower, upper = _lower_and_upper(path, f"coupled_limits.{name}", bounds)
+        limits[name] = dataclasses.replace(limits[name], lower=lower, upper=upper)
     return tuple(limits.values())
-
-
-def _checked_cut_off(path: Path, mechanism: Mechanism) -> float:
-    if not 0.1 <= mechanism.effort_cut_off <= 1000:
-        raise ArmError(
-            f"{path}: effort_cut_off = {mechanism.effort_cut_off:g} Hz of its mechanism; 0.1..1000 Hz is allowed"
-        )
-    return mechanism.effort_cut_off
 
 
 def _checked_effects(path: Path, effects: ArmEffects, joints: list[str]) -> ArmEffects:
@@ -331,19 +422,20 @@ def _checked_effects(path: Path, effects: ArmEffects, joints: list[str]) -> ArmE
     return effects
 
 
-def _checked_gravity(gravity: Sequence[float]) -> NDArray[np.float64]:
+def _checked_gravity(gravity: ArrayLike) -> NDArray[np.float64]:
     vector = np.asarray(gravity, float)
-    if vector.shape != (3,) or not np.linalg.norm(vector) <= 30.0:
+    if vector.shape != (3,) or not np.linalg.norm(vector) <= LARGEST_GRAVITY:
         numbers = ", ".join(f"{x:g}" for x in vector.ravel())
-        raise ArmError(f"gravity ({numbers}) must be three numbers of a size up to 30 m/s^2; on Earth 9.8")
+        raise ArmError(
+            f"gravity ({numbers}) must be three numbers of a size up to {LARGEST_GRAVITY:g} m/s^2; on Earth 9.8"
+        )
     return vector
 
 
 def _effort_limits(path: Path, joints: list[str], facts: SdfFacts) -> NDArray[np.float64]:
-    limits = np.array([facts.effort_limits.get(joint, 0.0) for joint in joints])
-    if bad := [joint for joint, limit in zip(joints, limits, strict=True) if not limit > 0]:
-        raise ArmError(f"{path}: joint {bad[0]} of its SDF needs a positive <axis><limit><effort> [N m, N]")
-    return limits
+    if missing := [joint for joint in joints if joint not in facts.effort_limits]:
+        raise ArmError(f"{path}: joint {missing[0]} of its SDF needs a positive <axis><limit><effort> [N m, N]")
+    return np.array([facts.effort_limits[joint] for joint in joints])
 
 
 def _transmission(path: Path, joints: list[str], mechanism: Mechanism, instrument: Instrument) -> NDArray[np.float64]:
@@ -370,6 +462,8 @@ def _row(path: Path, key: str, terms: dict[str, float], joints: list[str]) -> ND
     row = np.zeros(len(joints))
     for joint, coefficient in terms.items():
         row[_index(path, key, joint, joints)] = coefficient
+    if not np.any(row):
+        raise ArmError(f"{path}: {key} has no coefficient other than 0; allowed: one at least")
     return row
 
 

@@ -6,6 +6,21 @@ No postponed annotations here: yaml_load_typed reads the types at run time.
 from dataclasses import dataclass, field
 
 from dvrk_drake.models.effects_schema import ArmEffects
+from dvrk_drake.models.schema_fault import Range, within
+
+#: Position limits of a joint; an MTM's roll turns to -8.4 rad, that of a UR10e to 6.3 rad.
+ANGLES, TRAVELS = Range(-12.6, 12.6, "rad"), Range(-2.0, 2.0, "m")
+#: How far apart the two limits are.
+ANGLE_WIDTHS, TRAVEL_WIDTHS = Range(0.01, 25.2, "rad"), Range(0.001, 2.0, "m")
+#: Efforts of a joint: 0.023 N m at an MTM's roll, 330 N m at the shoulder of a UR10e.
+EFFORTS = Range(0.001, 2000.0, "N m or N")
+#: Positions of which the joint's kind is not known yet: the arm checks them with `ANGLES` or `TRAVELS`.
+_POSITIONS = within(-1e4, 1e4, "rad or m")
+#: Of one joint or actuator in another one's position; the dVRK's are 0.6..1.6.
+COUPLINGS = within(0.01, 100.0, also=(0.0,), either_sign=True)
+#: 9.81 m/s^2 in any direction; `Arm` checks the length of the vector.
+GRAVITIES = within(-30.0, 30.0, "m/s^2")
+_CUT_OFFS = within(0.1, 1000.0, "Hz")
 
 
 @dataclass
@@ -13,9 +28,9 @@ class CoupledLimit:
     """lower <= sum of coefficient * joint position <= upper; `name` is what messages call it."""
 
     name: str = ""
-    coefficients: dict[str, float] = field(default_factory=dict)
-    lower: float = 0.0
-    upper: float = 0.0
+    coefficients: dict[str, float] = field(default_factory=dict, metadata=COUPLINGS)
+    lower: float = field(default=0.0, metadata=_POSITIONS)
+    upper: float = field(default=0.0, metadata=_POSITIONS)
 
 
 @dataclass
@@ -28,19 +43,14 @@ class LoopClosure:
 
 @dataclass
 class Gains:
-    """Diagonal PID gains per joint: kp [N m/rad], kd [N m s/rad], ki [N m/(rad s)]; N and m on a prismatic joint."""
+    """Diagonal PID gains per joint: kp [N m/rad], kd [N m s/rad], ki [N m/(rad s)]; N and m on a prismatic joint.
 
-    kp: list[float] = field(default_factory=list)
-    kd: list[float] = field(default_factory=list)
-    ki: list[float] = field(default_factory=list)
+    The ranges here are of any arm; `Arm.gains_fault` has those of one arm.
+    """
 
-    def fault(self) -> str:
-        """The first gain with a sign that makes a controller unstable, or ""."""
-        for name, least in (("kp", "more than 0"), ("kd", "0 or more"), ("ki", "0 or more")):
-            for i, gain in enumerate(getattr(self, name)):
-                if not (gain > 0 if name == "kp" else gain >= 0):
-                    return f"{name}[{i}] is {gain:g}; allowed: {least}"
-        return ""
+    kp: list[float] = field(default_factory=list, metadata=within(1e-5, 1e7, "N m/rad or N/m"))
+    kd: list[float] = field(default_factory=list, metadata=within(1e-8, 1e6, "N m s/rad or N s/m", also=(0.0,)))
+    ki: list[float] = field(default_factory=list, metadata=within(1e-8, 1e8, "N m/(rad s) or N/(m s)", also=(0.0,)))
 
 
 @dataclass
@@ -55,19 +65,21 @@ class MotionSettings:
     coordinate's standard deviation of position.
     """
 
-    acceleration_cut_off: list[float] = field(default_factory=list)
-    effort_delay: list[float] = field(default_factory=list)
+    acceleration_cut_off: list[float] = field(default_factory=list, metadata=_CUT_OFFS)
+    effort_delay: list[float] = field(default_factory=list, metadata=within(-0.2, 0.2, "s"))
     base_may_tilt: bool = False
     known_effects: dict[str, list[str]] = field(default_factory=dict)
-    presliding_travels: list[float] = field(default_factory=lambda: [0.003, 0.01, 0.08, 0.3, 1.0])
+    presliding_travels: list[float] = field(
+        default_factory=lambda: [0.003, 0.01, 0.08, 0.3, 1.0], metadata=within(1e-6, 100.0)
+    )
 
 
 @dataclass
 class BoxCorners:
     """A box along the axes of a link's frame: its lower and upper corner [m]."""
 
-    lower: list[float] = field(default_factory=list)
-    upper: list[float] = field(default_factory=list)
+    lower: list[float] = field(default_factory=list, metadata=within(-5.0, 5.0, "m"))
+    upper: list[float] = field(default_factory=list, metadata=within(-5.0, 5.0, "m"))
 
 
 @dataclass
@@ -78,7 +90,7 @@ class BoundingShapes:
     are not where their mass is, or that have none; no margin is added to them.
     """
 
-    margin: float = 0.04
+    margin: float = field(default=0.04, metadata=within(0.0, 1.0, "m"))
     boxes: dict[str, BoxCorners] = field(default_factory=dict)
 
 
@@ -93,11 +105,11 @@ class Mechanism:
     sdf: str = ""
     joints: list[str] = field(default_factory=list)
     gains: Gains = field(default_factory=Gains)
-    transmission: dict[str, dict[str, float]] = field(default_factory=dict)
+    transmission: dict[str, dict[str, float]] = field(default_factory=dict, metadata=COUPLINGS)
     coupled_limits: list[CoupledLimit] = field(default_factory=list)
     loop_closures: list[LoopClosure] = field(default_factory=list)
     motion: MotionSettings = field(default_factory=MotionSettings)
-    effort_cut_off: float = 10.0
+    effort_cut_off: float = field(default=10.0, metadata=_CUT_OFFS)
     bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
     effects: ArmEffects = field(default_factory=ArmEffects)
 
@@ -113,10 +125,10 @@ class Instrument:
 
     sdf: str = ""
     joints: list[str] = field(default_factory=list)
-    joint_from_actuator: dict[str, dict[str, float]] = field(default_factory=dict)
-    position_limits: dict[str, list[float]] = field(default_factory=dict)
+    joint_from_actuator: dict[str, dict[str, float]] = field(default_factory=dict, metadata=COUPLINGS)
+    position_limits: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
     gains: Gains = field(default_factory=Gains)
-    friction_coordinates: dict[str, dict[str, float]] = field(default_factory=dict)
+    friction_coordinates: dict[str, dict[str, float]] = field(default_factory=dict, metadata=COUPLINGS)
     motion: MotionSettings = field(default_factory=MotionSettings)
     bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
     effects: ArmEffects = field(default_factory=ArmEffects)
@@ -136,7 +148,7 @@ class ArmDescription:
     name: str = ""
     mechanism: str = ""
     instrument: str = ""
-    position_limits: dict[str, list[float]] = field(default_factory=dict)
-    coupled_limits: dict[str, list[float]] = field(default_factory=dict)
+    position_limits: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
+    coupled_limits: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
     mirrored_links: dict[str, list[str]] = field(default_factory=dict)
-    gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81])
+    gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81], metadata=GRAVITIES)

@@ -12,6 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import ArmError
+from dvrk_drake.models.schema_fault import number_fault, within
+
+#: Steps and noise of efforts: one bit of a dVRK's wrist motor is 1e-5 N m.
+_EFFORT_STEPS = within(1e-9, 100.0, "N m or N")
 
 
 @dataclass
@@ -27,8 +31,8 @@ class DriveEffect:
 
     coordinate: str = ""
     kind: str = ""
-    scale: float = 0.0
-    coefficient: float = 0.0
+    scale: float = field(default=0.0, metadata=within(1e-6, 1000.0, also=(0.0,)))
+    coefficient: float = field(default=0.0, metadata=within(-1e4, 1e4, "N m, N m s/rad or N m/rad"))
 
 
 @dataclass
@@ -40,15 +44,15 @@ class FrictionEffect(DriveEffect):
             [rad/s, m/s]; 0: it holds the same at all speeds.
     """
 
-    fall_speed: float = 0.0
+    fall_speed: float = field(default=0.0, metadata=within(1e-6, 100.0, "rad/s or m/s", also=(0.0,)))
 
 
 @dataclass
 class Cable:
     """Between the motor and the joint of an actuator that turns this joint alone: [N m/rad], damping [N m s/rad]."""
 
-    stiffness: float = 0.0
-    damping: float = 0.0
+    stiffness: float = field(default=0.0, metadata=within(1e-3, 1e6, "N m/rad or N/m"))
+    damping: float = field(default=0.0, metadata=within(0.0, 1000.0, "N m s/rad or N s/m"))
 
 
 @dataclass
@@ -56,8 +60,8 @@ class EncoderEffect:
     """`resolution`: actuator -> one count [rad, m]; one that is not named is exact. `velocity_cut_off` [Hz] of the
     first-order low-pass behind the difference of two readings."""
 
-    resolution: dict[str, float] = field(default_factory=dict)
-    velocity_cut_off: float = 30.0
+    resolution: dict[str, float] = field(default_factory=dict, metadata=within(1e-9, 0.1, "rad or m"))
+    velocity_cut_off: float = field(default=30.0, metadata=within(0.1, 1e4, "Hz"))
 
 
 @dataclass
@@ -68,17 +72,17 @@ class EffortEffect:
     deviation of what is measured.
     """
 
-    command_resolution: dict[str, float] = field(default_factory=dict)
-    measured_resolution: dict[str, float] = field(default_factory=dict)
-    noise: dict[str, float] = field(default_factory=dict)
+    command_resolution: dict[str, float] = field(default_factory=dict, metadata=_EFFORT_STEPS)
+    measured_resolution: dict[str, float] = field(default_factory=dict, metadata=_EFFORT_STEPS)
+    noise: dict[str, float] = field(default_factory=dict, metadata=_EFFORT_STEPS)
 
 
 @dataclass
 class DelayEffect:
     """In time steps of the plant: from the arm to what is measured, and from what is commanded to the motors."""
 
-    measurement: int = 0
-    command: int = 0
+    measurement: int = field(default=0, metadata=within(0, 100, "time steps"))
+    command: int = field(default=0, metadata=within(0, 100, "time steps"))
 
 
 @dataclass
@@ -103,7 +107,7 @@ class ArmEffects:
     springs: list[DriveEffect] = field(default_factory=list)
     stops: bool = False
     stretch: dict[str, Cable] = field(default_factory=dict)
-    saturation: dict[str, float] = field(default_factory=dict)
+    saturation: dict[str, float] = field(default_factory=dict, metadata=within(0.001, 2000.0, "N m or N"))
     encoder: EncoderEffect | None = None
     effort: EffortEffect | None = None
     delay: DelayEffect | None = None
@@ -139,45 +143,29 @@ class ArmEffects:
         Raises:
             ArmError: names the field, its value, and what is allowed.
         """
-        tables = {"saturation": self.saturation}
+        if fault := number_fault(self):
+            raise ArmError(fault)
+        tables: dict[str, dict[str, Any]] = {"saturation": self.saturation, "stretch": self.stretch}
         if self.encoder is not None:
             tables["encoder.resolution"] = self.encoder.resolution
-            if not 0.1 <= self.encoder.velocity_cut_off <= 1e4:
-                raise ArmError(f"encoder.velocity_cut_off = {self.encoder.velocity_cut_off:g} Hz; allowed: 0.1..10000")
         if self.effort is not None:
             tables |= {f"effort.{key}": value for key, value in vars(self.effort).items()}
         for table, values in tables.items():
-            for actuator, value in values.items():
-                if actuator not in joint_names:
-                    raise ArmError(f"{table}: unknown actuator {actuator}; actuators: {', '.join(joint_names)}")
-                if not (0 < value < 1e3):
-                    raise ArmError(f"{table}.{actuator} = {value:g} must be a positive number below 1000")
-        for which, ticks in vars(self.delay or DelayEffect()).items():
-            if not 0 <= ticks <= 100:
-                raise ArmError(f"delay.{which} = {ticks}; allowed: 0..100 time steps")
-        for actuator, cable in self.stretch.items():
-            if actuator not in joint_names:
-                raise ArmError(f"stretch: unknown actuator {actuator}; actuators: {', '.join(joint_names)}")
-            if not (0 < cable.stiffness < 1e6 and 0 <= cable.damping < 1e3):
-                raise ArmError(f"stretch.{actuator} must have a stiffness in 0..1e6 and a damping in 0..1000")
+            if unknown := sorted(set(values) - set(joint_names)):
+                raise ArmError(f"{table}: unknown actuator {unknown[0]}; actuators: {', '.join(joint_names)}")
         for effect in self.friction:
             where = f"friction: {effect.coordinate} {effect.kind}"
             if effect.kind not in FRICTION_KINDS:
                 raise ArmError(f'friction: kind "{effect.kind}"; allowed: {", ".join(FRICTION_KINDS)}')
-            least = -1e3 if effect.kind == "presliding forward" else 0.0
-            if not least <= effect.coefficient < 1e3:
+            if effect.coefficient < 0 and effect.kind != "presliding forward":
                 raise ArmError(f"{where} has coefficient {effect.coefficient:g}; it must not be negative")
-            if effect.kind != "viscous" and not 1e-9 < effect.scale < 1e3:
-                raise ArmError(f"{where} has scale {effect.scale:g}; it must be positive")
-            if not 0 <= effect.fall_speed < 1e3 or (effect.fall_speed and effect.kind != "presliding"):
-                raise ArmError(
-                    f"{where} has fall_speed {effect.fall_speed:g}; allowed: 0, and up to 1000 of presliding"
-                )
+            if effect.kind != "viscous" and effect.scale == 0:
+                raise ArmError(f"{where} has scale 0; it must be positive")
+            if effect.fall_speed and effect.kind != "presliding":
+                raise ArmError(f"{where} has fall_speed {effect.fall_speed:g}; allowed: 0, others only of presliding")
         for law in [*self.cables, *self.springs]:
             if law.kind not in POSITION_KINDS:
                 raise ArmError(f'cables, springs: kind "{law.kind}"; allowed: {", ".join(POSITION_KINDS)}')
-            if not (np.isfinite(law.coefficient) and np.isfinite(law.scale)):
-                raise ArmError(f"cables, springs: {law.coordinate} {law.kind} must have finite numbers")
 
 
 #: What `friction` can hold: what a solver can take at the end of a step and what never gives energy.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import known_arms
 from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.input_file import read_json_input
+from dvrk_drake.models.schema_fault import number_fault, within
 
 VERSION = "2.0"
 NUM_JOINTS = 7
@@ -35,6 +36,9 @@ _LENGTHS = {"positive": NUM_PARAMETERS, "negative": NUM_PARAMETERS}
 #: Not read by the controller: the sweep in which the file's data were collected [deg].
 _SWEEP_KEYS = ("joint_position_lower_limit", "joint_position_upper_limit")
 
+#: An MTM's are up to 24 N m: of the polynomials in the joint positions.
+_PARAMETERS = within(-1e4, 1e4, "N m")
+
 
 @dataclass(frozen=True, eq=False)
 class GravityCompensationFile:
@@ -50,14 +54,14 @@ class GravityCompensationFile:
         arm_name: the arm that the file states (ARM_NAME), or else that its file name contains; "" if neither names one.
     """
 
-    positive: NDArray[np.float64]
-    negative: NDArray[np.float64]
-    torque_lower: NDArray[np.float64]
-    torque_upper: NDArray[np.float64]
-    dead_band: NDArray[np.float64]
-    saturation: NDArray[np.float64]
-    friction_ratio: NDArray[np.float64]
-    sweep: NDArray[np.float64] | None = None
+    positive: NDArray[np.float64] = field(metadata=_PARAMETERS)
+    negative: NDArray[np.float64] = field(metadata=_PARAMETERS)
+    torque_lower: NDArray[np.float64] = field(metadata=within(-100.0, 100.0, "N m"))
+    torque_upper: NDArray[np.float64] = field(metadata=within(-100.0, 100.0, "N m"))
+    dead_band: NDArray[np.float64] = field(metadata=within(0.0, 10.0, "rad/s"))
+    saturation: NDArray[np.float64] = field(metadata=within(1e-6, 100.0, "rad/s"))
+    friction_ratio: NDArray[np.float64] = field(metadata=within(0.0, 1.0))
+    sweep: NDArray[np.float64] | None = field(default=None, metadata=within(-12.6, 12.6, "rad"))
     arm_name: str = ""
 
     def check(self) -> None:
@@ -71,12 +75,13 @@ class GravityCompensationFile:
             value = getattr(self, name)
             if value.shape != (length,) or not np.all(np.isfinite(value)):
                 raise ModelError(f"{key} must be {length} finite numbers")
+        if fault := number_fault(self):
+            name = fault.split("[")[0]
+            raise ModelError(fault.replace(name, _KEYS.get(name, name), 1))
         if not np.all(self.torque_lower <= self.torque_upper):
             raise ModelError("safe_lower_torque_limit must not exceed safe_upper_torque_limit")
-        if not np.all((self.dead_band >= 0) & (self.dead_band < self.saturation)):
-            raise ModelError("db_vel_vec must be 0 or more and below sat_vec_vec [rad/s]")
-        if not np.all((self.friction_ratio >= 0) & (self.friction_ratio <= 1)):
-            raise ModelError("fric_comp_ratio_vec must be between 0 and 1")
+        if not np.all(self.dead_band < self.saturation):
+            raise ModelError("db_vel_vec must be below sat_vec_vec [rad/s]")
 
     @classmethod
     def load(cls, path: str | Path) -> GravityCompensationFile:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from dvrk_drake.models.schema_fault import within
 
 
 @dataclass(frozen=True)
@@ -17,8 +19,8 @@ class LinearMap:
         offset: (m,), in the units of y.
     """
 
-    matrix: NDArray[np.float64]
-    offset: NDArray[np.float64]
+    matrix: NDArray[np.float64] = field(metadata=within(-1e4, 1e4))
+    offset: NDArray[np.float64] = field(metadata=within(-100.0, 100.0, "rad or m"))
 
     def position(self, x: ArrayLike) -> NDArray[np.float64]:
         """y = matrix x + offset for x of shape (n,) or (samples, n)."""

@@ -14,6 +14,7 @@ from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.recording import SAME_POSE, Recording
+from dvrk_drake.models.schema_fault import within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 #: A pose written with few digits may stand on a limit [rad, m].
@@ -26,7 +27,8 @@ class PoseFile:
 
     format: str = "dvrk_drake poses 1"
     arm: str = ""
-    poses: list[list[float]] = field(default_factory=list)
+    # `check_poses` has the limits of the arm.
+    poses: list[list[float]] = field(default_factory=list, metadata=within(-1e4, 1e4, "rad or m"))
 
 
 def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:

@@ -1,4 +1,9 @@
-"""What does not fit a schema in a file's content, said such that it can be mended: key, value, what is allowed."""
+"""Checks of a file's content and of settings made in Python: the message names the key, its value, what is allowed.
+
+The range of a number stands beside its field, as metadata: `field(default=0.05, metadata=within(0.002, 1.0, "s"))`. It
+is valid for all numbers in the field, in lists and tables as well. `schema_fault` checks the content of a file,
+`number_fault` an object.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +11,100 @@ import dataclasses
 import difflib
 import math
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from numbers import Integral, Real
 from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
 
 _ONE = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 _MANY = {bool: "true or false", int: "whole numbers", float: "numbers", str: "texts"}
-#: Key in the metadata of a field: a number that may be infinite.
-INFINITE = "may be infinite"
+#: Key in the metadata of a field: the `Range` of all numbers in it.
+RANGE = "range"
+#: Unit -> another unit that a number may be in by mistake, and its size.
+_MISTAKEN = {
+    "rad": ("degrees", math.pi / 180),
+    "rad/s": ("degrees/s", math.pi / 180),
+    "m": ("mm", 1e-3),
+    "m/s": ("mm/s", 1e-3),
+    "s": ("ms", 1e-3),
+    "kg": ("g", 1e-3),
+}
 #: Whole numbers are below this in size.
 _LARGEST_INT = 2**63
 #: A value is quoted up to so many letters.
 _LONGEST = 60
+
+
+@dataclasses.dataclass(frozen=True)
+class Range:
+    """Numbers that a field accepts.
+
+    Attributes:
+        low, high: smallest and largest number.
+        unit: of both; of a joint that turns and of one that slides: "rad or m".
+        also: further numbers, e.g. 0 or infinity.
+        either_sign: low and high are of the size, whatever the sign.
+    """
+
+    low: float
+    high: float
+    unit: str = ""
+    also: tuple[float, ...] = ()
+    either_sign: bool = False
+
+    def __contains__(self, value: float) -> bool:
+        """Whether the number is accepted; NaN never is."""
+        return bool(self.low <= (abs(value) if self.either_sign else value) <= self.high) or value in self.also
+
+    def __str__(self) -> str:
+        numbers = [f"{number:g}" if isinstance(number, float) else str(number) for number in (self.low, self.high)]
+        text = "..".join(numbers) + (f" {self.unit}" if self.unit else "")
+        text += " of either sign" if self.either_sign else ""
+        return "".join(f"{number:g} or " for number in self.also) + text
+
+    def fault(self, key: str, value: float) -> str:
+        """Why the number is not accepted, with the unit that it probably is in; or ""."""
+        if value in self:
+            return ""
+        mistaken = [_MISTAKEN[unit] for unit in self.unit.split(" or ") if unit in _MISTAKEN]
+        other = " or ".join(name for name, size in mistaken if abs(value) > self.high and value * size in self)
+        text = f"{value:g}" if isinstance(value, float) else str(value)
+        return f"{key} is {text}; allowed: {self}" + (f"; is it in {other}?" if other else "")
+
+
+def within(
+    low: float, high: float, unit: str = "", *, also: tuple[float, ...] = (), either_sign: bool = False
+) -> dict[str, Range]:
+    """Metadata of a field whose numbers must be in a range, see `Range`."""
+    return {RANGE: Range(low, high, unit, also, either_sign)}
+
+
+def number_fault(instance: object) -> str:
+    """The first number in a dataclass that is not finite or outside the range of its field, with its key; or "".
+
+    Lists, tuples, tables, arrays and dataclasses in it are searched as well; what is no number is not checked.
+    """
+    return next(_number_faults(instance, "", None), "")
+
+
+def _number_faults(value: Any, key: str, allowed: Range | None) -> Iterator[str]:
+    if dataclasses.is_dataclass(value):
+        for entry in dataclasses.fields(value):
+            inside = f"{key}.{entry.name}" if key else entry.name
+            yield from _number_faults(getattr(value, entry.name), inside, entry.metadata.get(RANGE))
+    elif isinstance(value, Mapping):
+        for name, entry in value.items():
+            yield from _number_faults(entry, f"{key}.{name}", allowed)
+    elif isinstance(value, list | tuple | np.ndarray):
+        for i, entry in enumerate(value):
+            yield from _number_faults(entry, f"{key}[{i}]", allowed)
+    elif isinstance(value, Real) and not isinstance(value, bool):
+        number = int(value) if isinstance(value, Integral) else float(value)
+        if allowed is not None:
+            yield from filter(None, [allowed.fault(key, number)])
+        elif not math.isfinite(number):
+            yield f"{key} is {number:g}; allowed: a finite number"
 
 
 def schema_fault(schema: type, content: Any, what: str) -> str:
@@ -24,53 +112,55 @@ def schema_fault(schema: type, content: Any, what: str) -> str:
 
     Args:
         schema: a dataclass of dataclasses, lists, tables with texts as keys, bool, int, float, str, and None with them.
-            Numbers must be finite, except in a field with `INFINITE` in its metadata.
+            Numbers must be finite and in the range of their field, see `within`.
         content: as yaml_load gives it.
         what: it should be, e.g. "a file of gains".
     """
     if not isinstance(content, dict):
         given = "is empty" if content is None else f"must be keys and values, not {_quoted(content)}"
         return f"{given}; allowed in {what}: {_keys(schema)}"
-    return next(_faults(schema, content, "", what), "")
+    return next(_faults(schema, content, "", what, None), "")
 
 
-def _faults(schema: Any, value: Any, key: str, what: str) -> Iterator[str]:
+def _faults(schema: Any, value: Any, key: str, what: str, allowed: Range | None) -> Iterator[str]:
     """Lazily; `key` is where the value stands, `what` what the keys of a table are of."""
     origin, arguments = get_origin(schema), get_args(schema)
     if origin in (Union, types.UnionType):
         if value is not None:
             (inner,) = (argument for argument in arguments if argument is not types.NoneType)
-            yield from _faults(inner, value, key, what)
+            yield from _faults(inner, value, key, what, allowed)
     elif dataclasses.is_dataclass(schema):
         if not isinstance(value, dict):
             yield _wrong(schema, value, key)
             return
         hints = get_type_hints(schema)
-        infinite = {field.name for field in dataclasses.fields(schema) if field.metadata.get(INFINITE)}
+        ranges = {entry.name: entry.metadata.get(RANGE) for entry in dataclasses.fields(schema)}
         for name, entry in value.items():
-            if name in infinite and _is_infinite(entry):
-                continue
             if name not in hints:
                 yield f"{f'{key}: ' if key else ''}key {_quoted(name)} is unknown; {_meant(name, hints)}" + (
                     f"allowed in {what}: {_keys(schema)}"
                 )
             else:
                 inside = f"{key}.{name}" if key else name
-                yield from _faults(hints[name], entry, inside, inside)
+                yield from _faults(hints[name], entry, inside, inside, ranges[name])
     elif origin is list:
         if not isinstance(value, list):
             yield _wrong(schema, value, key)
             return
         for i, entry in enumerate(value):
-            yield from _faults(arguments[0], entry, f"{key}[{i}]", key)
+            yield from _faults(arguments[0], entry, f"{key}[{i}]", key, allowed)
     elif origin is dict:
         if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
             yield _wrong(schema, value, key)
             return
         for name, entry in value.items():
-            yield from _faults(arguments[1], entry, f"{key}.{name}", key)
+            yield from _faults(arguments[1], entry, f"{key}.{name}", key, allowed)
+    elif allowed is not None and isinstance(value, float) and math.isinf(value) and value in allowed:
+        return  # infinity, where it is accepted
     elif not _fits(schema, value):
         yield _wrong(schema, value, key)
+    elif allowed is not None and (fault := allowed.fault(key, schema(value))):
+        yield fault
 
 
 def missing_key(schema: Any, content: Any, key: str = "") -> str:
@@ -105,10 +195,6 @@ def _fits(schema: type, value: Any) -> bool:
     if schema is int:
         return abs(number) < _LARGEST_INT and (not isinstance(value, float) or value.is_integer())
     return math.isfinite(number)
-
-
-def _is_infinite(value: Any) -> bool:
-    return isinstance(value, float) and math.isinf(value)
 
 
 def _wrong(schema: Any, value: Any, key: str) -> str:

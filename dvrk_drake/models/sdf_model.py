@@ -12,19 +12,39 @@ from typing import Any
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.input_file import LARGEST_TEXT, read_input
 from dvrk_drake.models.mirrored_links import mirror_links
+from dvrk_drake.models.schema_fault import Range
 
 MODELS_FOLDER = Path(__file__).parent
 PACKAGE_URL = "package://dvrk_drake/"
 DRAKE = "{http://drake.mit.edu}"
 #: Deepest nesting of elements; an arm's SDF has 7 levels.
 _DEEPEST = 50
-#: Limits of a joint, which may be infinite.
-_LIMITS = {"lower", "upper", "velocity"}
-#: Elements that hold numbers.
-_NUMBERS = _LIMITS | {
-    *("mass", "ixx", "ixy", "ixz", "iyy", "iyz", "izz", "pose", "xyz", "effort", "damping"),
-    *("scale", "radius", "length", "size", f"{DRAKE}rotor_inertia", f"{DRAKE}gear_ratio"),
+#: Numbers that SDF files have where a joint has no limit.
+_NO_LIMIT = (-1e16, 1e16, -math.inf, math.inf)
+_MOMENTS, _PRODUCTS = Range(0.0, 50.0, "kg m^2"), Range(-50.0, 50.0, "kg m^2")
+_LENGTHS = Range(1e-6, 10.0, "m")
+#: Element or attribute -> the range of its numbers. The links of a dVRK weigh 1 g to 10 kg, those of a UR10e up to
+#: 13 kg; all are shorter than 1 m. -1 and 0 are written where a limit of speed or effort is not stated.
+_RANGES = {
+    "mass": Range(1e-6, 200.0, "kg"),
+    **{f"i{axis}": _MOMENTS for axis in ("xx", "yy", "zz")},
+    **{f"i{axes}": _PRODUCTS for axes in ("xy", "xz", "yz")},
+    "pose": Range(-5.0, 5.0, "m"),
+    "xyz": Range(-1000.0, 1000.0),
+    "lower": Range(-1000.0, 1000.0, "rad or m", also=_NO_LIMIT),
+    "upper": Range(-1000.0, 1000.0, "rad or m", also=_NO_LIMIT),
+    "velocity": Range(1e-3, 100.0, "rad/s or m/s", also=(-1.0, 0.0, math.inf)),
+    "effort": Range(1e-3, 2000.0, "N m or N", also=(-1.0, 0.0)),
+    "damping": Range(0.0, 1000.0, "N m s/rad or N s/m"),
+    "scale": Range(1e-6, 1e4, either_sign=True),
+    **dict.fromkeys(("radius", "length", "size"), _LENGTHS),
+    f"{DRAKE}rotor_inertia": Range(0.0, 50.0, "kg m^2 or kg"),
+    f"{DRAKE}gear_ratio": Range(1e-3, 1e4, either_sign=True),
+    "multiplier": Range(1e-3, 1e3, also=(0.0,), either_sign=True),
+    "offset": Range(-12.6, 12.6, "rad or m"),
 }
+#: The angles of a pose: roll, pitch, yaw, or a quaternion.
+_POSE_ANGLES, _POSE_DEGREES = Range(-12.6, 12.6, "rad"), Range(-720.0, 720.0, "degrees")
 ElementTree.register_namespace("drake", DRAKE.strip("{}"))
 #: How many numbers an element holds that holds several; a pose has 7 with a quaternion.
 _COUNTS = {"pose": (6, 7), "xyz": (3,), "scale": (3,), "size": (3,)}
@@ -162,28 +182,38 @@ def _parse(content: bytes) -> ElementTree.Element:
 
 
 def _check_numbers(path: Path, root: ElementTree.Element) -> None:
-    """Raises ArmError for a number that is none or is not finite, where Drake takes it or names no link or joint."""
+    """Raises ArmError for a number that is none, is not finite or is none of an arm, see `_RANGES`."""
     for part in root.iterfind("model/*"):
         for element in part.iter():
-            texts = [(f"<{element.tag}>", element.text)] if element.tag in _NUMBERS else []
+            texts = [(element.tag, f"<{element.tag}>", element.text)] if element.tag in _RANGES else []
             if element.tag == f"{DRAKE}mimic":
-                texts = [(name, element.get(name, "0")) for name in ("multiplier", "offset")]
-            for what, text in texts:
-                words, counts = (text or "").split(), _COUNTS.get(element.tag, (1,))
-                if len(words) not in counts or not all(_is_number(word, element.tag in _LIMITS) for word in words):
-                    number = "a finite number" if counts == (1,) else f"{counts[0]} finite numbers"
-                    raise ArmError(
-                        f"{path}: {part.tag} {part.get('name')}: {what.replace(DRAKE, 'drake:')} is "
-                        f"{(text or '')[:60]!r}; allowed: {number}"
-                    )
+                texts = [(name, name, element.get(name, "1")) for name in ("multiplier", "offset")]
+            for name, what, text in texts:
+                where = f"{path}: {part.tag} {part.get('name')}: {what.replace(DRAKE, 'drake:')}"
+                for value, allowed in zip(*_numbers_of(where, name, text or "", element), strict=True):
+                    if fault := allowed.fault(where, value):
+                        raise ArmError(fault)
 
 
-def _is_number(word: str, may_be_infinite: bool) -> bool:
+def _numbers_of(where: str, name: str, text: str, element: ElementTree.Element) -> tuple[list[float], list[Range]]:
+    """The numbers of an element or attribute, and the range of each."""
+    counts = _COUNTS.get(name, (1,))
+    values = [_number(word) for word in text.split()]
+    allowed = [_RANGES[name]] * len(values)
+    if name == "pose":
+        allowed[3:] = [_POSE_DEGREES if element.get("degrees") in ("true", "1") else _POSE_ANGLES] * len(values[3:])
+    are_numbers = all(math.isfinite(v) or v in a for v, a in zip(values, allowed, strict=True))
+    if len(values) not in counts or not are_numbers:
+        number = "a finite number" if counts == (1,) else f"{counts[0]} finite numbers"
+        raise ArmError(f"{where} is {text[:60]!r}; allowed: {number}")
+    return values, allowed
+
+
+def _number(word: str) -> float:
     try:
-        value = float(word)
+        return float(word)
     except ValueError:
-        return False
-    return math.isfinite(value) or (may_be_infinite and not math.isnan(value))
+        return math.nan
 
 
 def _add_shapes(link: ElementTree.Element, again: ElementTree.Element) -> None:

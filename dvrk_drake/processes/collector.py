@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.collection_file import CollectionFile
 from dvrk_drake.models.nearby_pose import beside
+from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.leg import Leg
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
@@ -47,12 +48,12 @@ class CollectionSettings:
             measurements are taken, which cancels dry friction; else measured once, as the paper does.
     """
 
-    traverse_time: float = 5.0
+    traverse_time: float = field(default=5.0, metadata=within(1.0, 60.0, "s"))
     both_sides: bool = True
 
     def __post_init__(self) -> None:
-        if not 1.0 <= self.traverse_time <= 60.0:
-            raise CollectionError(f"the time to cross a joint's range must be 1..60 s; got {self.traverse_time:g}")
+        if fault := number_fault(self):
+            raise CollectionError(f"the time to cross a joint's range, {fault}")
 
 
 class Collector:

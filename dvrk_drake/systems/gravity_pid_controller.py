@@ -95,7 +95,7 @@ class GravityPidController(LeafSystem):
         super().__init__()
         model.check()
         arm = model.load_arm()
-        self._joint_names = arm.joint_names
+        self._arm, self._joint_names = arm, arm.joint_names
         n = arm.num_joints
         limits = np.asarray(arm.effort_limits if effort_limits is None else effort_limits, float)
         if limits.shape != (n,) or not np.all(limits > 0):
@@ -135,7 +135,7 @@ class GravityPidController(LeafSystem):
         """Changes the gains from the next update on.
 
         Raises:
-            ControllerError: not n finite numbers >= 0 each.
+            ControllerError: a gain that is not for this arm, see `Arm.gains_fault`.
         """
         values = self._checked(gains)
         context.get_mutable_discrete_state(_MEMORY).get_mutable_value()[: values.size] = values
@@ -161,14 +161,8 @@ class GravityPidController(LeafSystem):
         return _MODES[int(context.get_discrete_state(_MEMORY).get_value()[mode_index])]
 
     def _checked(self, gains: Gains) -> NDArray[np.float64]:
-        n = len(self._joint_names)
-        for name in ("kp", "kd", "ki"):
-            values = np.asarray(getattr(gains, name), float)
-            if values.shape != (n,) or not np.all(np.isfinite(values) & (values >= 0)):
-                raise ControllerError(
-                    f"gains.{name} must be {n} finite numbers >= 0, one for each of "
-                    f"{', '.join(self._joint_names)}; got {values.tolist()}"
-                )
+        if fault := self._arm.gains_fault(gains):
+            raise ControllerError(fault)
         return np.concatenate([gains.kp, gains.kd, gains.ki])
 
     @staticmethod

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,13 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from dvrk_drake.dynamics.arm_frame import ArmFrame
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.systems.gravity_pid_step import ABSURD
 
 
 @dataclass(frozen=True)
 class Grip:
-    """How firmly a hand holds: all positive.
+    """How firmly a hand holds.
 
     The defaults are of the order that is measured of people: some hundred N/m at the hand (Mussa-Ivaldi, Hogan and
     Bizzi, J. Neurosci. 5, 1985). Limits are what a person exerts without effort.
@@ -32,12 +33,12 @@ class Grip:
         max_torque: [N m].
     """
 
-    stiffness: float = 600.0
-    damping: float = 25.0
-    rotational_stiffness: float = 2.0
-    rotational_damping: float = 0.03
-    max_force: float = 20.0
-    max_torque: float = 0.6
+    stiffness: float = field(default=600.0, metadata=within(1e-6, 1e6, "N/m"))
+    damping: float = field(default=25.0, metadata=within(1e-6, 1e5, "N s/m"))
+    rotational_stiffness: float = field(default=2.0, metadata=within(1e-6, 1e5, "N m/rad"))
+    rotational_damping: float = field(default=0.03, metadata=within(1e-6, 1e4, "N m s/rad"))
+    max_force: float = field(default=20.0, metadata=within(1e-6, 2000.0, "N"))
+    max_torque: float = field(default=0.6, metadata=within(1e-6, 500.0, "N m"))
 
 
 class Hand(LeafSystem):
@@ -83,9 +84,10 @@ class Hand(LeafSystem):
         """
         super().__init__()
         grip = grip or Grip()
-        for name, value in {**vars(grip), "time_step": time_step}.items():
-            if not (np.isfinite(value) and value > 0):
-                raise StationError(f"a hand's {name} must be a positive number; got {value}")
+        if fault := number_fault(grip):
+            raise StationError(f"a hand's {fault}")
+        if not (np.isfinite(time_step) and time_step > 0):
+            raise StationError(f"a hand's time_step must be a positive number; got {time_step}")
         self._frame = ArmFrame(arm, frame_name)
         self._grip, self._time_step = grip, time_step
         self._K = np.repeat([grip.rotational_stiffness, grip.stiffness], 3)

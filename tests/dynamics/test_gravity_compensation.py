@@ -215,7 +215,7 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
         compensation_from_model(IdentifiedModel.from_arm(load_arm("psm")))
     with pytest.raises(ModelError, match="dead_band must be 7 numbers"):
         compensation_from_model(balanced(), CompensationOptions(dead_band=(0.1,)))
-    with pytest.raises(ModelError, match="fric_comp_ratio_vec must be between 0 and 1"):
+    with pytest.raises(ModelError, match=r"fric_comp_ratio_vec\[\d\] is .*; allowed: 0\.\.1"):
         compensation_from_model(balanced(), CompensationOptions(friction_ratio=(2.0,) * 7))
 
 

@@ -140,7 +140,7 @@ def own_arm(folder, change):
         (('multiplier="', 'multiplier="x'), r"joint \S+: multiplier is 'x.*'; allowed: a finite number"),
         (("</model>", "<model name='a'/></model>"), r"own\.sdf: must hold one <model> in <sdf>, with no <model> or"),
         (('type="revolute"', 'type="ball"'), r"own\.yaml: joint \S+ of the SDF has type 'ball'; allowed: revolute"),
-        (("<mass>", "<mass>-"), r"link \S+ of the SDF needs a positive <inertial><mass>"),
+        (("<mass>", "<mass>-"), r"link \S+: <mass> is -\S+; allowed: 1e-06\.\.200 kg"),
         (("<inertial>.*?</inertial>", ""), r"link \S+ of the SDF needs a positive <inertial><mass>"),
         (('multiplier="[^"]*"', 'multiplier="0"'), r"joint \S+ of the SDF follows another with the multiplier 0"),
         (('"dh_2"', '"dh_x"'), r"own\.sdf: has a frame dh_7, but no dh_2"),
@@ -163,7 +163,7 @@ def test_gains_of_the_wrong_sign_are_refused(name, gain, tmp_path):
     mechanism = yaml.safe_load((tmp_path / "mechanism.yaml").read_text())
     mechanism["gains"][name][3] = gain
     (tmp_path / "mechanism.yaml").write_text(yaml.safe_dump(mechanism))
-    with pytest.raises(ArmError, match=rf"own\.yaml: gains\.{name}\[3\] is {gain:g}; allowed: "):
+    with pytest.raises(ArmError, match=rf"mechanism\.yaml: gains\.{name}\[3\] is {gain:g}; allowed: "):
         load_arm(path)
 
 
@@ -175,7 +175,7 @@ def test_limits_in_degrees_are_refused(key, tmp_path):
     content.setdefault(table, {})[name] = [-40, 65]
     path.write_text(yaml.safe_dump(content))
     with pytest.raises(
-        ArmError, match=rf"own\.yaml: {key} = .* must be in rad, at most 12\.6 rad; are these degrees\?"
+        ArmError, match=rf"own\.yaml: {key}\[0\] is -40; allowed: -12\.6\.\.12\.6 rad; is it in degrees\?"
     ):
         load_arm(str(path))
 

@@ -71,8 +71,8 @@ def test_it_is_simulated_and_touches_its_arm_as_little_as_the_arm_does(folder, n
     ("limits", "message"),
     [
         ("[0.0, .nan]", r"is nan; allowed: a finite number"),
-        ("[0.0, 240]", "must be in m, at most 2 m"),
-        ("[0.2]", "finite"),
+        ("[0.0, 240]", r"\[1\] is 240; allowed: -2\.\.2 m; is it in mm\?"),
+        ("[0.2]", r"is \[0\.2\]; allowed: \[lower, upper\]"),
     ],
 )
 def test_limits_that_are_none_or_in_millimetres_are_refused(folder, limits, message):

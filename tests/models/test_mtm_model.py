@@ -246,11 +246,20 @@ def test_sampled_poses_respect_all_limits(arm):
     assert arm.limit_violations([0, 1.0, 0.5, 0, 0, 0, 0]) == ["parallelogram = 1.5 is outside -0.33..0.68"]
 
 
-def test_arm_whose_box_misses_its_coupled_limit_cannot_be_sampled(arm):
+def test_an_arm_whose_box_misses_its_coupled_limit_is_refused(arm):
     import dataclasses
 
     lower = arm.position_lower.copy()
     lower[1:3] = [0.7, 0.3]
+    with pytest.raises(ArmError, match=r"parallelogram: no pose inside position_limits meets -0\.33\.\.0\.68"):
+        dataclasses.replace(arm, position_lower=lower)
+
+
+def test_an_arm_whose_box_hardly_meets_its_coupled_limit_cannot_be_sampled(arm):
+    import dataclasses
+
+    lower = arm.position_lower.copy()
+    lower[1:3] = [0.6, 0.0799999]
     with pytest.raises(ArmError, match="hardly any pose inside its position limits"):
         dataclasses.replace(arm, position_lower=lower).sample_poses(5, np.random.default_rng(0))
 

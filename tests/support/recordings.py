@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.recording import Recording
 
 Q_NAMES = [f"q{i}" for i in range(1, 8)]
@@ -34,4 +35,7 @@ SIX = ",".join([*Q_NAMES[:6], *TAU_NAMES[:6]])
 
 
 def six_joint_arm():
-    return replace(load_arm("psm"), joint_names=load_arm("psm").joint_names[:6])
+    psm = load_arm("psm")
+    arrays = ("joint_names", "position_lower", "position_upper", "effort_limits", "prismatic")
+    gains = Gains(psm.gains.kp[:6], psm.gains.kd[:6], psm.gains.ki[:6])
+    return replace(psm, gains=gains, **{name: getattr(psm, name)[:6] for name in arrays})

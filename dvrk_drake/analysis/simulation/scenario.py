@@ -14,18 +14,22 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
 from dvrk_drake.dynamics.arm_frame import ArmFrame
-from dvrk_drake.dynamics.friction_compensation import check_ratios
+from dvrk_drake.dynamics.friction_compensation import LARGEST_HYSTERESIS_RATIO, LARGEST_RATIO
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import ArmError, ControllerError, ScenarioError
+from dvrk_drake.errors import ArmError, ScenarioError
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.models.arm_schema import GRAVITIES, Gains
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
 from dvrk_drake.models.plant import Closure
+from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.hand import Grip
 
 #: Longest simulation [s] and finest recording that are taken for meant.
 LONGEST, LEAST_SAMPLE_PERIOD = 3600.0, 1e-3
+#: Positions; `check_pose` has the limits of the arm.
+_POSITIONS = within(-1e4, 1e4, "rad or m")
+_GRIP = {grip.name: grip for grip in dataclasses.fields(Grip)}
 
 
 @dataclass
@@ -45,17 +49,17 @@ class ControllerScenario:
     model: str = ""
     knows: list[str] = field(default_factory=list)
     gains: Gains | None = None
-    friction_ratio: float = 0.0
-    hysteresis_ratio: float = 0.0
-    parameter_error: float = 0.0
+    friction_ratio: float = field(default=0.0, metadata=within(0.0, LARGEST_RATIO))
+    hysteresis_ratio: float = field(default=0.0, metadata=within(0.0, LARGEST_HYSTERESIS_RATIO))
+    parameter_error: float = field(default=0.0, metadata=within(0.0, 1.0))
 
 
 @dataclass
 class Target:
     """At `time` [s] the arm is wanted at rest at `pose` [rad, m], one number a joint."""
 
-    time: float = 0.0
-    pose: list[float] = field(default_factory=list)
+    time: float = field(default=0.0, metadata=within(0.0, LONGEST, "s"))
+    pose: list[float] = field(default_factory=list, metadata=_POSITIONS)
 
 
 @dataclass
@@ -69,12 +73,14 @@ class HandScenario:
 
     path: list[Target] = field(default_factory=list)
     frame: str = "dh_7"
-    stiffness: float = Grip.stiffness
-    damping: float = Grip.damping
-    rotational_stiffness: float = Grip.rotational_stiffness
-    rotational_damping: float = Grip.rotational_damping
-    max_force: float = Grip.max_force
-    max_torque: float = Grip.max_torque
+    stiffness: float = field(default=Grip.stiffness, metadata=_GRIP["stiffness"].metadata)
+    damping: float = field(default=Grip.damping, metadata=_GRIP["damping"].metadata)
+    rotational_stiffness: float = field(
+        default=Grip.rotational_stiffness, metadata=_GRIP["rotational_stiffness"].metadata
+    )
+    rotational_damping: float = field(default=Grip.rotational_damping, metadata=_GRIP["rotational_damping"].metadata)
+    max_force: float = field(default=Grip.max_force, metadata=_GRIP["max_force"].metadata)
+    max_torque: float = field(default=Grip.max_torque, metadata=_GRIP["max_torque"].metadata)
 
     @property
     def grip(self) -> Grip:
@@ -106,19 +112,19 @@ class Scenario:
 
     arm: str = ""
     closure: str = "ball"
-    gravity: list[float] | None = None
-    time_step: float = 1e-3
-    duration: float = 5.0
-    sample_period: float = 0.01
+    gravity: list[float] | None = field(default=None, metadata=GRAVITIES)
+    time_step: float = field(default=1e-3, metadata=within(1e-5, 0.01, "s"))
+    duration: float = field(default=5.0, metadata=within(LEAST_SAMPLE_PERIOD, LONGEST, "s"))
+    sample_period: float = field(default=0.01, metadata=within(LEAST_SAMPLE_PERIOD, LONGEST, "s"))
     controller: ControllerScenario = field(default_factory=ControllerScenario)
-    start: list[float] | None = None
+    start: list[float] | None = field(default=None, metadata=_POSITIONS)
     targets: list[Target] = field(default_factory=list)
     hand: HandScenario = field(default_factory=HandScenario)
     effects: list[DriveEffect] = field(default_factory=list)
     stretch: dict[str, Cable] = field(default_factory=dict)
     real_arm: list[str] = field(default_factory=list)
-    effort_noise: float = 0.0
-    seed: int = 0
+    effort_noise: float = field(default=0.0, metadata=within(0.0, 1.0))
+    seed: int = field(default=0, metadata=within(0, 2**63 - 1))
 
     @cached_property
     def mounted_arm(self) -> Arm:
@@ -169,12 +175,10 @@ class Scenario:
         arm = self.mounted_arm
         _check_choice("closure", self.closure, get_args(Closure))
         _check_choice("controller.mode", self.controller.mode, get_args(Mode))
-        _check_number("time_step", self.time_step, 1e-5, 0.01)
-        _check_number("sample_period", self.sample_period, LEAST_SAMPLE_PERIOD, LONGEST)
-        _check_number("duration", self.duration, self.sample_period, LONGEST)
-        _check_number("effort_noise", self.effort_noise, 0.0, 1.0)
-        _check_number("controller.parameter_error", self.controller.parameter_error, 0.0, 1.0)
-        _check_number("seed", self.seed, 0, 2**63)
+        if fault := number_fault(self):
+            raise ScenarioError(fault)
+        if self.duration < self.sample_period:
+            raise ScenarioError(f"duration is {self.duration:g}; allowed: {self.sample_period:g}..{LONGEST:g} s")
         try:
             arm.effects.only(self.real_arm)
             ArmEffects(stretch=self.stretch).check(arm.joint_names)
@@ -189,10 +193,8 @@ class Scenario:
             _check_choice("controller.knows", part, ("cables", "springs"))
         if self.controller.knows and self.controller.model:
             raise ScenarioError("controller.knows is of a model from the arm's files; controller.model names another")
-        try:
-            check_ratios(self.controller.friction_ratio, self.controller.hysteresis_ratio)
-        except ControllerError as error:
-            raise ScenarioError(f"controller: {error}") from error
+        if (gains := self.controller.gains) and (fault := arm.gains_fault(gains)):
+            raise ScenarioError(f"controller.{fault}")
         for name in ("friction_ratio", "hysteresis_ratio"):
             if getattr(self.controller, name) and self.controller.mode != "gravity":
                 raise ScenarioError(f'controller.{name} needs mode "gravity"; it is "{self.controller.mode}"')
@@ -202,7 +204,6 @@ class Scenario:
             law = ActuatorEffect(effect.coordinate, effect.kind, effect.scale)
             if fault := effect_fault(arm, law, POSITION_KINDS):
                 raise ScenarioError(f"effects[{i}].{fault}")
-            _check_number(f"effects[{i}].coefficient", effect.coefficient, -1e3, 1e3)
         if self.model.load_arm().name != arm.name:
             raise ScenarioError(f"controller.model {self.controller.model} is of {self.model.arm}, not of {self.arm}")
 
@@ -223,18 +224,11 @@ class Scenario:
         ArmFrame(self.mounted_arm, self.hand.frame)
         if len(self.hand.path) < 2:
             raise ScenarioError("hand.path needs two poses or more: from when to when the hand holds on")
-        for grip in dataclasses.fields(Grip):
-            _check_number(f"hand.{grip.name}", getattr(self.hand, grip.name), 1e-6, 1e6)
 
 
 def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
     if value not in allowed:
         raise ScenarioError(f'{name} is "{value}"; allowed: {", ".join(allowed)}')
-
-
-def _check_number(name: str, value: float, least: float, most: float) -> None:
-    if not least <= value <= most:  # also true of NaN
-        raise ScenarioError(f"{name} is {value:g}; allowed: {least:g}..{most:g}")
 
 
 def check_pose(name: str, pose: list[float], arm: Arm) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.simulation.scenario import Scenario
 from dvrk_drake.analysis.simulation.simulation import Simulation
 from dvrk_drake.errors import StudyError
+from dvrk_drake.models.schema_fault import number_fault, within
 
 
 @dataclass
@@ -30,8 +31,8 @@ class Measure:
 
     kind: str = ""
     name: str = ""
-    band: float | None = None
-    time: float | None = None
+    band: float | None = field(default=None, metadata=within(1e-9, 12.6, "rad or m"))
+    time: float | None = field(default=None, metadata=within(1e-5, 3600.0, "s"))
     joints: list[str] = field(default_factory=list)
 
     @property
@@ -62,13 +63,13 @@ class Measure:
         """
         if self.kind not in KINDS:
             raise StudyError(f'kind is "{self.kind}"; allowed: {", ".join(KINDS)}')
+        if fault := number_fault(self):
+            raise StudyError(fault)
         kind = KINDS[self.kind]
         for name, default in (("band", kind.band), ("time", kind.time)):
             value = getattr(self, name)
             if value is not None and default is None:
                 raise StudyError(f"{self.kind} has no {name}")
-            if value is not None and not 0 < value < math.inf:
-                raise StudyError(f"{name} of {self.kind} is {value:g}; allowed: above 0")
         if unknown := sorted(set(self.joints) - set(scenario.mounted_arm.joint_names)):
             raise StudyError(
                 f"joints of {self.column}: unknown {', '.join(unknown)}; {scenario.mounted_arm.name} has "

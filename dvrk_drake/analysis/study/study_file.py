@@ -23,6 +23,7 @@ from dvrk_drake.analysis.simulation.scenario_file import load_scenario
 from dvrk_drake.analysis.study.measures import Measure
 from dvrk_drake.errors import DvrkDrakeError, StudyError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
@@ -34,9 +35,9 @@ RESERVED = ("study", "case", "variation", "pose", "seed", "error")
 class RandomPoses:
     """`count` poses, uniform in the joint box and inside the coupled limits; see `Arm.sample_poses`."""
 
-    count: int = 0
-    seed: int = 0
-    margin: float = 0.0
+    count: int = field(default=0, metadata=within(1, 10**6))
+    seed: int = field(default=0, metadata=within(0, 2**63 - 1))
+    margin: float = field(default=0.0, metadata=within(0.0, 0.49))
 
 
 @dataclass
@@ -78,9 +79,9 @@ class Study:
 
     scenario: str = ""
     set: list[str] = field(default_factory=list)
-    poses: list[list[float]] = field(default_factory=list)
+    poses: list[list[float]] = field(default_factory=list, metadata=within(-1e4, 1e4, "rad or m"))
     random_poses: RandomPoses | None = None
-    seeds: list[int] = field(default_factory=lambda: [0])
+    seeds: list[int] = field(default_factory=lambda: [0], metadata=within(0, 2**63 - 1))
     variations: list[Variation] = field(default_factory=lambda: [Variation("as stated")])
     measures: list[Measure] = field(default_factory=list)
 
@@ -143,7 +144,9 @@ class Study:
             raise StudyError("scenario is missing; give an arm's name, or the path of a scenario's YAML file")
         if not (self.seeds and self.variations and self.measures):
             raise StudyError("seeds, variations and measures must not be empty")
-        if min(self.seeds) < 0 or len({*self.seeds}) < len(self.seeds):
+        if fault := number_fault(self):
+            raise StudyError(fault)
+        if len({*self.seeds}) < len(self.seeds):
             raise StudyError(f"seeds must be different whole numbers from 0; got {self.seeds}")
         _check_names("variations", [variation.name for variation in self.variations])
         if any(scenario.mounted_arm.joint_names != self.arm.joint_names for scenario in self.scenarios.values()):
@@ -168,10 +171,6 @@ class Study:
             return
         if self.poses:
             raise StudyError("poses and random_poses: give one of them")
-        for name, most in (("count", 1_000_000), ("seed", 2**63), ("margin", 0.49)):
-            value, least = getattr(self.random_poses, name), int(name == "count")
-            if not least <= value <= most:
-                raise StudyError(f"random_poses.{name} is {value:g}; allowed: {least}..{most}")
 
     def _starts(self) -> list[list[float]]:
         """Where the arm starts."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.errors import StationError
+from dvrk_drake.errors import ArmError, StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.systems.guard.settings import GuardSettings
 
@@ -56,11 +56,13 @@ class GuardLimits:
         """Of `arm`.
 
         Raises:
-            StationError: a joint has no gain kp, so nothing holds it.
+            StationError: a number of the arm is not finite or not in its range, see `Arm.check`.
         """
         n = arm.num_joints
-        if not np.all(np.array(arm.gains.kp) > 0):
-            raise StationError(f"{arm.name}: all gains.kp must be positive; got {arm.gains.kp}")
+        try:
+            arm.check()
+        except ArmError as error:
+            raise StationError(f"{arm.name}: {error}") from error
         self.effort_limits = np.array(arm.effort_limits)
         self.command_limits = settings.effort_fraction * self.effort_limits
         self.A, self.lower, self.upper = arm.limit_matrix()

@@ -6,22 +6,7 @@ No postponed annotations here: yaml_load_typed reads the types at run time.
 from dataclasses import dataclass, field
 
 from dvrk_drake.errors import StationError
-
-#: Lowest and highest value of each: outside, the guard would guard nothing, or nobody could command.
-_ALLOWED = {
-    "expiry": (0.002, 1.0),
-    "measurement_age": (0.001, 0.1),
-    "start_time": (0.05, 10.0),
-    "clock_tolerance": (0.001, 1.0),
-    "start_effort": (0.001, 0.25),
-    "margin": (0.001, 0.3),
-    "margin_fraction": (0.001, 0.25),
-    "effort_fraction": (0.01, 1.0),
-    "effort_rise_time": (0.002, 10.0),
-    "traverse_time": (0.1, 100.0),
-    "following_error": (0.01, 0.5),
-    "following_time": (0.01, 1.0),
-}
+from dvrk_drake.models.schema_fault import number_fault, within
 
 
 @dataclass
@@ -48,26 +33,28 @@ class PlausibilitySettings:
         bad_samples: number of measurements in a row that may be late or not finite while the arm holds.
     """
 
-    position_tolerance: float = 0.01
-    jitter: float = 0.02
-    velocity_delay: float = 0.03
-    velocity_memory: float = 0.3
-    frozen_effort: float = 0.45
-    frozen_time: float = 0.01
-    frozen_speed: float = 0.1
-    response: float = 1.5
-    response_time: float = 0.03
-    response_memory: float = 0.2
-    start_gravity: float = 0.25
-    silent_effort: float = 0.3
-    silent_time: float = 0.02
-    detection_time: float = 0.03
-    bad_samples: int = 20
+    position_tolerance: float = field(default=0.01, metadata=within(0.001, 0.1, "rad"))
+    jitter: float = field(default=0.02, metadata=within(0.0, 0.05, "s"))
+    velocity_delay: float = field(default=0.03, metadata=within(0.001, 0.1, "s"))
+    velocity_memory: float = field(default=0.3, metadata=within(0.05, 2.0, "s"))
+    frozen_effort: float = field(default=0.45, metadata=within(0.05, 1.0))
+    frozen_time: float = field(default=0.01, metadata=within(0.002, 1.0, "s"))
+    frozen_speed: float = field(default=0.1, metadata=within(0.001, 10.0, "rad/s"))
+    response: float = field(default=1.5, metadata=within(0.2, 5.0))
+    response_time: float = field(default=0.03, metadata=within(0.005, 0.5, "s"))
+    response_memory: float = field(default=0.2, metadata=within(0.02, 10.0, "s"))
+    start_gravity: float = field(default=0.25, metadata=within(0.02, 2.0))
+    silent_effort: float = field(default=0.3, metadata=within(0.05, 1.0))
+    silent_time: float = field(default=0.02, metadata=within(0.002, 1.0, "s"))
+    detection_time: float = field(default=0.03, metadata=within(0.005, 0.5, "s"))
+    bad_samples: int = field(default=20, metadata=within(0, 100))
 
 
 @dataclass
 class GuardSettings:
     """What a command guard allows.
+
+    The range of each setting stands beside it; outside, the guard would guard nothing, or nobody could command.
 
     Attributes:
         expiry: age at which a command is not obeyed any more, counted from the measurement that it answers [s]; and
@@ -96,23 +83,23 @@ class GuardSettings:
         plausibility: tolerances of the checks of measurements.
     """
 
-    expiry: float = 0.05
-    measurement_age: float = 0.02
-    start_time: float = 0.25
-    clock_tolerance: float = 0.05
-    start_effort: float = 0.1
-    margin: float = 0.05
-    margin_fraction: float = 0.05
-    effort_fraction: float = 1.0
-    effort_rise_time: float = 0.02
-    traverse_time: float = 0.5
-    following_error: float = 0.15
-    following_time: float = 0.2
-    fault_effort: float = 0.3
-    slow_period: float = 0.005
-    longest_period: float = 0.04
-    oscillation: float = 0.45
-    oscillation_time: float = 1.0
+    expiry: float = field(default=0.05, metadata=within(0.002, 1.0, "s"))
+    measurement_age: float = field(default=0.02, metadata=within(0.001, 0.1, "s"))
+    start_time: float = field(default=0.25, metadata=within(0.05, 10.0, "s"))
+    clock_tolerance: float = field(default=0.05, metadata=within(0.001, 1.0, "s"))
+    start_effort: float = field(default=0.1, metadata=within(0.001, 0.25))
+    margin: float = field(default=0.05, metadata=within(0.001, 0.3, "rad"))
+    margin_fraction: float = field(default=0.05, metadata=within(0.001, 0.25))
+    effort_fraction: float = field(default=1.0, metadata=within(0.01, 1.0))
+    effort_rise_time: float = field(default=0.02, metadata=within(0.002, 10.0, "s"))
+    traverse_time: float = field(default=0.5, metadata=within(0.1, 100.0, "s"))
+    following_error: float = field(default=0.15, metadata=within(0.01, 0.5))
+    following_time: float = field(default=0.2, metadata=within(0.01, 1.0, "s"))
+    fault_effort: float = field(default=0.3, metadata=within(0.05, 1.0))
+    slow_period: float = field(default=0.005, metadata=within(0.001, 0.02, "s"))
+    longest_period: float = field(default=0.04, metadata=within(0.005, 1.0, "s"))
+    oscillation: float = field(default=0.45, metadata=within(0.05, 2.0))
+    oscillation_time: float = field(default=1.0, metadata=within(0.1, 10.0, "s"))
     resume_automatically: bool = False
     plausibility: PlausibilitySettings = field(default_factory=PlausibilitySettings)
 
@@ -129,6 +116,5 @@ class GuardSettings:
             raise StationError(
                 f"guard settings: resume_automatically must be true or false; got {self.resume_automatically}"
             )
-        for name, (lowest, highest) in _ALLOWED.items():
-            if not lowest <= (value := getattr(self, name)) <= highest:
-                raise StationError(f"guard settings: {name} must be {lowest:g} to {highest:g}; got {value}")
+        if fault := number_fault(self):
+            raise StationError(f"guard settings: {fault}")

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
+from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 _MODES = {"position": lcmt_dvrk_command.POSITION, "effort": lcmt_dvrk_command.EFFORT}
@@ -26,7 +27,7 @@ class DvrkDriver:
     """
 
     lcm_url: str = ""
-    status_period: float = 1e-3
+    status_period: float = field(default=1e-3, metadata=within(0.0005, 0.01, "s"))
     control_modes: list[str] = field(default_factory=lambda: ["position", "effort"])
     gravity_compensation: bool = False
     model: str = ""
@@ -39,13 +40,13 @@ class DvrkDriver:
         """Checks the values; whoever sets them one by one, as yaml_load_typed does, calls it again.
 
         Raises:
-            StationError: an unknown control mode, a period below 0.5 ms or above 10 ms, or a guard's setting.
+            StationError: an unknown control mode, a period out of its range, or a guard's setting.
         """
         self.guard.check()
         if any(mode not in _MODES for mode in self.control_modes):
             raise StationError(f"control_modes must be a list of {', '.join(_MODES)}; got {list(self.control_modes)}")
-        if not 0.0005 <= self.status_period <= 0.01:
-            raise StationError(f"status_period must be from 0.0005 to 0.01 s; got {self.status_period}")
+        if fault := number_fault(self):
+            raise StationError(fault)
 
     def accepted_modes(self) -> tuple[int, ...]:
         """`control_modes` as values of lcmt_dvrk_command.control_mode."""

@@ -103,14 +103,14 @@ def test_another_mounting_is_held_by_its_own_model_and_not_by_the_files(tmp_path
 
 
 def test_gains_of_the_scenario_are_used():
-    limp = "controller.gains={kp: [0,0,0,0,0,0,0], kd: [0,0,0,0,0,0,0], ki: [0,0,0,0,0,0,0]}"
+    limp = "controller.gains={kp: [0.02,0.02,0.5,0.01,0.01,0.01,0.01], kd: [0,0,0,0,0,0,0], ki: [0,0,0,0,0,0,0]}"
     target = "targets=[{time: 0.5, pose: [0.1,0,0.1,0,0,0,0]}]"
     moved = []
     for more in ([], [limp]):
         q = simulate(load_scenario("psm", ["duration=1", f"start={ZERO}", target, *more])).recording.q
         moved.append(q[-1, 0])
     assert moved[0] == pytest.approx(0.1, abs=2e-3)
-    assert abs(moved[1]) < 1e-3
+    assert abs(moved[1]) < 0.02
 
 
 def test_a_recording_of_it_is_read_by_the_other_verbs(tmp_path, capsys, monkeypatch):
@@ -163,7 +163,7 @@ def test_a_recording_of_it_is_read_by_the_other_verbs(tmp_path, capsys, monkeypa
         ("closure=weld", 'closure is "weld"; allowed: mimic, ball'),
         ("controller.mode=float", 'controller.mode is "float"; allowed: hold, gravity'),
         ("controller.model=nothing.yaml", "nothing.yaml: no such file"),
-        ("gravity=[0, 0, 981]", "must be three numbers of a size up to 30 m/s^2"),
+        ("gravity=[0, 0, 981]", "gravity[2] is 981; allowed: -30..30 m/s^2"),
         ("start=[0, 0, 0.1, 0, 0, 0]", "start has 6 numbers; PSM has 7 joints: yaw, pitch, insertion"),
         ("start=[0, 0, 100, 0, 0, 0, 0]", "insertion = 100 is outside 0..0.24 [rad, m] of PSM; is insertion in mm?"),
         ("start=[3, 0, 0.1, 0, 0, 0, 0]", "yaw = 3 is outside -1.588..1.588 [rad, m] of PSM"),

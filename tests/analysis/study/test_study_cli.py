@@ -47,7 +47,7 @@ def refusal(capsys, path, *options):
             'key "scenarios" is unknown; did you mean "scenario"? allowed in a study: scenario, set, poses',
         ),
         (("scenario: psm", "scenario: psm\nseeds: [1, 1]"), "seeds must be different whole numbers from 0; got [1, 1]"),
-        (("scenario: psm", "scenario: psm\nseeds: [-1]"), "seeds must be different whole numbers from 0; got [-1]"),
+        (("scenario: psm", "scenario: psm\nseeds: [-1]"), "seeds[0] is -1; allowed: 0..9223372036854775807"),
         (("scenario: psm", "scenario: psm\nseeds: [a]"), 'seeds[0] is "a"; allowed: a whole number'),
         (("scenario: psm", "scenario: psm\nseeds: []"), "seeds, variations and measures must not be empty"),
         (

@@ -312,14 +312,14 @@ def test_gains_of_a_file_are_what_an_arm_is_held_with(tmp_path):
     status.guard_state = lcmt_dvrk_status.STATE_EFFORT
     for factor in (1.0, 3.0):
         path = tmp_path / "gains.yaml"
-        save_gains(Gains([factor * 0.01] * n, [0.0] * n, [0.0] * n), path, "no integral")
+        save_gains(Gains([factor * 0.1] * n, [0.0] * n, [0.0] * n), path, "no integral")
         controller = ArmController(arm, IdentifiedModel.from_arm(arm), "hold", 1e-3, gains=load_gains(path))
         status.command_sender_id = controller.sender_id
         desired = np.concatenate([np.full(n, 0.1 + error), np.zeros(n)])
         answers = [controller.answer(status, 1e-3 * k, desired) for k in range(1200)]  # the ramp takes a second
         assert controller.ramped
         sender_commands.append(np.array(answers[-1].effort))
-    np.testing.assert_allclose(sender_commands[1] - sender_commands[0], 2 * 0.01 * error, atol=1e-12)
+    np.testing.assert_allclose(sender_commands[1] - sender_commands[0], 2 * 0.1 * error, atol=1e-12)
 
 
 @pytest.mark.parametrize(

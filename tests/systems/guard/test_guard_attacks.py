@@ -121,21 +121,22 @@ def test_no_mode_accepted_is_not_every_mode_accepted():
 )
 def test_settings_that_switch_the_guard_off_are_refused(name, value):
     for bad in (value, 0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(StationError, match=f"guard settings: {name} must be"):
+        with pytest.raises(StationError, match=f"guard settings: {name} is .*; allowed: "):
             GuardSettings(**{name: bad})
 
 
 def test_settings_that_are_changed_afterwards_are_refused():
     settings = GuardSettings()
     settings.expiry = 9.0
-    with pytest.raises(StationError, match="guard settings: expiry must be"):
+    with pytest.raises(StationError, match=r"guard settings: expiry is 9; allowed: 0\.002\.\.1 s"):
         CommandGuard(ARM, SESSION, Weightless(), settings)
 
 
 def test_an_arm_that_nothing_holds_is_refused():
-    gains = dataclasses.replace(ARM.gains, kp=[0.0, *ARM.gains.kp[1:]])
-    with pytest.raises(StationError, match=r"MTML: all gains\.kp must be positive"):
-        CommandGuard(dataclasses.replace(ARM, gains=gains), SESSION, Weightless())
+    arm = dataclasses.replace(ARM, gains=dataclasses.replace(ARM.gains, kp=list(ARM.gains.kp)))
+    arm.gains.kp[0] = 0.0
+    with pytest.raises(StationError, match=r"MTML: gains\.kp\[0\] is 0; allowed: "):
+        CommandGuard(arm, SESSION, Weightless())
 
 
 def test_a_fraction_of_the_effort_limits_clamps_commands_and_refuses_a_start_that_would_drop_the_arm():

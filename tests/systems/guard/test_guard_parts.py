@@ -9,7 +9,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.systems.guard.command_stream import CommandInForce, CommandStream, is_finite, refusal_by_itself
 from dvrk_drake.systems.guard.measurement import Measurement
-from dvrk_drake.systems.guard.settings import GuardSettings
+from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
 
 # Measurements
 
@@ -230,6 +230,27 @@ SETTINGS = {
     "traverse_time": (0.1, 0.5, 100.0),
     "following_error": (0.01, 0.15, 0.5),
     "following_time": (0.01, 0.2, 1.0),
+    "fault_effort": (0.05, 0.3, 1.0),
+    "slow_period": (0.001, 0.005, 0.02),
+    "longest_period": (0.005, 0.04, 1.0),
+    "oscillation": (0.05, 0.45, 2.0),
+    "oscillation_time": (0.1, 1.0, 10.0),
+}
+PLAUSIBILITY_SETTINGS = {
+    "position_tolerance": (0.001, 0.01, 0.1),
+    "jitter": (0.0, 0.02, 0.05),
+    "velocity_delay": (0.001, 0.03, 0.1),
+    "velocity_memory": (0.05, 0.3, 2.0),
+    "frozen_effort": (0.05, 0.45, 1.0),
+    "frozen_time": (0.002, 0.01, 1.0),
+    "frozen_speed": (0.001, 0.1, 10.0),
+    "response": (0.2, 1.5, 5.0),
+    "response_time": (0.005, 0.03, 0.5),
+    "response_memory": (0.02, 0.2, 10.0),
+    "start_gravity": (0.02, 0.25, 2.0),
+    "silent_effort": (0.05, 0.3, 1.0),
+    "silent_time": (0.002, 0.02, 1.0),
+    "detection_time": (0.005, 0.03, 0.5),
 }
 
 
@@ -240,12 +261,30 @@ def test_each_setting_has_a_default_and_bounds(name):
     for value in (lowest, highest):
         assert getattr(GuardSettings(**{name: value}), name) == value
     for value in (np.nextafter(lowest, 0.0), np.nextafter(highest, np.inf), np.nan):
-        with pytest.raises(StationError, match=f"guard settings: {name} must be {lowest:g} to {highest:g}; got"):
+        with pytest.raises(StationError, match=f"guard settings: {name} is .*; allowed: {lowest:g}..{highest:g}"):
             GuardSettings(**{name: value})
 
 
+@pytest.mark.parametrize("name", PLAUSIBILITY_SETTINGS)
+def test_each_setting_of_a_check_has_a_default_and_bounds(name):
+    lowest, default, highest = PLAUSIBILITY_SETTINGS[name]
+    assert getattr(PlausibilitySettings(), name) == default
+    for value in (lowest, highest):
+        GuardSettings(plausibility=PlausibilitySettings(**{name: value}))
+    for value in (np.nextafter(lowest, -1.0), np.nextafter(highest, np.inf), np.nan):
+        with pytest.raises(StationError, match=rf"guard settings: plausibility\.{name} is .*; allowed: {lowest:g}"):
+            GuardSettings(plausibility=PlausibilitySettings(**{name: value}))
+
+
 def test_every_setting_has_bounds():
-    assert set(vars(GuardSettings())) == {*SETTINGS, "resume_automatically"}
+    assert set(vars(GuardSettings())) == {*SETTINGS, "resume_automatically", "plausibility"}
+    assert set(vars(PlausibilitySettings())) == {*PLAUSIBILITY_SETTINGS, "bad_samples"}
+    for count, allowed in ((0, True), (100, True), (-1, False), (101, False)):
+        if allowed:
+            GuardSettings(plausibility=PlausibilitySettings(bad_samples=count))
+        else:
+            with pytest.raises(StationError, match=r"plausibility\.bad_samples is .*; allowed: 0\.\.100"):
+                GuardSettings(plausibility=PlausibilitySettings(bad_samples=count))
 
 
 @pytest.mark.parametrize("value", ["false", 1, None])

@@ -68,8 +68,12 @@ def test_a_typo_is_an_error(tmp_path):
     for old, new, message in (
         ("stops: true", "stopps: true", "stopps"),
         ("outer_yaw: 1.861", "outer_jaw: 1.861", "effects.saturation: unknown actuator outer_jaw"),
-        ("outer_yaw: 1.861", "outer_yaw: -1.861", "effects.saturation.outer_yaw = -1.861 must be"),
-        ("measurement: 1", "measurement: -1", "effects.delay.measurement = -1"),
+        (
+            "outer_yaw: 1.861",
+            "outer_yaw: -1.861",
+            "effects.saturation.outer_yaw is -1.861; allowed: 0.001..2000 N m or N",
+        ),
+        ("measurement: 1", "measurement: -1", "effects.delay.measurement is -1; allowed: 0..100 time steps"),
         ("presliding, scale: 0.015", "stiction, scale: 0.015", 'effects.friction: kind "stiction"; allowed'),
         ("scale: 0.015", "scale: 0.0", "has scale 0"),
         ("coefficient: 0.0011", "coefficient: -0.0011", "has coefficient -0.0011"),
@@ -171,7 +175,7 @@ def test_a_cable_of_a_scenario_stretches():
     ("setting", "message"),
     [
         ("stretch.elbow={stiffness: 100.0}", "simulated arm: stretch: unknown actuator elbow"),
-        ("stretch.outer_yaw={stiffness: -1.0}", "simulated arm: stretch.outer_yaw must have a stiffness"),
+        ("stretch.outer_yaw={stiffness: -1.0}", "stretch.outer_yaw.stiffness is -1; allowed: "),
         ("hand.path=[{time: 0.1, pose: [0, 0, 0, 0, 0, 0, 0]}]", "hand.path needs two poses or more"),
         ("hand.path=[{time: 0.1, pose: [0, 0, 0]}]", r"hand.path\[0\].pose has 3 numbers"),
         ("hand.grip=1", "allowed"),

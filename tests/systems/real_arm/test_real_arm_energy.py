@@ -16,7 +16,7 @@ from dvrk_drake.systems.hand import Grip, Hand
 HANDLES = {"mtml": "dh_7", "psm": "dh_6"}
 GRIPS = {
     "as a person": Grip(),
-    "undamped": Grip(damping=1e-9, rotational_damping=1e-9),
+    "undamped": Grip(damping=1e-6, rotational_damping=1e-6),
     # Their limits bind until they have nearly arrived.
     "ten times as firm": Grip(6e3, 250.0, 20.0, 0.3),
     "a thousand times as firm": Grip(6e5, 2.5e4, 2e3, 30.0),

@@ -1,0 +1,403 @@
+"""Every number of every file and setting has a range; NaN, infinity and what is outside are refused, with the key."""
+
+import dataclasses
+import math
+import re
+import types
+from pathlib import Path
+from typing import Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import pytest
+import yaml
+from guard_bench import Weightless
+
+from dvrk_drake.analysis.simulation.scenario import Scenario
+from dvrk_drake.analysis.simulation.scenario_file import load_scenario
+from dvrk_drake.analysis.study.study_file import Study
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ArmError, ControllerError, ModelError, ScenarioError, StationError
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm_schema import ArmDescription, CoupledLimit, Gains, Instrument, Mechanism
+from dvrk_drake.models.effects_schema import ArmEffects, Cable, FrictionEffect
+from dvrk_drake.models.gains_file import load_gains
+from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.models.pose_file import PoseFile
+from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, schema_fault, within
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
+from dvrk_drake.processes.collector import CollectionSettings
+from dvrk_drake.processes.simulated_arm import load_driver
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.hand import Grip
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+
+#: Schemas of files.
+FILES = (ArmDescription, Mechanism, Instrument, Gains, DvrkDriver, Scenario, Study, PoseFile, IdentifiedModel)
+#: Dataclasses that Python code makes, with arrays.
+OBJECTS = (Arm, GravityCompensationFile, CollectionSettings, Grip)
+
+
+def numbers_of(schema: type, path: tuple = ()):
+    """Yields (path, field, type) of each field with numbers; path: the names, [0] of a list and "x" of a table."""
+    hints = get_type_hints(schema)
+    for field in dataclasses.fields(schema):
+        yield from numbers_in(hints[field.name], (*path, field.name), field)
+
+
+def numbers_in(kind, path, field):
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        for argument in arguments:
+            yield from numbers_in(argument, path, field)
+    elif origin in (list, tuple):
+        yield from numbers_in(arguments[0], (*path, 0), field)
+    elif origin is dict:
+        yield from numbers_in(arguments[1], (*path, "x"), field)
+    elif origin is np.ndarray:
+        if "float64" in str(arguments[1]):
+            yield path, field, np.ndarray
+    elif dataclasses.is_dataclass(kind):
+        yield from numbers_of(kind, path)
+    elif kind in (int, float):
+        yield path, field, kind
+
+
+def key_of(path) -> str:
+    key = "".join(f"[{part}]" if part == 0 else f".{part}" for part in path)
+    return key.removeprefix(".")
+
+
+def nested(path, value):
+    """Content of a file that has nothing but `value` at `path`."""
+    for part in reversed(path):
+        value = [value] if part == 0 else {part: value}
+    return value
+
+
+def outside(allowed: Range) -> float:
+    """The nearest number above the range."""
+    return allowed.high + 1 if isinstance(allowed.high, int) else float(np.nextafter(allowed.high, np.inf))
+
+
+IN_FILES = {f"{schema.__name__}.{key_of(p)}": (schema, p, f, k) for schema in FILES for p, f, k in numbers_of(schema)}
+IN_OBJECTS = {f"{schema.__name__}.{key_of(p)}": (p, f) for schema in OBJECTS for p, f, _ in numbers_of(schema)}
+
+
+def test_no_schema_is_passed_over():
+    assert len(IN_FILES) > 120
+    assert len(IN_OBJECTS) > 50
+    assert {"IdentifiedModel.joints[0].trust", "DvrkDriver.guard.expiry", "Mechanism.gains.kp[0]"} <= set(IN_FILES)
+    assert {"Arm.effort_limits", "Arm.gains.kp[0]", "Arm.linkage.matrix"} <= set(IN_OBJECTS)
+
+
+@pytest.mark.parametrize("name", {**IN_FILES, **IN_OBJECTS})
+def test_each_number_has_a_range_that_is_finite(name):
+    field = IN_FILES[name][2] if name in IN_FILES else IN_OBJECTS[name][1]
+    allowed = field.metadata.get(RANGE)
+    assert allowed is not None, f"{name} needs a range: field(metadata=within(low, high, unit))"
+    assert math.isfinite(allowed.low) and math.isfinite(allowed.high) and allowed.low < allowed.high
+    assert 1e300 not in allowed and -1e300 not in allowed and allowed.fault("", math.nan) != ""
+
+
+@pytest.mark.parametrize("name", IN_FILES)
+def test_a_file_with_a_number_outside_its_range_is_refused(name):
+    schema, path, field, kind = IN_FILES[name]
+    allowed, key = field.metadata[RANGE], key_of(path)
+    wrong = [outside(allowed), 10**300 if kind is int else -1e300, math.nan]
+    wrong += [number for number in (math.inf, -math.inf) if number not in allowed]
+    for value in wrong:
+        fault = schema_fault(schema, nested(path, value), "a test")
+        assert fault.startswith(f"{key} is ") and "; allowed: " in fault
+    for value in (allowed.low, allowed.high, *allowed.also):
+        assert schema_fault(schema, nested(path, kind(value) if math.isfinite(value) else value), "a test") == ""
+
+
+@pytest.mark.parametrize("name", [name for name in IN_OBJECTS if name.startswith("Arm.")])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1e300])
+def test_an_arm_with_a_number_outside_its_range_is_refused(name, value):
+    arm = load_arm("mtml")
+    effects = dataclasses.replace(arm.effects, stretch={"outer_yaw": Cable(1000.0, 1.0)})
+    whole = dataclasses.replace(arm, effects=effects, friction_coordinates={"pulley": np.eye(7)[0]})
+    with pytest.raises(ArmError, match=r"allowed: |gravity \(") as refusal:
+        changed(whole, IN_OBJECTS[name][0], value)
+    assert "\n" not in str(refusal.value)
+
+
+def changed(owner, path, value):
+    """`owner` with `value` at `path`."""
+    if not path:
+        return np.full_like(owner, value) if isinstance(owner, np.ndarray) else value
+    first, *rest = path
+    if dataclasses.is_dataclass(owner):
+        return dataclasses.replace(owner, **{first: changed(getattr(owner, first), rest, value)})
+    if isinstance(owner, dict):
+        key = next(iter(owner))
+        return {**owner, key: changed(owner[key], rest, value)}
+    return type(owner)([changed(owner[0], rest, value), *owner[1:]])
+
+
+@pytest.mark.parametrize(
+    ("gain", "value"),
+    [(gain, value) for gain in ("kp", "kd", "ki") for value in (1e-9, 1e9, math.nan, math.inf, -1.0)],
+)
+@pytest.mark.parametrize("arm", ["mtml", "psm"])
+def test_absurd_gains_are_refused_in_files_and_in_python(arm, gain, value, tmp_path, capsys):
+    arm = load_arm(arm)
+    gains = dataclasses.asdict(arm.gains)
+    gains[gain][2] = value
+    with pytest.raises(ControllerError, match=rf"gains\.{gain}\[2\] is .*; allowed: "):
+        GravityPidController(IdentifiedModel.from_arm(arm), gains=Gains(**gains))
+    path = tmp_path / "gains.yaml"
+    path.write_text(yaml.safe_dump(gains))
+    with pytest.raises(ControllerError, match=rf"gains\.yaml: {gain}\[2\] is .*; allowed: "):
+        load_gains(path)
+    assert main(["run", "--arm", arm.source, "--mode", "hold", "--gains", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and f"{gain}[2] is " in error
+
+
+def test_gains_are_compared_with_the_effort_limit_and_the_range():
+    arm = load_arm("mtml")
+    width, least_error = arm.position_upper - arm.position_lower, 1e-4
+    for share, ok in ((0.009, False), (0.011, True)):
+        gains = dataclasses.replace(arm.gains, kp=(share * arm.effort_limits / width).tolist())
+        assert (arm.gains_fault(gains) == "") == ok
+    for share, ok in ((0.99, True), (1.01, False)):
+        gains = dataclasses.replace(arm.gains, kp=(share * arm.effort_limits / least_error).tolist())
+        assert (arm.gains_fault(gains) == "") == ok
+    assert "for the range and effort limit of outer_yaw" in arm.gains_fault(gains)
+    with pytest.raises(ScenarioError, match=r"mtml: controller\.gains\.kp\[0\] is 1e\+06; allowed: .*outer_yaw"):
+        load_scenario("mtml", [f"controller.gains={dataclasses.asdict(dataclasses.replace(gains, kp=[1e6] * 7))}"])
+
+
+@pytest.fixture
+def own_psm(tmp_path):
+    """Writes the PSM as files of one's own, with changes; returns the path of the arm."""
+
+    def write(changes=(), sdf=()):
+        for kind, name in (("arm", "psm"), ("mechanism", "psm"), ("instrument", "large_needle_driver")):
+            text = (MODELS_FOLDER / f"{kind}s" / f"{name}.yaml").read_text()
+            text = text.replace("mechanism: psm", "mechanism: mechanism.yaml")
+            text = text.replace("instrument: large_needle_driver", "instrument: instrument.yaml")
+            content = yaml.safe_load(text)
+            for file, keys, value in changes:
+                if file == kind:
+                    put(content, keys, value)
+            if kind == "mechanism":
+                content["sdf"] = "psm.sdf"
+            (tmp_path / f"{kind}.yaml").write_text(yaml.safe_dump(content))
+        text = (MODELS_FOLDER / "sdf/psm.sdf").read_text()
+        if sdf:
+            assert re.search(sdf[0], text, re.DOTALL)
+            text = re.sub(*sdf, text, count=1, flags=re.DOTALL)
+        (tmp_path / "psm.sdf").write_text(text)
+        return tmp_path / "arm.yaml"
+
+    return write
+
+
+def put(content, keys, value):
+    *path, last = keys
+    for key in path:
+        content = content.setdefault(key, {})
+    content[last] = value
+
+
+SUM = {"name": "sum", "coefficients": {"yaw": 1.0, "pitch": 1.0}, "lower": -1.0, "upper": 1.0}
+LIMITS, COUPLED = "position_limits", "coupled_limits"
+
+
+@pytest.mark.parametrize(
+    ("file", "keys", "value", "message"),
+    [
+        ("arm", (LIMITS, "yaw"), [-90, 90], r"position_limits\.yaw\[0\] is -90; allowed: .* rad; is it in degrees\?"),
+        ("arm", (LIMITS, "insertion"), [0, 240], r"insertion\[1\] is 240; allowed: -2\.\.2 m; is it in mm\?"),
+        ("arm", (LIMITS, "yaw"), [1.0, 1.0], r"position_limits\.yaw is \[1, 1\]; allowed: .* lower < upper"),
+        ("arm", (LIMITS, "yaw"), [1.0, 1.001], r"yaw: upper - lower is 0\.001; allowed: 0\.01\.\.25\.2 rad"),
+        ("arm", (LIMITS, "insertion"), [0.1, 0.1001], r"insertion: upper - lower is 0\.0001; allowed: 0\.001\.\.2 m"),
+        ("arm", ("gravity",), [0, 0, -9810], r"gravity\[2\] is -9810; allowed: -30\.\.30 m/s\^2"),
+        ("mechanism", (COUPLED,), [{**SUM, "coefficients": {"yaw": 0.0}}], r"coupled_limits\.sum has no coefficient"),
+        ("mechanism", (COUPLED,), [{**SUM, "coefficients": {"yaw": 1e9}}], r"coefficients\.yaw is 1e\+09; allowed: "),
+        ("mechanism", (COUPLED,), [{**SUM, "lower": 1.0}], r"coupled_limits\.sum is \[1, 1\]; allowed: .* < upper"),
+        ("mechanism", (COUPLED,), [{**SUM, "lower": 0.999}], r"coupled_limits\.sum: upper - lower is 0\.001; all"),
+        ("mechanism", (COUPLED,), [{**SUM, "upper": 65}], r"coupled_limits\.sum\[1\] is 65; .* is it in degrees\?"),
+        (
+            "mechanism",
+            (COUPLED,),
+            [{**SUM, "lower": 3.0, "upper": 4.0}],
+            r"coupled_limits\.sum: no pose inside position_limits meets 3\.\.4; allowed: .* -2\.513\.\.2\.513",
+        ),
+        (
+            "mechanism",
+            (COUPLED,),
+            [{**SUM, "upper": -0.5}, {**SUM, "name": "same", "lower": 0.5}],
+            "coupled_limits: no pose inside position_limits meets them all",
+        ),
+        ("mechanism", ("transmission",), {"yaw": {"yaw": 0.0}}, r"transmission\.yaw has no coefficient other than 0"),
+        ("mechanism", ("transmission",), {"yaw": {"yaw": 1e9}}, r"transmission\.yaw\.yaw is 1e\+09; allowed: 0 or "),
+        ("instrument", ("joint_from_actuator", "roll"), {"roll": 0.0}, r"joint_from_actuator\.roll has no coeff"),
+        ("instrument", ("friction_coordinates", "finger_1"), {"jaw": 0.0}, r"friction_coordinates\.finger_1 has no c"),
+        ("mechanism", ("effort_cut_off",), 1e6, r"effort_cut_off is 1e\+06; allowed: 0\.1\.\.1000 Hz"),
+        ("mechanism", ("motion", "effort_delay"), [5.0, 0, 0], r"effort_delay\[0\] is 5; .*0\.2 s; is it in ms\?"),
+        ("mechanism", ("bounding_shapes", "margin"), 40, r"bounding_shapes\.margin is 40; .* m; is it in mm\?"),
+        ("mechanism", ("effects", "saturation", "yaw"), 1e-9, r"effects\.saturation\.yaw is 1e-09; allowed: "),
+        ("mechanism", ("effects", "stretch"), {"yaw": {"damping": 1.0}}, r"effects\.stretch\.yaw\.stiffness is 0; "),
+        ("mechanism", ("effects", "encoder", "resolution", "yaw"), 4000, r"resolution\.yaw is 4000; allowed: 1e-09"),
+        ("mechanism", ("gains", "kp"), [1e-4, 99.0, 1320.0], r"gains\.kp\[0\] is 0\.0001; .* effort limit of yaw"),
+        ("mechanism", ("gains", "kd"), [9.5, 1e5, 79.0], r"gains\.kd\[1\] is 100000; allowed: 0 or .* limit of pitch"),
+        ("mechanism", ("gains", "ki"), [9.5, 9.5, 1e8], r"gains\.ki\[2\] is 1e\+08; .* effort limit of insertion"),
+    ],
+)
+def test_absurd_numbers_in_the_files_of_an_arm_are_refused(file, keys, value, message, own_psm, capsys):
+    path = own_psm([(file, keys, value)])
+    with pytest.raises(ArmError, match=message) as refusal:
+        load_arm(str(path))
+    assert "\n" not in str(refusal.value) and str(path.parent) in str(refusal.value)
+    assert main(["model", str(path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("element", "value", "message"),
+    [
+        ("<effort>3[^<]*", "<effort>1e9", r"<effort> is 1e\+09; allowed: -1 or 0 or 0\.001\.\.2000 N m or N"),
+        ("<effort>3[^<]*", "<effort>1e-9", r"<effort> is 1e-09; allowed: "),
+        ("<effort>3[^<]*", "<effort>0", r"effort limit of joint yaw is 0; allowed: 0\.001\.\.2000 N m or N"),
+        ("<effort>3[^<]*", "<effort>-1", r"effort limit of joint yaw is -1; allowed: "),
+        ("<mass>[^<]*", "<mass>1470.5", r"<mass> is 1470\.5; allowed: 1e-06\.\.200 kg; is it in g\?"),
+        ("<mass>[^<]*", "<mass>1e-9", r"<mass> is 1e-09; allowed: "),
+        ("<ixx>[^<]*", "<ixx>26605", r"<ixx> is 26605; allowed: 0\.\.50 kg m\^2"),
+        ("<ixx>[^<]*", "<ixx>-1", r"<ixx> is -1; allowed: "),
+        ("<pose>[^<]*", "<pose>0 0 150 0 0 0", r"<pose> is 150; allowed: -5\.\.5 m; is it in mm\?"),
+        ("<pose>[^<]*", "<pose>0 0 0 90 0 0", r"<pose> is 90; allowed: -12\.6\.\.12\.6 rad; is it in degrees\?"),
+        ("<velocity>[^<]*", "<velocity>180", r"<velocity> is 180; .* rad/s or m/s; is it in degrees/s or mm/s\?"),
+        ('multiplier="[^"]*', 'multiplier="1e9', r"multiplier is 1e\+09; allowed: 0 or 0\.001\.\.1000 of either sign"),
+        ('offset="[^"]*', 'offset="90', r"offset is 90; allowed: .*; is it in degrees or mm\?"),
+    ],
+)
+def test_absurd_numbers_in_an_sdf_are_refused(element, value, message, own_psm, capsys):
+    path = own_psm(sdf=(element, value))
+    with pytest.raises(ArmError, match=message):
+        load_arm(str(path))
+    assert main(["model", str(path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_pose_in_degrees_that_says_so_is_read(own_psm):
+    path = own_psm(sdf=("<pose>[^<]*", '<pose degrees="true">0 0 0 90 0 0'))
+    assert load_arm(str(path)).num_joints == 7
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("base_parameters[0].value", -1e300, r"allowed: -100000\.\.100000 kg, kg m or kg m\^2"),
+        ("base_parameters[0].standard_error", -1.0, r"allowed: 0\.\.1e\+09"),
+        ("joints[1].trust", 1.5, r"allowed: 0\.\.1"),
+        ("joints[1].rms_fit", 1e300, "allowed: 0"),
+        ("joints[0].position_lower", -180.0, r"allowed: -50\.\.50 rad or m; is it in degrees or mm\?"),
+        ("gravity[2]", -1e300, r"allowed: -30\.\.30 m/s\^2"),
+    ],
+)
+def test_absurd_numbers_in_a_model_are_refused(key, value, message, tmp_path, capsys):
+    path = tmp_path / "model.yaml"
+    IdentifiedModel.from_arm(load_arm("mtml")).save(path)
+    content = yaml.safe_load(path.read_text())
+    owner, parts = content, re.findall(r"\w+", key)
+    for part in parts[:-1]:
+        owner = owner[int(part) if part.isdigit() else part]
+    owner[int(parts[-1]) if parts[-1].isdigit() else parts[-1]] = value
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(ModelError, match=rf"model\.yaml: {re.escape(key)} is \S+; {message}"):
+        IdentifiedModel.load(path)
+    assert main(["export", str(path), "--sdf", str(tmp_path / "out.sdf")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("status_period: 1", r"status_period is 1; allowed: 0\.0005\.\.0\.01 s; is it in ms\?"),
+        ("guard: {expiry: 50}", r"guard\.expiry is 50; allowed: 0\.002\.\.1 s; is it in ms\?"),
+        ("guard: {margin: 3}", r"guard\.margin is 3; allowed: 0\.001\.\.0\.3 rad; is it in degrees\?"),
+    ],
+)
+def test_units_in_the_file_of_a_driver_are_checked(text, message, tmp_path):
+    path = tmp_path / "driver.yaml"
+    path.write_text(text)
+    with pytest.raises(StationError, match=rf"driver\.yaml: {message}"):
+        load_driver(path)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 0.0, -1.0])
+@pytest.mark.parametrize("name", ["effort_limits", "position_upper", "kp"])
+def test_a_guard_refuses_an_arm_that_was_changed_after_it_was_made(name, value):
+    arm = load_arm("mtml")
+    arm = dataclasses.replace(
+        arm,
+        effort_limits=arm.effort_limits.copy(),
+        position_upper=arm.position_upper.copy(),
+        gains=Gains(list(arm.gains.kp), list(arm.gains.kd), list(arm.gains.ki)),
+    )
+    changed_array = arm.gains.kp if name == "kp" else getattr(arm, name)
+    changed_array[1] = -3.0 if name == "position_upper" and value == 0.0 else value
+    with pytest.raises(StationError, match=r"MTML: .*allowed: "):
+        CommandGuard(arm, 1, Weightless())
+
+
+def test_other_numbers_of_an_arm_made_in_python_are_refused():
+    arm = load_arm("mtml")
+    never = CoupledLimit("never", {"outer_yaw": 0.0}, 0.0, 1.0)
+    for changes, message in (
+        ({"coupled_limits": (never,)}, r"coupled_limits\.never: coefficients are all 0"),
+        ({"coupled_limits": (dataclasses.replace(never, coefficients={"outer_yaw": math.nan}),)}, "is nan; allowed"),
+        ({"effort_limits": arm.effort_limits[:6]}, "effort_limits has 6 numbers, one a joint is 7"),
+        ({"gains": Gains([1.0], [1.0], [1.0])}, r"gains\.kp has 1 numbers, one a joint is 7"),
+        ({"effects": ArmEffects(stretch={"outer_yaw": Cable()})}, r"effects\.stretch\.outer_yaw\.stiffness is 0; all"),
+        ({"effects": ArmEffects(friction=[FrictionEffect(coefficient=math.nan)])}, r"coefficient is nan; allowed: "),
+        ({"friction_coordinates": {"nothing": np.zeros(7)}}, r"friction_coordinates\.nothing has no coefficient"),
+        ({"gravity": np.array([20.0, 20.0, 20.0])}, "must be three numbers of a size up to 30"),
+    ):
+        with pytest.raises(ArmError, match=message):
+            dataclasses.replace(arm, **changes)
+
+
+def test_what_a_range_says():
+    assert str(Range(0.5, 2.0, "s")) == "0.5..2 s"
+    assert str(Range(0.5, 2.0, also=(0.0,), either_sign=True)) == "0 or 0.5..2 of either sign"
+    assert str(Range(0, 10**6)) == "0..1000000"
+    assert -1.0 in Range(0.5, 2.0, either_sign=True) and -1.0 not in Range(0.5, 2.0)
+    assert Range(0.0, 1.0, "rad or m").fault("a", 1.5) == "a is 1.5; allowed: 0..1 rad or m; is it in degrees or mm?"
+    assert Range(0.0, 1.0, "rad").fault("a", 100.0) == "a is 100; allowed: 0..1 rad"
+    assert Range(0.0, 1.0).fault("a", math.nan) == "a is nan; allowed: 0..1"
+
+
+@dataclasses.dataclass
+class Inner:
+    table: dict[str, list[float]] = dataclasses.field(default_factory=dict, metadata=within(0.0, 1.0))
+
+
+@dataclasses.dataclass
+class Outer:
+    inner: Inner
+    array: np.ndarray
+    free: float = 0.0
+
+
+def test_the_first_number_in_an_object_that_is_refused_is_named():
+    good = Outer(Inner({"a": [0.5]}), np.zeros((2, 2)))
+    assert number_fault(good) == ""
+    assert (
+        number_fault(dataclasses.replace(good, inner=Inner({"a": [0.5, 2]}))) == "inner.table.a[1] is 2; allowed: 0..1"
+    )
+    array = np.array([[0.0, 1.0], [math.nan, 0.0]])
+    assert number_fault(dataclasses.replace(good, array=array)) == "array[1][0] is nan; allowed: a finite number"
+    assert number_fault(dataclasses.replace(good, free=-math.inf)) == "free is -inf; allowed: a finite number"
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "examples").glob("*.yaml")), ids=lambda p: p.name)
+def test_the_examples_are_inside_the_ranges(path):
+    content = yaml.safe_load(path.read_text())
+    assert schema_fault(Study if "scenario" in content else Scenario, content, "a test") == ""
