@@ -186,7 +186,7 @@ def test_run_stops_when_the_arm_faults_and_refuses_one_that_has_a_fault(arm):
     assert "has a fault: senders" in process.said()
     again = start_run(name)
     assert again.wait() == 2
-    assert "It must be reset first" in again.said()
+    assert "Look at the arm, then start again with --reset" in again.said()
     observer.during(FORGOTTEN)
     meant = start_run(name, "--reset")
     try:

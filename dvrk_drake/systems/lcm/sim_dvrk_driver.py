@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from pydrake.lcm import DrakeLcmInterface
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.lcm import LcmPublisherSystem
@@ -39,17 +41,20 @@ class SimDvrkDriver(Diagram):
     command acts, is a GravityPidController that knows the arm's true gravity; a real arm's has friction instead.
     """
 
-    def __init__(self, arm: Arm, driver: DvrkDriver, *, start_utime: int = 0) -> None:
+    def __init__(
+        self, arm: Arm, driver: DvrkDriver, *, start_utime: int = 0, wall_clock: Callable[[], int] | None = None
+    ) -> None:
         """Of `arm`.
 
         Args:
             arm: as it is simulated, mounting included.
             driver: its configuration.
             start_utime: the arm's clock at time zero of the context [us].
+            wall_clock: of the guard [us]; None: commands expire by the context's time only.
         """
         super().__init__()
         clock = ArmClock(start_utime, driver.status_period)
-        guard = CommandGuard(arm, draw_id(), driver.guard, driver.accepted_modes())
+        guard = CommandGuard(arm, draw_id(), driver.guard, driver.accepted_modes(), wall_clock)
         builder = DiagramBuilder()
         self._receiver = builder.AddNamedSystem("command_receiver", DvrkCommandReceiver(arm, guard, clock))
         position_controller = builder.AddNamedSystem(
@@ -90,6 +95,13 @@ class SimDvrkDriver(Diagram):
         """Takes a message of the command channel, as it came over the wire, at the next update."""
         self._receiver.Receive(data)
 
+    def SetStalled(self, stalled: bool) -> None:
+        """Stops the guard, as in a bridge whose process is stopped, or lets it go on.
+
+        While it is stopped, no command is received and the motors do what they were told last.
+        """
+        self._receiver.stalled = stalled
+
     def GetGuard(self, context: Context) -> CommandGuard:
         """The guard in this driver's context, to be read only."""
         return self._receiver.GetGuard(self.GetSubsystemContext(self._receiver, context))
@@ -103,6 +115,7 @@ def apply_driver_config(
     *,
     start_utime: int = 0,
     subscribe: bool = True,
+    wall_clock: Callable[[], int] | None = None,
 ) -> SimDvrkDriver:
     """Puts a simulated station behind LCM: DVRK_COMMAND_<ARM> moves it, DVRK_STATUS_<ARM> tells of it.
 
@@ -114,12 +127,13 @@ def apply_driver_config(
         start_utime: the arm's clock at time zero of the context [us].
         subscribe: take commands from `lcm`, which over UDP keeps the newest one between two calls of
             `HandleSubscriptions`. False: somebody else gives every message to `SimDvrkDriver.Receive`.
+        wall_clock: of the guard, for a simulation that is stepped by the wall clock [us].
 
     Returns:
         The driver that was added.
     """
     arm, name = station.arm, station.arm.name.lower()
-    sim_driver = builder.AddSystem(SimDvrkDriver(arm, driver, start_utime=start_utime))
+    sim_driver = builder.AddSystem(SimDvrkDriver(arm, driver, start_utime=start_utime, wall_clock=wall_clock))
     if subscribe:
         lcm.Subscribe(command_channel(arm), sim_driver.Receive)
     for port in ("state_estimated", "effort_measured"):
