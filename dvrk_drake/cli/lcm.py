@@ -68,9 +68,6 @@ def _add_run(verbs: argparse._SubParsersAction) -> None:
         "--gains", metavar="GAINS.yaml", help="from tune, for modes hold and damped; default: the arm's own"
     )
     verb.add_argument(
-        "--reset", action="store_true", help="say which fault the arm has, if any, and clear it before it is controlled"
-    )
-    verb.add_argument(
         "--friction-ratio",
         type=float,
         default=0.0,
@@ -97,7 +94,7 @@ def _run(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
     compensator, gains = _friction_compensator(options), _gains(options)
-    controller, url, period = ready_controller(options, options.mode, compensator, gains, reset=options.reset)
+    controller, url, period = ready_controller(options, options.mode, compensator, gains)
     arm = controller.arm
     stopped = stop_on_signals()
     print(
@@ -191,6 +188,11 @@ def add_control(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--model", metavar="MODEL.yaml", help="from identify; default: what the arm's SDF states")
     verb.add_argument("--lcm-url", default="", metavar="URL", help="default: LCM_DEFAULT_URL, or LCM's own")
     verb.add_argument("--realtime", action="store_true", help="real-time scheduling, or a warning where not permitted")
+    verb.add_argument(
+        "--reset",
+        action="store_true",
+        help="say which fault the arm has or why it took over, if it did, and clear that before it is controlled",
+    )
 
 
 def ready_controller(
@@ -198,13 +200,11 @@ def ready_controller(
     mode: Mode,
     friction: FrictionCompensator | None = None,
     gains: Gains | None = None,
-    *,
-    reset: bool = False,
 ) -> tuple[ArmController, str, float]:
     """A controller of an arm that may be controlled, the URL of the network, and the period of its statuses [s].
 
-    With `friction` it compensates that as well; `gains` are what it holds with; with `reset` a latched fault is said
-    and cleared first.
+    With `friction` it compensates that as well; `gains` are what it holds with. With --reset a latched fault is said
+    and cleared first, and an arm whose watchdog took over resumes.
 
     Raises:
         ModelError: the model is of another arm.
@@ -227,7 +227,7 @@ def ready_controller(
         _warn(warning)
     url = open_lcm(options.lcm_url).get_lcm_url()
     with closing(ArmLink(arm, url)) as link:
-        if reset:
+        if options.reset:
             reset_fault(link, _warn)
         _, period = first_status(link)
     controller = ArmController(arm, model, mode, period, friction, gains)

@@ -44,6 +44,9 @@ _FORGOTTEN = 1.1
 #: How long commands may be refused, or watched, without one that acts [s]; the start guard takes a quarter of a second.
 _PATIENCE = 10.0
 
+#: What to do about an arm that has a fault or waits for an operator.
+_RESET = "Look at the arm, then start again with --reset"
+
 #: How often `tell` hears the live status [s].
 _TELL = 0.2
 
@@ -112,11 +115,11 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
     """The first status of an arm that may be controlled, and the period in which statuses come [s].
 
     Raises:
-        ControllerError: no arm, a fault, a state that is not known, a pose outside the limits, an arm that takes no
-            efforts, is restarted, or is measured too seldom.
+        ControllerError: no arm, a fault, an arm that waits for an operator, a state that is not known, a pose outside
+            the limits, an arm that takes no efforts, is restarted, or is measured too seldom.
     """
     status, name = link.next_status(_FIRST_WAIT), link.arm.name
-    _check(status, name, status.session_id, "It must be reset first, with run --reset")
+    _check(status, name, status.session_id)
     if not np.all(np.isfinite([*status.position, *status.velocity, *status.effort_measured])):
         raise ControllerError(f"{name} does not know its state: a position, velocity or effort is not finite")
     if violations := link.arm.limit_violations(status.position):
@@ -140,20 +143,23 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
 
 
 def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
-    """Asks the arm to clear its latched fault, if it has one, and leaves it in its hold.
+    """Asks the arm to clear its latched fault, or to resume after its watchdog took over, and leaves it in its hold.
 
     Args:
         link: to the arm.
-        tell: hears what the fault was, before it is cleared.
+        tell: hears what the fault was, or why the watchdog took over, before it is cleared.
 
     Raises:
-        ControllerError: no arm, or one whose fault stays, because its cause lasts.
+        ControllerError: no arm, or one whose fault or hold stays, because its cause lasts.
     """
     status, name = link.next_status(_FIRST_WAIT), link.arm.name
-    if status.fault_code == lcmt_dvrk_status.FAULT_NONE:
+    if status.fault_code == lcmt_dvrk_status.FAULT_NONE and not status.fault_text:
         return
     fault = status.fault_text
-    tell(f"{name} has a fault, which is reset now: {fault}")
+    if status.fault_code == lcmt_dvrk_status.FAULT_NONE:
+        tell(f"{name} took over and waits for an operator, who resumes now: {fault}")
+    else:
+        tell(f"{name} has a fault, which is reset now: {fault}")
     sender = DvrkCommandSender(link.arm)
     context = sender.CreateDefaultContext()
     start = link.now()
@@ -170,14 +176,22 @@ def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
         status = link.next_status(_SILENCE)
     if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
         raise ControllerError(f"{name} has a fault that stays: {status.fault_text or fault}")
+    if status.fault_text:
+        raise ControllerError(f"{name} does not resume: {status.fault_text}")
 
 
-def _check(status: lcmt_dvrk_status, name: str, session: int, advice: str = "") -> None:
-    """Refuses an arm that was restarted, has a fault, or adds gravity compensation of its own."""
+def _check(status: lcmt_dvrk_status, name: str, session: int, late: Callable[[], str] = lambda: "") -> None:
+    """Refuses an arm that was restarted, has a fault, waits for an operator, or adds its own gravity compensation.
+
+    `late` says whether answers came too seldom, which may be why the arm took over.
+    """
     if status.session_id != session:
         raise ControllerError(f"{name} was restarted: look at it, then start again")
     if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
-        raise ControllerError(f"{name} has a fault: {status.fault_text}" + (f". {advice}" if advice else ""))
+        raise ControllerError(f"{name} has a fault: {status.fault_text}. {_RESET}")
+    if status.fault_text:
+        why = "; ".join(filter(None, [status.fault_text, late()]))
+        raise ControllerError(f"{name} took over and holds: {why}. {_RESET}")
     if status.gravity_compensation:
         raise ControllerError(
             f"{name} adds gravity compensation of its own, and two of them throw the arm upward: switch it off there "
@@ -206,7 +220,7 @@ def control(
         lead: where to, asked once a status.
 
     Raises:
-        ControllerError: the arm fell silent, faulted, was restarted, or lets no command act.
+        ControllerError: the arm fell silent, faulted, took over, was restarted, or lets no command act.
     """
     start = link.now()
     first = link.next_status(_SILENCE)
@@ -214,11 +228,11 @@ def control(
     answers = AnswerTimes()
     while not stopped():
         status = link.next_status(_SILENCE)
-        _check(status, link.arm.name, first.session_id)
         now = link.now() - start
+        answers.add(now)
+        _check(status, link.arm.name, first.session_id, answers.lateness)
         link.send(controller.answer(status, now, lead(status, now)))
         live.answer(status, now)
-        answers.add(now)
         if controller.acting:
             acted, before = now, status
         elif now > acted + _PATIENCE:

@@ -29,6 +29,11 @@ from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 _MESSAGES_A_STEP = 200
 
 
+def monotonic_utime() -> int:
+    """Time by the computer's monotonic clock [us]."""
+    return time.monotonic_ns() // 1000
+
+
 def load_driver(path: str | Path) -> DvrkDriver:
     """A driver's configuration from its YAML file; what it leaves out has its default.
 
@@ -69,8 +74,12 @@ class SimulatedArm:
         driver: DvrkDriver,
         url: str,
         q: ArrayLike,
+        wall_clock: Callable[[], int] = monotonic_utime,
     ) -> None:
-        """On the LCM network `url`, at rest at the pose q (n,); the arm's clock starts at the time of day."""
+        """On the LCM network `url`, at rest at the pose q (n,); the arm's clock starts at the time of day.
+
+        By `wall_clock` [us] the guard lets commands expire also when this process is late or was stopped.
+        """
         self.arm, self.driver, self._url = arm, driver, url
         self._ticks = 0
         self._status = b""
@@ -79,7 +88,13 @@ class SimulatedArm:
         builder = DiagramBuilder()
         station = builder.AddSystem(ArmStation(arm))
         self._driver = apply_driver_config(
-            driver, station, self._memory, builder, start_utime=time.time_ns() // 1000, subscribe=False
+            driver,
+            station,
+            self._memory,
+            builder,
+            start_utime=time.time_ns() // 1000,
+            subscribe=False,
+            wall_clock=wall_clock,
         )
         self._simulator = Simulator(builder.Build())
         context = self._simulator.get_mutable_context()
@@ -100,6 +115,16 @@ class SimulatedArm:
         self._ticks += 1
         self._simulator.AdvanceTo(self._ticks * self.driver.status_period)
         self._memory.HandleSubscriptions(0)
+
+    def stall(self, seconds: float) -> None:
+        """Plays a bridge whose process is stopped for so long, of the arm's clock: neither guard nor status.
+
+        The motors apply meanwhile what they were told last, as those of a dVRK do.
+        """
+        self._driver.SetStalled(True)
+        for _ in range(round(seconds / self.driver.status_period)):
+            self.step()
+        self._driver.SetStalled(False)
 
     def send(self, network: lcm.LCM) -> None:
         """Tells of the state as it is now."""
@@ -139,7 +164,7 @@ class SimulatedArm:
     def _describe(self) -> str:
         guard = self.guard
         sender = f", sender {guard.sender_id}" if guard.sender_id else ""
-        return describe_state(guard.state, guard.fault_text) + sender
+        return describe_state(guard.state, guard.fault_text or guard.hold_reason) + sender
 
 
 def stop_on_signals() -> Callable[[], bool]:

@@ -72,7 +72,7 @@ def after(count, action):
 def test_a_fault_is_said_then_cleared_and_a_controller_may_follow():
     link, said = GuardedArm(), []
     link.guard.report_fault("the amplifier is hot")
-    with pytest.raises(ControllerError, match=r"has a fault: the amplifier is hot\. It must be reset first"):
+    with pytest.raises(ControllerError, match=r"has a fault: the amplifier is hot\. Look at the arm, then start again"):
         first_status(link)
     assert not link.commands  # a fault is cleared on request only
     reset_fault(link, lambda text: said.append((text, len(link.commands))))
@@ -94,6 +94,52 @@ def test_a_fault_whose_cause_lasts_is_an_error_and_no_fault_needs_no_reset():
     link = GuardedArm()
     reset_fault(link, pytest.fail)
     assert not link.commands
+
+
+def stop_for(link, seconds):
+    """The controller is stopped for so long, while the arm goes on."""
+    link.utime += round(1e6 * seconds)
+
+
+LOOK = r"Look at the arm, then start again with --reset"
+
+
+@pytest.mark.parametrize("seconds", [0.02, 0.05, 0.2, 1.0])
+def test_a_controller_that_was_stopped_while_it_acted_ends_and_an_operator_resumes(controller, seconds):
+    link, said = GuardedArm(), []
+    end = link.now() + 2.0
+    link.before_step = after(500, lambda: stop_for(link, seconds))
+    if seconds < 0.05:
+        control(link, controller, lambda: link.now() > end, lambda status: None)
+        return
+    why = rf"MTML took over and holds: the last command expired: .* ms old by the arm's clock.*; .*too slow.*\. {LOOK}"
+    with pytest.raises(ControllerError, match=why):
+        control(link, controller, lambda: link.now() > end, lambda status: None)
+    assert link.guard.state == Status.STATE_HOLD and link.now() < end
+    sent = len(link.commands)
+    with pytest.raises(ControllerError, match=rf"MTML took over and holds: the last command expired: .*\. {LOOK}"):
+        first_status(link)
+    assert len(link.commands) == sent
+    reset_fault(link, said.append)
+    (line,) = said
+    assert line.startswith("MTML took over and waits for an operator, who resumes now: the last command expired: ")
+    first_status(link)
+    assert link.guard.hold_reason == ""
+
+
+def test_an_arm_that_does_not_resume_is_an_error():
+    link = GuardedArm()
+    link.before_step = lambda: link.guard._take_over("its period is 20 ms")
+    with pytest.raises(ControllerError, match="MTML does not resume: its period is 20 ms"):
+        reset_fault(link, lambda text: None)
+
+
+def test_an_arm_that_takes_over_during_the_release_is_an_error(controller):
+    link = GuardedArm()
+    end = link.now() + 0.5
+    link.before_step = lambda: link.now() > end and link.guard._take_over("its period is 20 ms")
+    with pytest.raises(ControllerError, match=rf"MTML took over and holds: its period is 20 ms\. {LOOK}"):
+        control(link, controller, lambda: link.now() > end, lambda status: None)
 
 
 @pytest.mark.parametrize("count", [2, 10, 21])
@@ -185,7 +231,7 @@ def test_run_prints_what_is_new_and_nothing_twice(controller, monkeypatch, capsy
             tell(LiveStatus(state, pace, problem))
 
     monkeypatch.setattr(
-        "dvrk_drake.cli.lcm.ready_controller", lambda options, mode, friction, gains, reset: (controller, "", 1e-3)
+        "dvrk_drake.cli.lcm.ready_controller", lambda options, mode, friction, gains: (controller, "", 1e-3)
     )
     monkeypatch.setattr("dvrk_drake.processes.control.control", control)
     monkeypatch.setattr("dvrk_drake.processes.control.ArmLink", lambda arm, url: None)

@@ -13,6 +13,7 @@ from dvrk_drake.models.collection_file import CollectionFile
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.collector import CollectionSettings, Collector
 from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
 
 PERIOD = 1e-3
@@ -84,11 +85,14 @@ class StickyArm:
 
 
 class GuardedArm(StickyArm):
-    """A StickyArm behind the guard that a driver has; its clock goes on by a period with every step."""
+    """A StickyArm behind a guard that resumes automatically; its clock goes on by a period with every step.
+
+    Where an operator must resume, `control` ends before a collector is asked: tests/processes/test_control.py.
+    """
 
     def __init__(self, *arguments):
         super().__init__(*arguments)
-        self.guard = CommandGuard(self.arm, 7, Weightless())
+        self.guard = CommandGuard(self.arm, 7, Weightless(), GuardSettings(resume_automatically=True))
         self._step_guard()
 
     def status(self):

@@ -113,9 +113,11 @@ def test_command_and_status_go_round(arm):
 @inside
 @watchdog
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_a_killed_controller_is_followed_by_a_hold(name):
+def test_a_killed_controller_is_followed_by_a_hold(name, tmp_path):
     """With the expiry that a real arm has, by the arm's clock and, where scheduling is real-time, by the wall clock."""
-    observer, arm = Observer(name, OTHER_URL), start_arm(name, "--lcm-url", OTHER_URL)
+    (tmp_path / "driver.yaml").write_text("guard: {resume_automatically: true}\n")
+    observer = Observer(name, OTHER_URL)
+    arm = start_arm(name, "--lcm-url", OTHER_URL, "--driver", tmp_path / "driver.yaml")
     controller = start_controller(name, "--lcm-url", OTHER_URL)
     try:
         observer.until(lambda status: True, "first status", process=arm)
@@ -141,6 +143,81 @@ def test_a_killed_controller_is_followed_by_a_hold(name):
         assert by_the_wall <= 0.060
     assert worst < 1e-3
     assert observer.last.num_expired >= 1
+
+
+def stop(process, seconds):
+    """Stops a process for at least that long."""
+    process.send_signal(signal.SIGSTOP)
+    stat = Path(f"/proc/{process.process.pid}/stat")
+    wait_until(lambda: stat.read_text().rpartition(")")[2].split()[0] == "T", "stop", process)
+    time.sleep(seconds)
+    process.send_signal(signal.SIGCONT)
+
+
+def waits_for_an_operator(status):
+    return holds(status) and not status.fault_code and status.fault_text.startswith("the last command expired: ")
+
+
+@inside
+@pytest.mark.parametrize("seconds", [0.05, 0.2, 1.0])
+@pytest.mark.parametrize("stalled", ["arm", "controller"])
+def test_a_stall_is_followed_by_a_hold_until_an_operator_resumes(stalled, seconds):
+    """By signals, with the expiry that a real arm has; a stall of 20 ms may be longer, so its test has a simulated clock.
+
+    A busy computer may stop one of them before the test does: that has the same end.
+    """
+    observer, arm = Observer("mtml", OTHER_URL), start_arm("mtml", "--lcm-url", OTHER_URL)
+    controller = start_controller("mtml", "--lcm-url", OTHER_URL)
+    try:
+        begun = observer.until(takes_efforts, "start of the controller", process=controller)
+        stop(arm if stalled == "arm" else controller, seconds)
+        held = observer.until(waits_for_an_operator, "hold", begun, arm)
+        # The controller goes on as if nothing had happened.
+        observer.until(
+            lambda status: status.refusal_code == Status.REFUSAL_RESUME and status.num_refused > 300,
+            "refusals",
+            held,
+            controller,
+        )
+        after = observer.heard[held:]
+    finally:
+        said = controller.end(), arm.end(signal.SIGINT)
+        print(*said)
+    assert arm.wait() == 0
+    assert all(map(waits_for_an_operator, after))
+    assert "hold: the last command expired: " in said[1]
+    farthest = drift(*observer.heard[begun:])
+    print(f"{stalled} stopped for {seconds} s: {after[0].fault_text}; the arm moves {farthest:.2g} rad or m")
+    assert farthest < 1e-3
+
+
+@inside
+@watchdog
+@pytest.mark.parametrize("stalled", ["arm", "run"])
+def test_run_ends_after_a_stall_and_starts_again_by_an_operator(stalled):
+    observer, url = Observer("mtml", OTHER_URL), ("--lcm-url", OTHER_URL)
+    arm, run = start_arm("mtml", *url), start_run("mtml", *url)
+    runs = [run]
+    try:
+        begun = observer.until(takes_efforts, "run", process=run)
+        stop(arm if stalled == "arm" else run, 0.2)
+        held = observer.until(waits_for_an_operator, "hold", begun, arm)
+        assert run.wait() == 2
+        runs.append(start_run("mtml", *url))
+        assert runs[-1].wait() == 2
+        for ended in runs:
+            lines = [line for line in ended.said().splitlines() if line.startswith("dvrk-drake: error")]
+            (line,) = lines
+            assert line.startswith("dvrk-drake: error: MTML took over and holds: the last command expired: ")
+            assert line.endswith("Look at the arm, then start again with --reset")
+        assert all(map(waits_for_an_operator, observer.heard[held:]))
+        runs.append(start_run("mtml", *url, "--reset"))
+        observer.until(lambda status: holds(status) and not status.fault_text, "resume", held, runs[-1])
+        observer.until(takes_efforts, "run", held, runs[-1])
+    finally:
+        for process in (*runs, arm):
+            print(process.end(signal.SIGINT))
+    assert "MTML took over and waits for an operator, who resumes now: " in runs[-1].said()
 
 
 @inside
@@ -186,7 +263,7 @@ def test_run_stops_when_the_arm_faults_and_refuses_one_that_has_a_fault(arm):
     assert "has a fault: senders" in process.said()
     again = start_run(name)
     assert again.wait() == 2
-    assert "It must be reset first" in again.said()
+    assert "Look at the arm, then start again with --reset" in again.said()
     observer.during(FORGOTTEN)
     meant = start_run(name, "--reset")
     try:

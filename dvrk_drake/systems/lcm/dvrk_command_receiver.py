@@ -57,6 +57,10 @@ class DvrkCommandReceiver(LeafSystem):
 
     The measurement is always fresh. The guard is abstract state; it is updated once a period of the clock, and
     Drake does that before discrete plants of the same time are stepped, so a command acts in the step that follows it.
+
+    Attributes:
+        stalled: whether the guard stands still, as in a bridge whose process is stopped. Messages then wait in the
+            inbox, and the outputs follow what the guard said last.
     """
 
     def __init__(
@@ -74,6 +78,7 @@ class DvrkCommandReceiver(LeafSystem):
         """
         super().__init__()
         n = arm.num_joints
+        self.stalled = False
         self._num_joints, self._clock = n, clock or ArmClock()
         self._effort_limits = arm.effort_limits
         self._command = self.DeclareAbstractInputPort("lcmt_dvrk_command", AbstractValue.Make(lcmt_dvrk_command()))
@@ -102,6 +107,8 @@ class DvrkCommandReceiver(LeafSystem):
         return context.get_abstract_state(int(self._guard)).get_value()
 
     def _update(self, context: Context, state: State) -> None:
+        if self.stalled:
+            return
         guard = state.get_mutable_abstract_state(int(self._guard)).get_mutable_value()
         utime = self._clock.utime(context)
         while self._inbox:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from pydrake.lcm import DrakeLcmInterface
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.lcm import LcmPublisherSystem
@@ -41,7 +43,13 @@ class SimDvrkDriver(Diagram):
     """
 
     def __init__(
-        self, arm: Arm, driver: DvrkDriver, *, model: IdentifiedModel | None = None, start_utime: int = 0
+        self,
+        arm: Arm,
+        driver: DvrkDriver,
+        *,
+        model: IdentifiedModel | None = None,
+        start_utime: int = 0,
+        wall_clock: Callable[[], int] | None = None,
     ) -> None:
         """Driver of `arm`.
 
@@ -51,6 +59,7 @@ class SimDvrkDriver(Diagram):
             model: with which the guard checks measurements, and which the position controller compensates; the
                 driver's if None, or else what the arm's SDF states.
             start_utime: the arm's clock at time zero of the context [us].
+            wall_clock: of the guard [us]; None: commands expire by the context's time only.
 
         Raises:
             ModelError: the driver's model cannot be read, or is of another arm.
@@ -60,7 +69,7 @@ class SimDvrkDriver(Diagram):
         if model is None:
             model = IdentifiedModel.load(driver.model) if driver.model else IdentifiedModel.from_arm(arm)
         guard_model = ControlModel(model, with_gravity=not driver.gravity_compensation)
-        guard = CommandGuard(arm, draw_id(), guard_model, driver.guard, driver.accepted_modes())
+        guard = CommandGuard(arm, draw_id(), guard_model, driver.guard, driver.accepted_modes(), wall_clock)
         builder = DiagramBuilder()
         self._receiver = builder.AddNamedSystem("command_receiver", DvrkCommandReceiver(arm, guard, clock))
         position_controller = builder.AddNamedSystem(
@@ -101,6 +110,13 @@ class SimDvrkDriver(Diagram):
         """Takes a message of the command channel, as it came over the wire, at the next update."""
         self._receiver.Receive(data)
 
+    def SetStalled(self, stalled: bool) -> None:
+        """Stops the guard, as in a bridge whose process is stopped, or lets it go on.
+
+        While it is stopped, no command is received and the motors do what they were told last.
+        """
+        self._receiver.stalled = stalled
+
     def GetGuard(self, context: Context) -> CommandGuard:
         """The guard in this driver's context, to be read only."""
         return self._receiver.GetGuard(self.GetSubsystemContext(self._receiver, context))
@@ -115,6 +131,7 @@ def apply_driver_config(
     model: IdentifiedModel | None = None,
     start_utime: int = 0,
     subscribe: bool = True,
+    wall_clock: Callable[[], int] | None = None,
 ) -> SimDvrkDriver:
     """Puts a simulated station behind LCM: DVRK_COMMAND_<ARM> moves it, DVRK_STATUS_<ARM> tells of it.
 
@@ -127,12 +144,15 @@ def apply_driver_config(
         start_utime: the arm's clock at time zero of the context [us].
         subscribe: take commands from `lcm`, which over UDP keeps the newest one between two calls of
             `HandleSubscriptions`. False: somebody else gives every message to `SimDvrkDriver.Receive`.
+        wall_clock: of the guard, for a simulation that is stepped by the wall clock [us].
 
     Returns:
         The driver that was added.
     """
     arm, name = station.arm, station.arm.name.lower()
-    sim_driver = builder.AddSystem(SimDvrkDriver(arm, driver, model=model, start_utime=start_utime))
+    sim_driver = builder.AddSystem(
+        SimDvrkDriver(arm, driver, model=model, start_utime=start_utime, wall_clock=wall_clock)
+    )
     if subscribe:
         lcm.Subscribe(command_channel(arm), sim_driver.Receive)
     for port in ("state_estimated", "effort_measured"):

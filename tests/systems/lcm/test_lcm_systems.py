@@ -41,7 +41,20 @@ def test_a_controller_starts_acts_and_is_replaced_by_a_hold(name):
     assert (status.num_expired, status.command_sender_id, status.num_accepted) == (1, 0, accepted)
     assert np.abs(np.array(status.effort_commanded) - effort_before).max() < 0.01 * arm.arm.effort_limits.max()
     assert arm.drift() < 1e-3
-    # It comes back as another sender and is watched again first.
+    # It comes back as another sender, but an operator did not resume.
+    controller = Controller(lcm, name)
+    run(lcm, 300, arm, controller)
+    status = arm.statuses[-1]
+    assert (status.guard_state, status.refusal_code) == (Status.STATE_HOLD, Status.REFUSAL_RESUME)
+    assert status.fault_code == Status.FAULT_NONE and status.fault_text.startswith("the last command expired: ")
+    run(lcm, 60, arm)
+    operator = Sending(lcm, arm.arm)
+    run(lcm, 5, arm, operator)
+    operator.fix("reset_fault", [1.0])
+    run(lcm, 5, arm, operator)
+    run(lcm, 60, arm)
+    assert not arm.statuses[-1].fault_text
+    # It comes back again, and is watched first.
     controller = Controller(lcm, name)
     run(lcm, 200, arm, controller)
     assert arm.statuses[-1].guard_state == Status.STATE_STARTING

@@ -1,0 +1,163 @@
+"""Time from `kill -9` of a controller until the guard of the simulated arm holds, over LCM.
+
+    python benchmarks/kill_controller.py [--kills 10] [--realtime]
+
+It starts the arm of `dvrk-drake arm` and `dvrk-drake run --mode hold`, each as a process, and kills the controller when
+its efforts have acted for 0.3 s to 0.6 s. Then an operator resumes (`run --reset`), and the next kill follows. It does so
+alone, and beside two processes that never wait.
+
+The arm's process notes the time by the monotonic clock at which the tick ended in which its guard changed its state, and
+prints it afterwards. That clock is the same in all processes. So neither the network nor a process that observes adds to
+the figure. It begins just before the system is asked to send the signal.
+
+A busy computer may stop the controller for longer than a command lasts. The watchdog then takes over before the kill;
+such an attempt is counted and repeated.
+
+It needs a multicast route:
+
+    unshare -rn sh -c 'ip link set lo up; ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo;
+                       exec python benchmarks/kill_controller.py'
+
+As root, `unshare -n`: the root of `unshare -r` has no right to real-time scheduling.
+"""
+
+import argparse
+import contextlib
+import os
+import queue
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from typing import IO
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.lcm_messages import describe_state
+from dvrk_drake.processes.lcm_network import open_lcm
+from dvrk_drake.processes.pace import make_realtime, settle_memory
+from dvrk_drake.processes.simulated_arm import SimulatedArm, start_pose, stop_on_signals
+from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+
+CONDITIONS = {"alone": 0, "two busy processes": 2}
+#: The controller is killed when its efforts have acted for so long [s].
+ACTING = (0.3, 0.6)
+#: Attempts without a kill before it is given up.
+MOST_TAKEOVERS = 50
+EFFORT = describe_state(lcmt_dvrk_status.STATE_EFFORT)
+HOLD = describe_state(lcmt_dvrk_status.STATE_HOLD)
+
+
+class Arm:
+    """The changes of state that an arm's process prints."""
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._changes: queue.Queue[tuple[int, str]] = queue.Queue()
+        threading.Thread(target=self._read, args=(stream,), daemon=True).start()
+
+    def _read(self, stream: IO[str]) -> None:
+        for line in stream:
+            time_ns, _, state = line.strip().partition(" ")
+            self._changes.put((int(time_ns), state))
+
+    def until(self, state: str, seconds: float, process: subprocess.Popen | None = None) -> tuple[int, str] | None:
+        """The next change to a state that begins so [ns]; None if none comes in time, or `process` ends before."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0 and (process is None or process.poll() is None):
+            with contextlib.suppress(queue.Empty):
+                change = self._changes.get(timeout=min(left, 0.1))
+                if change[1].startswith(state):
+                    return change
+        return None
+
+
+def be_the_arm(name: str, realtime: bool) -> None:
+    """As `dvrk-drake arm`; its changes of state have the time of the monotonic clock [ns]."""
+    arm = load_arm(name)
+    simulated = SimulatedArm(arm, DvrkDriver(), open_lcm().get_lcm_url(), start_pose(arm))
+    stopped = stop_on_signals()
+    if realtime:
+        for warning in make_realtime():
+            print(f"warning: {warning}", file=sys.stderr)
+    settle_memory()
+
+    def tell(line: str) -> None:
+        now = time.monotonic_ns()
+        print(now, line.partition(" s  ")[2], flush=True)
+
+    simulated.run(stopped, tell)
+
+
+@contextlib.contextmanager
+def started(*arguments: str, stdout: int = subprocess.DEVNULL) -> Iterator[subprocess.Popen]:
+    """A Python process of these arguments that ends with the block."""
+    process = subprocess.Popen([sys.executable, *arguments], stdout=stdout, stderr=subprocess.DEVNULL, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def measure(name: str, kills: int, busy: int, realtime: bool) -> tuple[list[float], list[str], int]:
+    """Times from the kill to HOLD [s], why the guard took over, and how often it did so before the kill."""
+    options = ["--realtime"] if realtime else []
+    run = ["-m", "dvrk_drake.cli", "run", "--arm", name, "--mode", "hold", "--reset", *options]
+    times: list[float] = []
+    reasons: list[str] = []
+    before = 0
+    with contextlib.ExitStack() as stack:
+        process = stack.enter_context(
+            started(__file__, "--be-the-arm", "--arm", name, *options, stdout=subprocess.PIPE)
+        )
+        arm = Arm(process.stdout)  # type: ignore[arg-type]
+        for _ in range(busy):
+            stack.enter_context(started("-c", "while True: pass"))
+        while len(times) < kills:
+            with started(*run) as controller:
+                acts = arm.until(EFFORT, 60.0, controller)
+                if acts is None or arm.until(HOLD, random.uniform(*ACTING)):
+                    before += 1
+                    if process.poll() is not None or before > MOST_TAKEOVERS:
+                        raise SystemExit("the controller's efforts do not act for long enough")
+                    continue
+                killed = time.monotonic_ns()
+                controller.kill()
+                held = arm.until(HOLD, 10.0)
+            if held is None:
+                raise SystemExit("the arm does not hold within 10 s")
+            times.append(1e-9 * (held[0] - killed))
+            reasons.append(held[1])
+    return times, reasons, before
+
+
+def main() -> None:
+    """One line per condition."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--kills", type=int, default=10, help="for each line of the table; default: 10")
+    parser.add_argument("--arm", default="mtml", help="default: mtml")
+    parser.add_argument("--condition", choices=CONDITIONS, help="only this one")
+    parser.add_argument("--realtime", action="store_true", help="real-time scheduling of arm and controller")
+    parser.add_argument("--be-the-arm", action="store_true", help="be the arm's process")
+    options = parser.parse_args()
+    if options.be_the_arm:
+        be_the_arm(options.arm, options.realtime)
+        return
+    print(f"load average at the start: {os.getloadavg()[0]:.2f} on {os.cpu_count()} cores")
+    print(f"{options.arm}, {'real-time' if options.realtime else 'normal'} scheduling; kill -9 to HOLD [ms]")
+    print(f"| {'condition':20} | kills | p50 | max | by the wall clock | took over before the kill |")
+    print("|---|---|---|---|---|---|")
+    for condition, busy in CONDITIONS.items():
+        if options.condition in (None, condition):
+            times, reasons, before = measure(options.arm, options.kills, busy, options.realtime)
+            p50, by_wall = sorted(times)[len(times) // 2], sum("wall clock" in reason for reason in reasons)
+            print(
+                f"| {condition:20} | {len(times)} | {1e3 * p50:.1f} | {1e3 * max(times):.1f} | {by_wall} | {before} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
