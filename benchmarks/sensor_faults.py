@@ -39,7 +39,9 @@ def table(name, use, processes, faults):
     with multiprocessing.get_context("fork").Pool(processes, maxtasksperchild=1) as pool:
         outcomes = pool.map(outcome, tasks, chunksize=1)
     print(f"\n{name}, {use}. Movement in rad, of prismatic joints in dm; speed in rad/s or dm/s; effort / limit")
-    print(f"{'fault':18} {'joint':16} {'detected ms':>11} {'moved until':>11} {'after':>7} {'speed':>6} {'effort':>6}  guard")
+    print(
+        f"{'fault':18} {'joint':16} {'detected ms':>11} {'moved until':>11} {'after':>7} {'speed':>6} {'effort':>6}  guard"
+    )
     for (fault, joint), o in zip(tasks, outcomes, strict=True):
         scale = 10.0 if ARM.arm.prismatic[joint] else 1.0
         print(
@@ -47,9 +49,13 @@ def table(name, use, processes, faults):
             f"{scale * o.after:7.3f} {o.speed:6.2f} {o.effort:6.2f}  {o.text}",
             flush=True,
         )
-    late = [o for o, (_, j) in zip(outcomes, tasks, strict=True) if o.before * (10 if ARM.arm.prismatic[j] else 1) > 0.05]
+    late = [
+        o for o, (_, j) in zip(outcomes, tasks, strict=True) if o.before * (10 if ARM.arm.prismatic[j] else 1) > 0.05
+    ]
     found = [o.detected for o in outcomes if np.isfinite(o.detected)]
-    print(f"{len(found)} of {len(tasks)} detected, median {1e3 * np.median(found):.0f} ms; {len(late)} moved more than 0.05")
+    print(
+        f"{len(found)} of {len(tasks)} detected, median {1e3 * np.median(found):.0f} ms; {len(late)} moved more than 0.05"
+    )
 
 
 if __name__ == "__main__":

@@ -95,7 +95,7 @@ class lcmt_dvrk_status(object):
     """ OFF that does not follow a HOLD of the same sender """
     REFUSAL_RESUME = 17
     """ POSITION or EFFORT after the watchdog took over, before an operator resumed; fault_text is why it did """
-    REFUSAL_START_GRAVITY = 21
+    REFUSAL_START_GRAVITY = 18
     """ starting with efforts while the measured effort is not the gravity effort of the pose """
     FLAG_EFFORT_CLAMPED = 1
     """ joint_flags, bits: the commanded effort was beyond the motor's limit """

@@ -125,7 +125,10 @@ class FaultyArm:
         state, effort = (self.sensors.GetOutputPort(port) for port in ("state_measured", "effort_measured"))
         connect(state, self.driver.GetInputPort("state_estimated"))
         connect(effort, self.driver.GetInputPort("effort_measured"))
-        connect(self.driver.GetOutputPort("effort_commanded"), self.station.GetInputPort(f"{arm.name.lower()}.effort_commanded"))
+        connect(
+            self.driver.GetOutputPort("effort_commanded"),
+            self.station.GetInputPort(f"{arm.name.lower()}.effort_commanded"),
+        )
         path = wave(arm, seconds, speed, seed)
         self.start = path.value(0.0).ravel()
         velocity = path.MakeDerivative()

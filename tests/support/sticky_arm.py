@@ -4,8 +4,7 @@ from concurrent.futures import Executor, Future
 
 import numpy as np
 
-from guard_bench import Weightless
-
+from dvrk_drake.dynamics.control_model import ControlModel
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
@@ -92,7 +91,7 @@ class GuardedArm(StickyArm):
 
     def __init__(self, *arguments):
         super().__init__(*arguments)
-        self.guard = CommandGuard(self.arm, 7, Weightless(), GuardSettings(resume_automatically=True))
+        self.guard = CommandGuard(self.arm, 7, ControlModel(self.model), GuardSettings(resume_automatically=True))
         self._step_guard()
 
     def status(self):

@@ -228,8 +228,8 @@ class CommandGuard:
         if problem:
             self.report_fault(problem, lcmt_dvrk_status.FAULT_CLOCK)
         self._measure(measured_utime, q, v, effort)
-        self._watch_period(dt)
         self._expire(utime)
+        self._watch_period(dt)
         if self.state == lcmt_dvrk_status.STATE_EFFORT and (excess := self.limits.beyond(self._q())):
             self.report_fault(excess, lcmt_dvrk_status.FAULT_POSITION_LIMIT)
         if self.state in _REGULATED and (away := self._follower.astray(self._q())):
@@ -343,9 +343,7 @@ class CommandGuard:
         if command.control_mode < 0 or not self.accepted_modes >> command.control_mode & 1:
             return lcmt_dvrk_status.REFUSAL_BAD_MODE
         if command.control_mode in _ACTIVE and self.state != _ACTIVE[command.control_mode]:
-            return self.limits.refusal_to_start(
-                command, self._q(), self._measured.effort, self._plausibility.gravity
-            )
+            return self.limits.refusal_to_start(command, self._q(), self._measured.effort, self._plausibility.gravity)
         return lcmt_dvrk_status.REFUSAL_NONE
 
     def _accept(self, command: lcmt_dvrk_command, utime: int) -> None:

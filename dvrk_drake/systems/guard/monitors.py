@@ -37,35 +37,47 @@ class PeriodMonitor:
         self._slow = (self._slow << 1 | (period > self._slow_period)) & ((1 << _PERIODS) - 1)
         self.fault = ""
         if period > self._longest_period:
-            self.fault = f"the guard was not stepped for {1e3 * period:.0f} ms; allowed are {1e3 * self._longest_period:g}"
+            self.fault = (
+                f"the guard was not stepped for {1e3 * period:.0f} ms; allowed are {1e3 * self._longest_period:g}"
+            )
         elif self._slow.bit_count() > _PERIODS // 2:
             self.fault = f"the guard's period has a median above the allowed {1e3 * self._slow_period:g} ms"
         return self.fault
 
 
 class OscillationMonitor:
-    """RMS of the alternating part of the efforts that the guard commands, with first-order filters.
+    """Reversals of the efforts that the guard commands, counted with a fading memory.
 
-    x = tau - filter(tau),   rms = sqrt(filter(x^2)) <= oscillation * limit
+    The alternating part of an effort is x = tau - filter(tau), with a first-order filter. A reversal is a change of x
+    from above +`oscillation` to below -`oscillation` of the effort limit, or back.
     """
 
     def __init__(self, settings: GuardSettings, arm: Arm) -> None:
         """Monitor for the joints of `arm`."""
         self._scale, self._time = 1.0 / (settings.oscillation * arm.effort_limits), settings.oscillation_time
-        self.restart()
+        self._allowed = settings.oscillation_reversals
+        self._mean: Vector | None = None
 
     def restart(self) -> None:
         """Begins anew."""
-        self._mean: Vector | None = None
+        self._mean = None
 
     def add(self, effort: Vector, dt: float) -> int | None:
         """Adds an effort (n,) [N m, N] that was commanded for `dt` [s]; returns the joint that oscillates, or None."""
         scaled = self._scale * effort
         if self._mean is None:
-            self._mean, self._square = scaled, np.zeros_like(scaled)
+            self._mean = scaled
+            self._side = self._reversals = np.zeros_like(scaled)
             return None
         alternating = scaled - self._mean
         self._mean = self._mean + dt / _MEAN_TIME * alternating
-        self._square = self._square + dt / self._time * (alternating * alternating - self._square)
-        worst = int(self._square.argmax())
-        return worst if self._square[worst] > 1.0 else None
+        self._reversals = (1.0 - dt / self._time) * self._reversals
+        # Rounded to the side on which it is beyond the threshold, or 0 between both.
+        side = np.trunc(alternating)
+        if not side.any():
+            return None
+        side = np.where(side == 0, self._side, np.sign(side))
+        self._reversals = self._reversals + (side * self._side < 0)
+        self._side = side
+        worst = int(self._reversals.argmax())
+        return worst if self._reversals[worst] > self._allowed else None

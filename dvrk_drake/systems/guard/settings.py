@@ -77,8 +77,10 @@ class GuardSettings:
             gravity needs nearly as much or more, a third of it beyond the gravity effort.
         slow_period: largest median of the last 100 periods between two steps of the guard [s].
         longest_period: largest time between two steps of the guard [s].
-        oscillation: RMS of the alternating part of the commanded effort, as a fraction of the effort limit.
-        oscillation_time: time constant of that RMS [s].
+        oscillation: alternating part of the commanded effort that counts as a reversal, as a fraction of the effort
+            limit.
+        oscillation_reversals: number of them, fading with `oscillation_time`, that is allowed.
+        oscillation_time: see oscillation_reversals [s].
         resume_automatically: whether commands may act again after the watchdog took over, without an operator's reset.
         plausibility: tolerances of the checks of measurements.
     """
@@ -98,8 +100,9 @@ class GuardSettings:
     fault_effort: float = field(default=0.3, metadata=within(0.05, 1.0))
     slow_period: float = field(default=0.005, metadata=within(0.001, 0.02, "s"))
     longest_period: float = field(default=0.04, metadata=within(0.005, 1.0, "s"))
-    oscillation: float = field(default=0.45, metadata=within(0.05, 2.0))
-    oscillation_time: float = field(default=1.0, metadata=within(0.1, 10.0, "s"))
+    oscillation: float = field(default=0.4, metadata=within(0.05, 1.0))
+    oscillation_reversals: float = field(default=4.0, metadata=within(1.0, 100.0))
+    oscillation_time: float = field(default=2.0, metadata=within(0.1, 10.0, "s"))
     resume_automatically: bool = False
     plausibility: PlausibilitySettings = field(default_factory=PlausibilitySettings)
 

@@ -26,7 +26,6 @@ def measurement():
     return measured
 
 
-
 def test_a_clock_tells_how_much_time_has_passed():
     measured = Measurement(3, 20_000)
     assert measured.utime is None and measured.q is None
@@ -93,7 +92,6 @@ def test_numbers_below_a_million_are_finite(number, finite):
 
 
 # Streams of commands
-
 
 
 class Stream:
@@ -233,8 +231,9 @@ SETTINGS = {
     "fault_effort": (0.05, 0.3, 1.0),
     "slow_period": (0.001, 0.005, 0.02),
     "longest_period": (0.005, 0.04, 1.0),
-    "oscillation": (0.05, 0.45, 2.0),
-    "oscillation_time": (0.1, 1.0, 10.0),
+    "oscillation": (0.05, 0.4, 1.0),
+    "oscillation_reversals": (1.0, 4.0, 100.0),
+    "oscillation_time": (0.1, 2.0, 10.0),
 }
 PLAUSIBILITY_SETTINGS = {
     "position_tolerance": (0.001, 0.01, 0.1),

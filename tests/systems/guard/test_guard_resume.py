@@ -199,7 +199,9 @@ def test_a_stall_of_the_bridge_expires_what_is_in_force_by_the_wall_clock(mode, 
 
 
 @MODES
-@pytest.mark.parametrize(("milliseconds", "goes_on"), [(20, True), (50, True), (51, False), (200, False), (1000, False)])
+@pytest.mark.parametrize(
+    ("milliseconds", "goes_on"), [(20, True), (50, True), (51, False), (200, False), (1000, False)]
+)
 def test_a_stall_of_the_sender_expires_what_is_in_force_by_the_arms_clock(mode, milliseconds, goes_on):
     bench = WallBench().started(mode)
     bench.run(mode, 1)  # received one tick before the time that the bench has now
