@@ -2,13 +2,13 @@
 
     python benchmarks/kill_controller.py [--kills 10] [--realtime]
 
-It starts the arm of `dvrk-drake arm` and `dvrk-drake run --mode hold`, each as a process, and kills the controller when
-its efforts have acted for 0.3 s to 0.6 s. Then an operator resumes (`run --reset`), and the next kill follows. It does so
-alone, and beside two processes that never wait.
+It starts the arm of `dvrk-drake arm` and `dvrk-drake run --mode hold`, each as a process, and kills the controller
+when its efforts have acted for 0.3 s to 0.6 s. Then an operator resumes (`run --reset`), and the next kill follows. It
+does so alone, and beside two processes that never wait.
 
-The arm's process notes the time by the monotonic clock at which the tick ended in which its guard changed its state, and
-prints it afterwards. That clock is the same in all processes. So neither the network nor a process that observes adds to
-the figure. It begins just before the system is asked to send the signal.
+The arm's process notes the time by the monotonic clock at the end of the tick in which its guard changed its state, and
+prints it afterwards. That clock is the same in all processes. So neither the network nor a process that observes adds
+to the figure. It begins just before the system is asked to send the signal.
 
 A busy computer may stop the controller for longer than a command lasts. The watchdog then takes over before the kill;
 such an attempt is counted and repeated.
@@ -23,6 +23,7 @@ As root, `unshare -n`: the root of `unshare -r` has no right to real-time schedu
 
 import argparse
 import contextlib
+import multiprocessing
 import os
 import queue
 import random
@@ -31,11 +32,15 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from multiprocessing.process import BaseProcess
 from typing import IO
 
+from dvrk_drake import cli
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.lcm_messages import describe_state
+from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.lcm_network import open_lcm
 from dvrk_drake.processes.pace import make_realtime, settle_memory
 from dvrk_drake.processes.simulated_arm import SimulatedArm, start_pose, stop_on_signals
@@ -62,10 +67,10 @@ class Arm:
             time_ns, _, state = line.strip().partition(" ")
             self._changes.put((int(time_ns), state))
 
-    def until(self, state: str, seconds: float, process: subprocess.Popen | None = None) -> tuple[int, str] | None:
+    def until(self, state: str, seconds: float, process: BaseProcess | None = None) -> tuple[int, str] | None:
         """The next change to a state that begins so [ns]; None if none comes in time, or `process` ends before."""
         end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0 and (process is None or process.poll() is None):
+        while (left := end - time.monotonic()) > 0 and (process is None or process.is_alive()):
             with contextlib.suppress(queue.Empty):
                 change = self._changes.get(timeout=min(left, 0.1))
                 if change[1].startswith(state):
@@ -90,6 +95,14 @@ def be_the_arm(name: str, realtime: bool) -> None:
     simulated.run(stopped, tell)
 
 
+def be_the_controller(arguments: list[str]) -> None:
+    """`dvrk-drake` with these arguments, in a process that was forked from one that has compiled the controller."""
+    silence = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silence, 1)
+    os.dup2(silence, 2)
+    sys.exit(cli.main(arguments))
+
+
 @contextlib.contextmanager
 def started(*arguments: str, stdout: int = subprocess.DEVNULL) -> Iterator[subprocess.Popen]:
     """A Python process of these arguments that ends with the block."""
@@ -104,7 +117,8 @@ def started(*arguments: str, stdout: int = subprocess.DEVNULL) -> Iterator[subpr
 def measure(name: str, kills: int, busy: int, realtime: bool) -> tuple[list[float], list[str], int]:
     """Times from the kill to HOLD [s], why the guard took over, and how often it did so before the kill."""
     options = ["--realtime"] if realtime else []
-    run = ["-m", "dvrk_drake.cli", "run", "--arm", name, "--mode", "hold", "--reset", *options]
+    run = ["run", "--arm", name, "--mode", "hold", "--reset", *options]
+    forkserver = multiprocessing.get_context("forkserver")
     times: list[float] = []
     reasons: list[str] = []
     before = 0
@@ -116,20 +130,26 @@ def measure(name: str, kills: int, busy: int, realtime: bool) -> tuple[list[floa
         for _ in range(busy):
             stack.enter_context(started("-c", "while True: pass"))
         while len(times) < kills:
-            with started(*run) as controller:
-                acts = arm.until(EFFORT, 60.0, controller)
-                if acts is None or arm.until(HOLD, random.uniform(*ACTING)):
-                    before += 1
-                    if process.poll() is not None or before > MOST_TAKEOVERS:
-                        raise SystemExit("the controller's efforts do not act for long enough")
-                    continue
-                killed = time.monotonic_ns()
+            controller = forkserver.Process(target=be_the_controller, args=(run,), daemon=True)
+            controller.start()
+            acts = arm.until(EFFORT, 60.0, controller)
+            if acts is None or arm.until(HOLD, random.uniform(*ACTING)):
+                before += 1
+                print("the watchdog took over before the kill", file=sys.stderr, flush=True)
                 controller.kill()
-                held = arm.until(HOLD, 10.0)
+                controller.join()
+                if process.poll() is not None or before > MOST_TAKEOVERS:
+                    raise SystemExit("the controller's efforts do not act for long enough")
+                continue
+            killed = time.monotonic_ns()
+            controller.kill()
+            held = arm.until(HOLD, 10.0)
+            controller.join()
             if held is None:
                 raise SystemExit("the arm does not hold within 10 s")
             times.append(1e-9 * (held[0] - killed))
             reasons.append(held[1])
+            print(f"kill {len(times)}: {1e3 * times[-1]:.1f} ms, {held[1]}", file=sys.stderr, flush=True)
     return times, reasons, before
 
 
@@ -161,3 +181,6 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
+elif __name__ == "__mp_main__":
+    # Once, in the process from which the controllers are forked: it compiles the controller.
+    ArmController(load_arm("mtml"), IdentifiedModel.from_arm(load_arm("mtml")), "hold", 1e-3)

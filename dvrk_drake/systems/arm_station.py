@@ -69,7 +69,9 @@ class ArmStation(Diagram):
 
     **On hardware** the ports of `station_ports` are all there are. Measured values are those of the last DVRK_STATUS
     message, NaN before the first. Efforts go out in DVRK_COMMAND messages every `driver.status_period` and on forced
-    publishing, and the arm's command guard decides what becomes of them; unconnected, the arm is told to hold.
+    publishing, and the arm's command guard decides what becomes of them; unconnected, the arm is told to hold. After
+    the guard's watchdog took over, e.g. because this process was stopped for 50 ms, efforts act again only when an
+    operator resumes: end this process, look at the arm, run `dvrk-drake run --reset`, end that, start this one again.
     """
 
     def __init__(

@@ -162,7 +162,7 @@ def waits_for_an_operator(status):
 @pytest.mark.parametrize("seconds", [0.05, 0.2, 1.0])
 @pytest.mark.parametrize("stalled", ["arm", "controller"])
 def test_a_stall_is_followed_by_a_hold_until_an_operator_resumes(stalled, seconds):
-    """By signals, with the expiry that a real arm has; a stall of 20 ms may be longer, so its test has a simulated clock.
+    """By signals, with the expiry that a real arm has. One of 20 ms may last longer: its test has a simulated clock.
 
     A busy computer may stop one of them before the test does: that has the same end.
     """

@@ -10,7 +10,13 @@ from numpy.typing import ArrayLike
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
-from dvrk_drake.systems.guard.command_stream import CommandInForce, CommandStream, GuardCounts, refusal_by_itself
+from dvrk_drake.systems.guard.command_stream import (
+    CommandInForce,
+    CommandStream,
+    GuardCounts,
+    WallClock,
+    refusal_by_itself,
+)
 from dvrk_drake.systems.guard.follower import Follower, GuardOutput
 from dvrk_drake.systems.guard.limits import GuardLimits, Vector
 from dvrk_drake.systems.guard.measurement import Measurement
@@ -57,9 +63,9 @@ class CommandGuard:
         any --fault--> FAULT --HOLD with reset_fault, changed from false to true--> HOLD
 
     **Expiry**: a command is obeyed until `expiry` after the measurement that it answers (its `status_utime`), whenever
-    it came; who answers one measurement again and again gains no time. Its age is the larger one of two: by the arm's
-    clock, and by the wall clock, where there is one, the time since it came plus its age then. So a command expires
-    also if the arm's clock is late or was stopped. Then the arm holds.
+    it came; who answers one measurement again and again gains no time. The age of the measurement is the larger one of
+    two: by the arm's clock, and by the wall clock if there is one. So a command expires also if the arm's clock is late
+    or was stopped. Then the arm holds.
 
     **Resume**: when a command in force expired, the sender's clock jumped or `_take_over` was called, the watchdog took
     over. The guard then refuses POSITION and EFFORT until an operator resumes, in the way in which a fault is reset;
@@ -90,7 +96,7 @@ class CommandGuard:
     else latches the measured pose; POSITION starts from the held pose; EFFORT starts from the measured effort, and the
     soft wall, for whoever starts inside it, comes on in `start_time`; each at its limited rate.
 
-    **Clocks**: the sender's clock and the arm's are never compared, only how far each went between two commands; so they need
+    **Clocks**: the sender's and the arm's are never compared, only how far each went between two commands; so they need
     not be synchronised, and a jump of either is seen. A jump of the arm's clock forward expires what is in force.
     """
 
@@ -132,7 +138,8 @@ class CommandGuard:
         self.counts = GuardCounts()
         self._modes = tuple(_ACTIVE) if modes is None else modes
         self._expiry = round(1e6 * self.settings.expiry)
-        self._wall_clock, self._stepped = wall_clock, 0
+        self._wall = None if wall_clock is None else WallClock(wall_clock)
+        self._stepped = 0
         self._stream = CommandStream(self._expiry, round(1e6 * self.settings.clock_tolerance))
         self._force = CommandInForce()
         self._powered = True
@@ -223,6 +230,10 @@ class CommandGuard:
             effort: what the motors applied (n,) [N m, N].
         """
         dt, problem = self._measured.advance(utime)
+        if self._wall is not None:
+            if dt < 0:
+                self._wall.forget()
+            self._wall.note(measured_utime, utime - measured_utime)
         if dt < 0:
             self._stream.forget()
         if problem:
@@ -281,8 +292,8 @@ class CommandGuard:
                 self.report_fault(fault, lcmt_dvrk_status.FAULT_IMPLAUSIBLE)
 
     def _watch_period(self, dt: float) -> None:
-        if self._wall_clock is not None:
-            now = self._wall_clock()
+        if self._wall is not None:
+            now = self._wall.now()
             dt, self._stepped = 1e-6 * (now - self._stepped) if self._stepped else 0.0, now
         if self._period.add(dt) and self._is_watched_or_in_force():
             self._take_over(self._period.fault)
@@ -298,7 +309,7 @@ class CommandGuard:
         if not self._is_watched_or_in_force():
             return
         age, clock = utime - self._force.status_utime, "the arm's clock"
-        if self._wall_clock is not None and (by_wall := self._wall_clock() - self._force.wall_utime) > age:
+        if self._wall is not None and (by_wall := self._wall.now() - self._force.wall_utime) > age:
             age, clock = by_wall, "the wall clock"
         if age <= self._expiry:
             return
@@ -353,8 +364,8 @@ class CommandGuard:
         mode, force = command.control_mode, self._force
         goes_on = self.state == lcmt_dvrk_status.STATE_STARTING and mode == force.command.control_mode
         force.take(command)
-        if self._wall_clock is not None:
-            force.wall_utime = self._wall_clock() - (utime - command.status_utime)
+        if self._wall is not None:
+            force.wall_utime = self._wall.time_of(command.status_utime, utime - command.status_utime)
         if mode == lcmt_dvrk_command.OFF:
             self.state, self._powered = lcmt_dvrk_status.STATE_OFF, False
         elif mode == lcmt_dvrk_command.HOLD:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +14,9 @@ from dvrk_drake.systems.guard.limits import Vector
 
 #: No joint is there, that fast or that strong [rad, m, rad/s, m/s, N m, N].
 ABSURD = 1e6
+
+#: The longest expiry, 1 s, has so many measurements at 2 kHz.
+_MOST_MEASUREMENTS = 2000
 
 #: Commands are counted in an int64 of the status; nobody loses as many, but a sequence may jump by more.
 _MOST_LOST = 2**63 - 1
@@ -57,6 +62,33 @@ class GuardCounts:
     lost: int = 0
     refused: int = 0
     expired: int = 0
+
+
+class WallClock:
+    """Time of measurements by a clock that goes on while the process and with it the arm's clock stands still.
+
+    Copies of a guard share it: it notes what happened outside of them.
+    """
+
+    def __init__(self, clock: Callable[[], int]) -> None:
+        """By `clock`, monotonic [us]."""
+        self.now = clock
+        self._times: OrderedDict[int, int] = OrderedDict()
+
+    def note(self, measured_utime: int, age: int) -> None:
+        """Notes a measurement of `measured_utime` on the arm's clock, which is `age` old by it [us]."""
+        self._times.setdefault(measured_utime, self.now() - age)
+        if len(self._times) > _MOST_MEASUREMENTS:
+            self._times.popitem(last=False)
+
+    def time_of(self, measured_utime: int, age: int) -> int:
+        """Time of a measurement [us]; for one that was not noted, `age` by the arm's clock before now [us]."""
+        time = self._times.get(measured_utime)
+        return self.now() - age if time is None else time
+
+    def forget(self) -> None:
+        """Forgets all measurements, for when the arm's clock went back."""
+        self._times.clear()
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""After the watchdog took over: an operator must resume. Expiry by the wall clock: stalls of the bridge and the sender."""
+"""After the watchdog took over an operator must resume. Expiry by the wall clock, in stalls of either side."""
 
 import copy
 
@@ -8,6 +8,7 @@ from guard_bench import MS, Bench, N, Q, modes
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.systems.guard.command_stream import WallClock
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
 
@@ -221,6 +222,47 @@ def test_a_command_that_answers_an_old_measurement_has_that_age_by_the_wall_cloc
     bench.stall(0.001)
     bench.step()
     assert bench.guard.state == Status.STATE_HOLD
+
+
+def test_a_command_that_waited_has_the_age_of_its_measurement_by_the_wall_clock():
+    """As in the socket of a process that was stopped: by the arm's clock it is new."""
+    bench = WallBench().started()
+    answered = bench.utime
+    bench.stall(30)
+    bench.tick()
+    assert bench.send(status_utime=answered) == Status.REFUSAL_NONE
+    bench.stall(19)
+    assert bench.step().control_mode == Command.EFFORT
+    bench.stall(0.001)
+    assert bench.step().control_mode == Command.HOLD
+    assert bench.guard.hold_reason.startswith("the last command expired: 50.0 ms old by the wall clock")
+
+
+def test_measurements_have_a_time_by_the_wall_clock():
+    now = [10**6]
+    clock = WallClock(lambda: now[0])
+    clock.note(5000, 200)
+    now[0] += 3000
+    clock.note(5000, 200)  # the same one again
+    clock.note(8000, 0)
+    assert clock.time_of(5000, 1) == 10**6 - 200
+    assert clock.time_of(8000, 1) == clock.now() == 10**6 + 3000
+    assert clock.time_of(7000, 1500) == clock.now() - 1500  # never noted
+    for utime in range(10_000, 12_000):
+        clock.note(utime, 0)
+    now[0] += 50
+    assert clock.time_of(8000, 7) == clock.now() - 7  # long ago
+    assert clock.time_of(10_000, 7) == clock.now() - 50
+    clock.forget()
+    assert clock.time_of(11_999, 7) == clock.now() - 7
+
+
+def test_a_clock_of_the_arm_that_went_back_has_no_times_of_its_future():
+    bench = WallBench().started()
+    bench.stalled += 10**6
+    bench.utime -= 10**6
+    bench.step()
+    assert bench.guard._wall.time_of(bench.utime + 10**6 - MS, 7) == bench.guard._wall.now() - 7
 
 
 def test_a_stall_while_starting_starts_anew_and_needs_no_resume():
