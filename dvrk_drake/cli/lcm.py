@@ -124,16 +124,20 @@ def _gains(options: argparse.Namespace) -> Gains | None:
     """What --gains names.
 
     Raises:
-        ControllerError: it is no file of gains, or the arm is not to be held.
+        ControllerError: it is no file of gains, they are not for the arm, or the arm is not to be held.
     """
     if options.gains is None:
         return None
     from dvrk_drake.errors import ControllerError
+    from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.gains_file import load_gains
 
     if options.mode == "gravity":
         raise ControllerError("--gains is for --mode hold or damped: in mode gravity the arm is not regulated")
-    return load_gains(options.gains)
+    gains = load_gains(options.gains)
+    if fault := load_arm(options.arm).gains_fault(gains):
+        raise ControllerError(f"{options.gains}: {fault}")
+    return gains
 
 
 def _friction_compensator(options: argparse.Namespace) -> FrictionCompensator | None:

@@ -259,7 +259,8 @@ def _limits_fault(key: str, lower: float, upper: float, slides: bool) -> str:
 def _count_fault(key: str, values: Mapping[str, Sequence[float] | NDArray], joints: Sequence[str]) -> str:
     for name, numbers in values.items():
         if np.shape(numbers) != (len(joints),):
-            return f"{key}{name} has {np.size(numbers)} numbers, one a joint is {len(joints)}: {', '.join(joints)}"
+            count = f"{np.size(numbers)} number{'s' * (np.size(numbers) != 1)}"
+            return f"{key}{name} has {count}; allowed: {len(joints)}, one per joint: {', '.join(joints)}"
     return ""
 
 

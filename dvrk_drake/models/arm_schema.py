@@ -16,8 +16,8 @@ ANGLE_WIDTHS, TRAVEL_WIDTHS = Range(0.01, 25.2, "rad"), Range(0.001, 2.0, "m")
 EFFORTS = Range(0.001, 2000.0, "N m or N")
 #: Positions of which the joint's kind is not known yet: the arm checks them with `ANGLES` or `TRAVELS`.
 _POSITIONS = within(-1e4, 1e4, "rad or m")
-#: Of one joint or actuator in another one's position; the dVRK's are 0.6..1.6.
-COUPLINGS = within(0.01, 100.0, also=(0.0,), either_sign=True)
+#: Of one joint or actuator in the position of another: 0.6..1.6 on a dVRK, 32..48 with the gears of a TX40.
+COUPLINGS = within(0.001, 1000.0, also=(0.0,), either_sign=True)
 #: 9.81 m/s^2 in any direction; `Arm` checks the length of the vector.
 GRAVITIES = within(-30.0, 30.0, "m/s^2")
 _CUT_OFFS = within(0.1, 1000.0, "Hz")

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import re
 import types
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Union, get_args, get_origin, get_type_hints
 
@@ -19,13 +20,13 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, ControllerError, ModelError, ScenarioError, StationError
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.arm_schema import ArmDescription, CoupledLimit, Gains, Instrument, Mechanism
+from dvrk_drake.models.arm_schema import ANGLES, EFFORTS, ArmDescription, CoupledLimit, Gains, Instrument, Mechanism
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, FrictionEffect
 from dvrk_drake.models.gains_file import load_gains
 from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.pose_file import PoseFile
 from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, schema_fault, within
-from dvrk_drake.models.sdf_model import MODELS_FOLDER
+from dvrk_drake.models.sdf_model import _RANGES, MODELS_FOLDER
 from dvrk_drake.processes.collector import CollectionSettings
 from dvrk_drake.processes.simulated_arm import load_driver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
@@ -353,8 +354,8 @@ def test_other_numbers_of_an_arm_made_in_python_are_refused():
     for changes, message in (
         ({"coupled_limits": (never,)}, r"coupled_limits\.never: coefficients are all 0"),
         ({"coupled_limits": (dataclasses.replace(never, coefficients={"outer_yaw": math.nan}),)}, "is nan; allowed"),
-        ({"effort_limits": arm.effort_limits[:6]}, "effort_limits has 6 numbers, one a joint is 7"),
-        ({"gains": Gains([1.0], [1.0], [1.0])}, r"gains\.kp has 1 numbers, one a joint is 7"),
+        ({"effort_limits": arm.effort_limits[:6]}, "effort_limits has 6 numbers; allowed: 7, one per joint"),
+        ({"gains": Gains([1.0], [1.0], [1.0])}, r"gains\.kp has 1 number; allowed: 7, one per joint"),
         ({"effects": ArmEffects(stretch={"outer_yaw": Cable()})}, r"effects\.stretch\.outer_yaw\.stiffness is 0; all"),
         ({"effects": ArmEffects(friction=[FrictionEffect(coefficient=math.nan)])}, r"coefficient is nan; allowed: "),
         ({"friction_coordinates": {"nothing": np.zeros(7)}}, r"friction_coordinates\.nothing has no coefficient"),
@@ -401,3 +402,20 @@ def test_the_first_number_in_an_object_that_is_refused_is_named():
 def test_the_examples_are_inside_the_ranges(path):
     content = yaml.safe_load(path.read_text())
     assert schema_fault(Study if "scenario" in content else Scenario, content, "a test") == ""
+
+
+@pytest.mark.parametrize("name", ["ur10e", "tx40"])
+def test_industrial_arms_are_inside_the_ranges_of_an_sdf(name, shared_data):
+    root = ElementTree.parse(shared_data / "other_robots" / name / f"{name}.urdf").getroot()
+    found = 0
+    for element in root.iter():
+        numbers = {key: value for key, value in element.attrib.items() if re.fullmatch(r"[-\d.e ]+", value)}
+        for key, value in numbers.items():
+            tag = {"value": "mass", "xyz": "pose"}.get(key, key)
+            if tag in _RANGES and element.tag != "axis":
+                found += 1
+                assert not any(_RANGES[tag].fault(key, float(word)) for word in value.split())
+        if element.tag == "limit":
+            assert float(element.get("effort")) in EFFORTS
+            assert float(element.get("lower")) in ANGLES and float(element.get("upper")) in ANGLES
+    assert found > 60

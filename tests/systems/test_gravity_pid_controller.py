@@ -268,7 +268,7 @@ def test_trust_scales_the_gravity():
         ({"mode": "float"}, 'unknown mode "float"; known modes: hold, gravity'),
         ({"effort_limits": [1.0] * 6}, "effort_limits must be 7 positive numbers"),
         ({"effort_limits": [np.nan] * 7}, "effort_limits must be 7 positive numbers"),
-        ({"gains": Gains(kp=[1.0], kd=[1.0] * 7, ki=[1.0] * 7)}, "gains.kp has 1 numbers, one a joint is 7"),
+        ({"gains": Gains(kp=[1.0], kd=[1.0] * 7, ki=[1.0] * 7)}, r"gains\.kp has 1 number; allowed: 7, one per joint"),
         (
             {"gains": Gains(kp=[1.0] * 7, kd=[-1.0] * 7, ki=[1.0] * 7)},
             r"gains\.kd\[0\] is -1; allowed: 0 or ",

@@ -240,7 +240,7 @@ def test_model_file_round_trip_and_refusals(arm, tmp_path):
             text.replace("model 2", "model 1").replace("\neffects:", "\njoint_effects:"),
             'model 1", this version reads "dvrk_drake identified model 2"; identify anew',
         ),
-        (text.replace("trust: 1.0", "trust: 2.0"), r"joints\[0\]\.trust is 2; allowed: 0\.\.1"),
+        (text.replace("trust: 1.0", "trust: 2.0"), r"joints\[1\]\.trust is 2; allowed: 0\.\.1"),
         (text.replace("arm: mtmr", "arms: mtmr"), 'key "arms" is unknown; did you mean "arm"'),
         ("]", "not YAML: line 1"),
     ):
