@@ -2,8 +2,8 @@
 
     python benchmarks/sensor_faults.py [--arms mtml psm] [--uses effort gravity position hold] [--processes 2]
 
-Each fault of tests/support/faulty_arm.py begins on each joint of a simulated arm with all effects of its file, while the
-joints move at up to 0.5 rad/s (50 mm/s) under effort or position commands, or stand. One line per fault and joint.
+Each fault of tests/support/faulty_arm.py begins on each joint of a simulated arm with all effects of its file, while
+the joints move at up to 0.5 rad/s (50 mm/s) under effort or position commands, or stand.
 """
 
 from __future__ import annotations
@@ -17,48 +17,50 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
-from faulty_arm import FAULTS, FaultyArm
+from faulty_arm import FAULTS, PERIOD, FaultyArm
 
 #: When the fault begins [s]: all joints move then.
 BEGIN = 2.6
 
 
-def outcome(task):
-    fault, joint = task
-    return ARM.fail(fault, joint, BEGIN)
+class Table:
+    """Outcomes of all faults on all joints of one arm in one use."""
 
+    def __init__(self, name, use, faults):
+        self.arm = FaultyArm(name, use)
+        self.title = f"{name}, {use}"
+        self.tasks = [(fault, joint) for fault in faults for joint in range(self.arm.arm.num_joints)]
+        while self.arm.ticks * PERIOD < BEGIN:
+            self.arm.step()
 
-def table(name, use, processes, faults):
-    """Prints the table of one arm in one use."""
-    global ARM
-    ARM = FaultyArm(name, use)
-    while ARM.ticks * 1e-3 < BEGIN:
-        ARM.step()
-    tasks = [(fault, joint) for fault in faults for joint in range(ARM.arm.num_joints)]
-    # A process of its own for each fault: it starts as a copy of the arm that moves.
-    with multiprocessing.get_context("fork").Pool(processes, maxtasksperchild=1) as pool:
-        outcomes = pool.map(outcome, tasks, chunksize=1)
-    print(f"\n{name}, {use}. Movement in rad, of prismatic joints in dm; speed in rad/s or dm/s; effort / limit")
-    print(
-        f"{'fault':18} {'joint':16} {'detected ms':>11} {'moved until':>11} {'after':>7} {'speed':>6} {'effort':>6}  guard"
-    )
-    for (fault, joint), o in zip(tasks, outcomes, strict=True):
-        scale = 10.0 if ARM.arm.prismatic[joint] else 1.0
+    def outcome(self, task):
+        """Outcome of one (fault, joint); for a process of its own, which is a copy of the arm that moves."""
+        return self.arm.fail(*task, BEGIN)
+
+    def print(self, outcomes):
+        """Prints a line for each fault and joint, and the counts."""
+        arm = self.arm.arm
+        print(f"\n{self.title}. Movement in rad, of prismatic joints in dm; speed in rad/s, dm/s; effort / limit")
+        columns = f"{'detected ms':>11} {'moved until':>11} {'after':>7} {'speed':>6} {'effort':>6}  guard"
+        print(f"{'fault':18} {'joint':16} {columns}")
+        far = 0
+        for (fault, joint), o in zip(self.tasks, outcomes, strict=True):
+            scale = 10.0 if arm.prismatic[joint] else 1.0
+            far += scale * o.before > 0.05
+            print(
+                f"{fault:18} {arm.joint_names[joint]:16} {1e3 * o.detected:11.0f} {scale * o.before:11.3f} "
+                f"{scale * o.after:7.3f} {o.speed:6.2f} {o.effort:6.2f}  {o.text}"
+            )
+        times = [1e3 * o.detected for o in outcomes if np.isfinite(o.detected)]
         print(
-            f"{fault:18} {ARM.arm.joint_names[joint]:16} {1e3 * o.detected:11.0f} {scale * o.before:11.3f} "
-            f"{scale * o.after:7.3f} {o.speed:6.2f} {o.effort:6.2f}  {o.text}",
+            f"{len(times)} of {len(self.tasks)} detected, after {np.median(times):.0f} ms (median); "
+            f"{far} moved more than 0.05 before",
             flush=True,
         )
-    late = [
-        o for o, (_, j) in zip(outcomes, tasks, strict=True) if o.before * (10 if ARM.arm.prismatic[j] else 1) > 0.05
-    ]
-    found = [o.detected for o in outcomes if np.isfinite(o.detected)]
-    print(
-        f"{len(found)} of {len(tasks)} detected, median {1e3 * np.median(found):.0f} ms; {len(late)} moved more than 0.05"
-    )
 
 
-if __name__ == "__main__":
+def main():
+    """Prints the tables."""
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("--arms", nargs="+", default=["mtml", "psm"])
     parser.add_argument("--uses", nargs="+", default=["effort", "gravity", "position", "hold"])
@@ -67,4 +69,20 @@ if __name__ == "__main__":
     arguments = parser.parse_args()
     for arm in arguments.arms:
         for use in arguments.uses:
-            table(arm, use, arguments.processes, arguments.faults)
+            table = Table(arm, use, arguments.faults)
+            TABLES.append(table)
+            with multiprocessing.get_context("fork").Pool(arguments.processes, maxtasksperchild=1) as pool:
+                table.print(pool.map(newest_outcome, table.tasks, chunksize=1))
+
+
+#: The tables so far; a forked process takes the newest one.
+TABLES = []
+
+
+def newest_outcome(task):
+    """Outcome of a task of the newest table."""
+    return TABLES[-1].outcome(task)
+
+
+if __name__ == "__main__":
+    main()

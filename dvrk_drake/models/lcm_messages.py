@@ -37,7 +37,7 @@ _REFUSALS = {
     lcmt_dvrk_status.REFUSAL_OTHER_SENDER: "from a second sender",
     lcmt_dvrk_status.REFUSAL_SUDDEN_OFF: "off without a hold before",
     lcmt_dvrk_status.REFUSAL_RESUME: "before an operator resumed",
-    lcmt_dvrk_status.REFUSAL_START_GRAVITY: "starting while the measured efforts are not the gravity effort of the model",
+    lcmt_dvrk_status.REFUSAL_START_GRAVITY: "starting while the measured effort is not the gravity effort",
 }
 
 

@@ -1,4 +1,4 @@
-"""A simulated arm with real sensors whose measurements can fail, behind its driver, under a controller that moves it."""
+"""A simulated arm with real sensors whose measurements can fail, behind its driver, and a controller that moves it."""
 
 from dataclasses import dataclass
 
@@ -20,8 +20,8 @@ PERIOD = 1e-3
 #: Time for which the desired pose rests at first, while the guard watches the controller [s].
 _AT_REST = 0.8
 
-#: Sensor faults of one joint: (q, v, effort, q when it began, time since then, scale) -> what is measured. The scale is 1
-#: on a joint that turns [rad] and 0.1 on one that slides [m].
+#: Sensor faults of one joint: (q, v, effort, q when it began, time since then, scale) -> what is measured. The scale is
+#: 1 on a joint that turns [rad] and 0.1 on one that slides [m].
 FAULTS = {
     "encoder stuck": lambda q, v, effort, q0, t, scale: (q0, 0.0, effort),
     "position stuck": lambda q, v, effort, q0, t, scale: (q0, v, effort),
@@ -76,8 +76,7 @@ def wave(arm, seconds, speed, seed=0):
     amplitude = np.minimum(0.35 * half, speed * arm.per_joint(1.0, 0.1) / omega)
     fade = np.clip((times - _AT_REST) / 1.5, 0.0, 1.0)
     q = middle + (fade**2 * (3 - 2 * fade))[:, None] * amplitude * np.sin(np.outer(times, omega))
-    path = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times, q.T, True)
-    return path
+    return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times, q.T, True)
 
 
 @dataclass
@@ -110,7 +109,6 @@ class FaultyArm:
     def __init__(self, name, use, *, speed=0.5, effects=True, driver=None, seconds=8.0, seed=0):
         """use: "effort" (PID and gravity along a path), "gravity" (gravity compensation), "position", or "hold"."""
         self.arm = arm = load_arm(name)
-        n = arm.num_joints
         known = arm.effects.cables + arm.effects.springs if effects else []
         model = IdentifiedModel.from_arm(arm, known)
         builder = DiagramBuilder()
@@ -119,9 +117,8 @@ class FaultyArm:
         self.driver = builder.AddSystem(SimDvrkDriver(arm, driver or DvrkDriver(), model=model))
         self.sensors = builder.AddSystem(FaultySensors(arm))
         connect = builder.Connect
-        station = lambda port: self.station.GetOutputPort(f"{arm.name.lower()}.{port}")
-        connect(station("state_estimated"), self.sensors.GetInputPort("state"))
-        connect(station("effort_measured"), self.sensors.GetInputPort("effort"))
+        for port, measured in (("state", "state_estimated"), ("effort", "effort_measured")):
+            connect(self.station.GetOutputPort(f"{arm.name.lower()}.{measured}"), self.sensors.GetInputPort(port))
         state, effort = (self.sensors.GetOutputPort(port) for port in ("state_measured", "effort_measured"))
         connect(state, self.driver.GetInputPort("state_estimated"))
         connect(effort, self.driver.GetInputPort("effort_measured"))

@@ -60,8 +60,9 @@ class Bench:
     Its checks of measurements and of its own period are off unless the test is about them.
     """
 
-    def __init__(self, arm=ARM, *, q=Q, model=Weightless(), checks=False, **arguments):
+    def __init__(self, arm=ARM, *, q=Q, model=None, checks=False, **arguments):
         self.arm = arm
+        model = model or Weightless()
         self.guard = CommandGuard(arm, SESSION, model, **arguments)
         if not checks:
             settings = self.guard.settings

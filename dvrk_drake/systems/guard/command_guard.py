@@ -283,13 +283,15 @@ class CommandGuard:
                 self._take_over(problem)
             return
         if first:
-            self._follower.latch(measured.q, np.zeros(self.num_joints))  # it stands so far
+            self._follower.latch(self._q(), np.zeros(self.num_joints))  # it stands so far
         if not self._powered:
             plausibility.restart()
         commanded = self.output.effort if self.state == lcmt_dvrk_status.STATE_EFFORT else None
-        if measured.dt > 0 or first:
-            if fault := plausibility.check(measured.dt, measured.q, measured.v, measured.effort, commanded):
-                self.report_fault(fault, lcmt_dvrk_status.FAULT_IMPLAUSIBLE)
+        if measured.dt == 0 and not first:
+            return  # the same measurement again
+        fault = plausibility.check(measured.dt, self._q(), measured.v, measured.effort, commanded)
+        if fault:
+            self.report_fault(fault, lcmt_dvrk_status.FAULT_IMPLAUSIBLE)
 
     def _watch_period(self, dt: float) -> None:
         if self._wall is not None:

@@ -1,4 +1,4 @@
-"""Plausibility checks of measurements that are finite and fresh but may be wrong: stuck, jumping, inconsistent sensors."""
+"""Plausibility checks of measurements that are finite and fresh but may be wrong: stuck, jumping, inconsistent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: The mass matrix is evaluated again after this time [s]: it changes slowly, and one evaluation costs as much as a tick.
+#: The mass matrix is evaluated again after this time [s]: it changes slowly, and evaluating it costs as much as a tick.
 _MASS_MATRIX_PERIOD = 0.05
 
 #: Encoder counts by which measured positions may deviate beyond the tolerances.
@@ -272,8 +272,8 @@ class Plausibility:
             sample = Sample(dt, q, v, q - q_before, fastest, effort, effort - self.gravity, commanded)
             states = []
             for check, state in zip(self._checks, self._states, strict=True):
-                state, joints = check.check(sample, state)
-                states.append(state)
+                next_state, joints = check.check(sample, state)
+                states.append(next_state)
                 if joints.any():
                     self._find(check, joints)
             self._states = states

@@ -24,7 +24,7 @@ class PlausibilitySettings:
         frozen_speed: at which a joint takes the time that it is given to move by an encoder count [rad/s, m/s].
         response: effort that the motion does not explain, as a fraction of the effort limit.
         response_time: time constant of the filters of effort and acceleration [s].
-        response_memory: time constant with which unexplained effort that lasts is accepted as an error of the model [s].
+        response_memory: time constant with which unexplained effort that lasts is taken as an error of the model [s].
         start_gravity: difference of measured effort and gravity effort at which efforts may start, as a fraction of the
             effort limit.
         silent_effort: commanded effort that must show in the measured one, as a fraction of the effort limit.

@@ -4,7 +4,7 @@ import copy
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, MS, Bench, N, Q, modes, Weightless
+from guard_bench import ARM, LIMIT, MS, Bench, N, Q, Weightless, modes
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status

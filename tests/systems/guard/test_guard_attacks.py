@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, MS, SESSION, Bench, N, Q, modes, Weightless
+from guard_bench import ARM, LIMIT, MS, SESSION, Bench, N, Q, Weightless, modes
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
