@@ -159,9 +159,10 @@ class Response:
 
     text, about_position = "the motion does not follow from the effort", True
 
-    def __init__(self, settings: PlausibilitySettings, effort_limits: Vector, model: ArmModel) -> None:
-        """Check for joints with effort limits (n,) [N m, N]."""
-        self._allowed, self._time = settings.response * effort_limits, settings.response_time
+    def __init__(self, settings: PlausibilitySettings, arm: Arm, model: ArmModel) -> None:
+        """Check for the joints of `arm` with a model of it."""
+        hand_effort = arm.per_joint(settings.hand_effort, 10 * settings.hand_effort)
+        self._allowed, self._time = settings.response * arm.effort_limits + hand_effort, settings.response_time
         self._memory, self._model = settings.response_memory, model
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector, Vector, NDArray[np.float64], float]:
@@ -236,7 +237,7 @@ class Plausibility:
             PositionJump(settings, tolerance, speed_limit),
             VelocityConsistency(settings, tolerance),
             FrozenPosition(settings, arm.effort_limits, counts),
-            Response(settings, arm.effort_limits, model),
+            Response(settings, arm, model),
             SilentEffort(settings, arm.effort_limits),
         )
         self._none = np.zeros(arm.num_joints, bool)

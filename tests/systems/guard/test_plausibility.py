@@ -1,0 +1,231 @@
+"""Each plausibility check: what it finds after which time, and what it must not find."""
+
+import numpy as np
+import pytest
+from guard_bench import ARM, LIMIT, Bench, Heavy, N, Q, Weightless
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.systems.guard.limits import GuardLimits
+from dvrk_drake.systems.guard.plausibility import Plausibility
+from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
+
+PSM = load_arm("psm")
+MS = 1e-3
+SETTINGS = PlausibilitySettings()
+COUNTS = np.abs(ARM.transmission.inverse().matrix) @ [ARM.effects.encoder.resolution[name] for name in ARM.joint_names]
+TOLERANCE = SETTINGS.position_tolerance + 3 * COUNTS
+JOINTS = range(N)
+
+
+class Unity(Weightless):
+    """A model with unit inertia in all joints."""
+
+    def mass_matrix(self, q):
+        return np.eye(len(q))
+
+
+class Sensors:
+    """An arm that moves as the test says, and the checks of what is measured."""
+
+    def __init__(self, arm=ARM, model=None):
+        self.checks = Plausibility(arm, model or Weightless(), SETTINGS, GuardLimits(arm, GuardSettings()).speed)
+        self.q = 0.5 * (arm.position_lower + arm.position_upper)
+        self.v = np.zeros(arm.num_joints)
+        self.effort, self.commanded = np.zeros(arm.num_joints), None
+        self.measure()
+
+    def measure(self, q=None, v=None, dt=MS):
+        q, v = self.q if q is None else q, self.v if v is None else v
+        return self.checks.check(dt, np.array(q), np.array(v), np.array(self.effort), self.commanded)
+
+    def move(self, v, *, ticks=1, measured_q=None, measured_v=None):
+        """Moves at v (n,) and returns the first fault with the ticks until it, or ("", ticks)."""
+        self.v = np.array(v, float)
+        for k in range(ticks):
+            self.q = self.q + MS * self.v
+            q = self.q if measured_q is None else measured_q(self.q)
+            v_measured = self.v if measured_v is None else measured_v(self.v)
+            if fault := self.measure(q, v_measured):
+                return fault, k + 1
+        return "", ticks
+
+
+def unit(joint, size=1.0):
+    return size * np.eye(N)[joint]
+
+
+@pytest.mark.parametrize("joint", JOINTS)
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_position_jumps_beyond_its_tolerance_only(joint, side):
+    for factor, found in ((0.99, False), (1.01, True)):
+        sensors = Sensors()
+        sensors.move(np.zeros(N), ticks=10)
+        before = sensors.q.copy()
+        sensors.q = sensors.q + unit(joint, side * factor * TOLERANCE[joint])
+        fault = sensors.measure()
+        assert (f"{ARM.joint_names[joint]}: the position jumps" == fault) == found
+        np.testing.assert_array_equal(sensors.checks.invalid, unit(joint).astype(bool) & found)
+        if found:
+            np.testing.assert_array_equal(sensors.checks.last_valid, before * unit(joint))
+
+
+def test_a_jump_is_found_however_fast_the_joint_seems_to_be():
+    """A velocity that is the difference of positions makes no jump plausible."""
+    sensors = Sensors()
+    v = unit(0, 0.3 / MS)
+    assert "jumps" in sensors.move(v)[0]
+
+
+def test_a_late_measurement_may_have_moved_on():
+    sensors = Sensors()
+    v = unit(0, 3.0)
+    sensors.move(0.5 * v, ticks=5)
+    sensors.q, sensors.v = sensors.q + 0.015 * v, v
+    assert sensors.measure(dt=0.010) == ""  # 5 ms of jitter
+
+
+@pytest.mark.parametrize("joint", JOINTS)
+@pytest.mark.parametrize("speed", [-1.0, 0.5, 2.0])
+@pytest.mark.parametrize(("measured", "relative"), [("stuck", 1.0), ("inverted", 2.0), ("zero", 1.0), ("double", 1.0)])
+def test_a_velocity_that_disagrees_with_the_position_is_found_in_time(joint, speed, measured, relative):
+    sensors = Sensors()
+    v, q0 = unit(joint, speed), sensors.q.copy()
+    q = (lambda q: q0) if measured == "stuck" else None
+    factor = {"stuck": 1.0, "inverted": -1.0, "zero": 0.0, "double": 2.0}[measured]
+    fault, ticks = sensors.move(v, ticks=1000, measured_q=q, measured_v=lambda v: factor * v)
+    assert fault == f"{ARM.joint_names[joint]}: position and velocity disagree"
+    # The difference grows at `relative` times the speed, and fades with the time constant T.
+    seen = abs(factor * speed)
+    allowed = TOLERANCE[joint] + SETTINGS.velocity_delay * seen
+    T = SETTINGS.velocity_memory
+    expected = -T * np.log(1 - allowed / (relative * abs(speed) * T))
+    assert MS * ticks == pytest.approx(expected, abs=4 * MS)
+
+
+def test_a_velocity_with_the_delay_of_a_filter_is_plausible():
+    """A first-order filter of 30 Hz, as in the arm files, at full acceleration from rest to the speed limit and back."""
+    sensors = Sensors()
+    limit = GuardLimits(ARM, GuardSettings()).speed
+    filtered = np.zeros(N)
+    for k in range(600):
+        v = 0.4 * limit * np.sin(2 * np.pi * k * MS / 0.3)
+        sensors.q, filtered = sensors.q + MS * v, filtered + MS / 0.0053 * (v - filtered)
+        assert sensors.measure(v=filtered) == ""
+
+
+@pytest.mark.parametrize("joint", JOINTS)
+def test_a_position_that_stays_the_same_under_a_changing_effort_is_frozen(joint):
+    time = SETTINGS.frozen_time + COUNTS[joint] / SETTINGS.frozen_speed
+    for factor, found in ((0.99, False), (1.01, True)):
+        sensors = Sensors()
+        sensors.move(np.zeros(N), ticks=1000)  # it may stand as long as it wishes
+        sensors.q = sensors.q + unit(joint, COUNTS[joint])
+        sensors.measure()
+        sensors.effort = unit(joint, factor * SETTINGS.frozen_effort * LIMIT[joint])
+        fault, ticks = sensors.move(np.zeros(N), ticks=500)
+        assert ("does not change although" in fault) == found
+        if found:
+            assert fault.startswith(ARM.joint_names[joint])
+            assert MS * ticks == pytest.approx(time, abs=1.5 * MS)
+
+
+def test_a_joint_that_presses_on_something_and_gives_way_by_a_count_is_not_frozen():
+    sensors = Sensors()
+    start = sensors.q.copy()
+    for k in range(1000):
+        sensors.effort = 0.9 * LIMIT * np.sin(0.005 * k)
+        sensors.q = start + COUNTS * np.round(2.4 * np.sin(0.005 * k))
+        assert sensors.measure() == ""
+
+
+def test_gravity_of_joints_that_move_does_not_make_the_others_frozen():
+    """The effort follows the gravity effort, which changes with the other joints' positions."""
+    sensors = Sensors(model=Heavy())
+    v = np.where(np.arange(N) < 3, 0.0, 0.5)
+    for _ in range(1000):
+        sensors.q = sensors.q + MS * v
+        sensors.effort = Heavy().gravity_effort(sensors.q)
+        assert sensors.measure(v=v) == ""
+
+
+@pytest.mark.parametrize("joint", JOINTS)
+def test_a_motion_that_does_not_follow_from_the_effort_is_found(joint):
+    """Unit inertia: an effort of its limit that accelerates the joint the other way, as with an inverted encoder."""
+    strong = SETTINGS.hand_effort < 0.1 * LIMIT[joint]  # what a hand can do hides it on the others
+    for sign, found in ((1, False), (-1, strong)):
+        sensors = Sensors(model=Unity())
+        sensors.effort = unit(joint, LIMIT[joint])
+        fault = ""
+        for _ in range(100):
+            sensors.v = sensors.v + sign * MS * sensors.effort
+            sensors.q = sensors.q + MS * sensors.v
+            fault = fault or sensors.measure()
+        assert (fault == f"{ARM.joint_names[joint]}: the motion does not follow from the effort") == found
+
+
+def test_an_error_of_the_model_that_grows_slowly_is_accepted():
+    sensors = Sensors()
+    v = COUNTS / MS  # a count at each tick, so that nothing looks frozen
+    for k in range(2000):
+        sensors.effort = 3 * LIMIT * min(k / 1000, 1.0)
+        assert sensors.move(v, ticks=1)[0] == ""
+
+
+@pytest.mark.parametrize("joint", JOINTS)
+@pytest.mark.parametrize("measured", [0.0, -0.5])
+def test_a_commanded_effort_that_does_not_show_is_a_fault_of_the_effort(joint, measured):
+    for commanded, found in ((0.29, False), (0.31, True), (-0.31, True)):
+        sensors = Sensors()
+        sensors.commanded = unit(joint, commanded * LIMIT[joint])
+        sensors.effort = measured * sensors.commanded
+        fault, ticks = sensors.move(np.zeros(N), ticks=100)
+        text = f"{ARM.joint_names[joint]}: the measured effort does not show the commanded one"
+        assert (fault == text) == found
+        assert not sensors.checks.invalid.any()  # its position is valid
+        if found:
+            assert MS * ticks == pytest.approx(SETTINGS.silent_time, abs=1.5 * MS)
+
+
+def test_an_effort_that_follows_late_is_shown():
+    sensors = Sensors()
+    for k in range(500):
+        sensors.commanded = 0.9 * LIMIT * np.sin(0.02 * k)
+        sensors.effort = 0.9 * LIMIT * np.sin(0.02 * (k - 5))
+        assert sensors.move(COUNTS / MS)[0] == ""
+
+
+def test_prismatic_joints_have_a_tenth_of_the_tolerance():
+    checks = Sensors(PSM)
+    checks.q = checks.q + 0.0012 * np.eye(7)[2]
+    assert checks.measure() == f"{PSM.joint_names[2]}: the position jumps"
+
+
+# In the guard
+
+
+@pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])
+@pytest.mark.parametrize("joint", JOINTS)
+def test_a_joint_without_a_valid_position_keeps_its_gravity_effort_and_the_others_are_held(mode, joint):
+    bench = Bench(model=Heavy(), checks=True).at_rest()
+    bench.run(mode, 300)
+    bench.q = Q + unit(joint, 0.3)
+    output = bench.tick()
+    assert bench.guard.fault_code == Status.FAULT_IMPLAUSIBLE
+    assert (bench.guard.fault_text, output.control_mode) == (
+        f"{ARM.joint_names[joint]}: the position jumps",
+        Command.EFFORT,
+    )
+    np.testing.assert_array_equal(output.joint_flags & Status.FLAG_IMPLAUSIBLE != 0, unit(joint).astype(bool))
+    gravity = Heavy().gravity_effort(Q)
+    np.testing.assert_allclose(output.effort, gravity, rtol=0, atol=1e-12)
+    # The others are held by springs and dampers, within 0.3 of their limits; this one has no feedback, wherever it goes.
+    kp, others = np.array(ARM.gains.kp), np.arange(N) != joint
+    for away in (1e-3, -1e-3, 9e-3):
+        bench.q = Q + unit(joint, 0.3) + away
+        effort = bench.tick().effort
+        assert effort[joint] == pytest.approx(gravity[joint], abs=1e-12)
+        moved = Heavy().gravity_effort(np.where(others, bench.q, Q))
+        expected = np.clip(moved - kp * away, -0.3 * LIMIT, 0.3 * LIMIT)
+        np.testing.assert_allclose(effort[others], expected[others], rtol=0, atol=1e-9)
