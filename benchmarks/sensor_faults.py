@@ -1,6 +1,6 @@
 """How soon the guard detects wrong sensor data, and what the arm does until then and afterwards.
 
-    python benchmarks/sensor_faults.py [--arms mtml psm] [--uses effort gravity position hold] [--processes 2]
+    python benchmarks/sensor_faults.py [--arms mtml psm] [--uses effort position hold] [--processes 2]
 
 Each fault of tests/support/faulty_arm.py begins on each joint of a simulated arm with all effects of its file, while
 the joints move at up to 0.5 rad/s (50 mm/s) under effort or position commands, or stand.
@@ -63,7 +63,7 @@ def main():
     """Prints the tables."""
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("--arms", nargs="+", default=["mtml", "psm"])
-    parser.add_argument("--uses", nargs="+", default=["effort", "gravity", "position", "hold"])
+    parser.add_argument("--uses", nargs="+", default=["effort", "position", "hold"])
     parser.add_argument("--faults", nargs="+", default=list(FAULTS))
     parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()

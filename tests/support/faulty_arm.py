@@ -12,6 +12,8 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.hand import Hand
+from dvrk_drake.systems.hand_path import HandPath
 from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import SimDvrkDriver
@@ -60,11 +62,11 @@ class FaultySensors(LeafSystem):
         return state, effort
 
 
-def wave(arm, seconds, speed, seed=0):
+def wave(arm, seconds, speed, seed=0, reach=0.35):
     """A smooth motion (2n: q, then v) of all joints about the middle of their ranges, that begins at rest.
 
-    Joints swing as far as 0.35 of their range and as fast as `speed` (a tenth of it if they slide) allow, each at a
-    frequency of its own.
+    Joints swing as far to each side as `reach` of half of their range and as fast as `speed` (a tenth of it if they
+    slide) allow, each at a frequency of its own.
     """
     times = np.arange(0.0, seconds + 0.1, 0.02)
     middle, half = 0.5 * (arm.position_upper + arm.position_lower), 0.5 * (arm.position_upper - arm.position_lower)
@@ -73,7 +75,7 @@ def wave(arm, seconds, speed, seed=0):
         middle = middle + row / (row @ row) * (0.5 * (limit.lower + limit.upper) - row @ middle)
         half = np.where(row != 0, np.minimum(half, 0.5 * (limit.upper - limit.lower)), half)
     omega = np.random.default_rng(seed).uniform(1.0, 2.5, arm.num_joints)
-    amplitude = np.minimum(0.35 * half, speed * arm.per_joint(1.0, 0.1) / omega)
+    amplitude = np.minimum(reach * half, speed * arm.per_joint(1.0, 0.1) / omega)
     fade = np.clip((times - _AT_REST) / 1.5, 0.0, 1.0)
     q = middle + (fade**2 * (3 - 2 * fade))[:, None] * amplitude * np.sin(np.outer(times, omega))
     return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times, q.T, True)
@@ -104,10 +106,20 @@ class FaultyArm:
 
     Attributes:
         sensors: whose measurements can be made to fail.
+        desired: time -> desired state (2n) of the arm under "effort" and "position".
+        lead: status, time -> the same for `ArmController.answer`.
+        controller: the ArmController, or None.
     """
 
-    def __init__(self, name, use, *, speed=0.5, effects=True, driver=None, seconds=8.0, seed=0):
-        """use: "effort" (PID and gravity along a path), "gravity" (gravity compensation), "position", or "hold"."""
+    def __init__(self, name, use, *, path=None, hand=False, effects=True, driver=None, seed=0):
+        """An arm at rest at the start of its path.
+
+        Args:
+            use: "effort" (PID and gravity along the path), "gravity" or "damped" (gravity compensation), "position",
+                "hold" (no commands).
+            path: PiecewisePolynomial of the joints; a wave of 8 s at 0.5 rad/s by default.
+            hand: whether a hand moves the arm along the path.
+        """
         self.arm = arm = load_arm(name)
         known = arm.effects.cables + arm.effects.springs if effects else []
         model = IdentifiedModel.from_arm(arm, known)
@@ -126,19 +138,25 @@ class FaultyArm:
             self.driver.GetOutputPort("effort_commanded"),
             self.station.GetInputPort(f"{arm.name.lower()}.effort_commanded"),
         )
-        path = wave(arm, seconds, speed, seed)
+        path = path or wave(arm, 8.0, 0.5, seed)
         self.start = path.value(0.0).ravel()
         velocity = path.MakeDerivative()
-        self._desired = lambda t: np.concatenate([path.value(t), velocity.value(t)]).ravel()
-        self._controller = None
-        if use in ("effort", "gravity"):
-            mode = "hold" if use == "effort" else "gravity"
-            self._controller = ArmController(arm, model, mode, PERIOD)
+        self.desired = lambda t: np.concatenate([path.value(t), velocity.value(t)]).ravel()
+        self.controller = None
+        self.lead = lambda status, time: self.desired(time) if use == "effort" else None
+        if use in ("effort", "gravity", "damped"):
+            self.controller = ArmController(arm, model, "hold" if use == "effort" else use, PERIOD)
         elif use == "position":
             self._sender = builder.AddSystem(DvrkCommandSender(arm))
             connect(self.driver.GetOutputPort("lcmt_dvrk_status"), self._sender.GetInputPort("lcmt_dvrk_status"))
             connect(self._sender.get_output_port(), self.driver.GetInputPort("lcmt_dvrk_command"))
         self._use = use
+        if hand:
+            hands, wanted = builder.AddSystem(Hand(arm)), builder.AddSystem(HandPath(arm, "dh_7", path))
+            connect(self.station.GetOutputPort(f"{arm.name.lower()}.state_true"), hands.GetInputPort("state_estimated"))
+            connect(wanted.get_output_port(), hands.GetInputPort("X_BG_desired"))
+            push = self.station.GetInputPort(f"{arm.name.lower()}.effort_disturbance")
+            connect(hands.GetOutputPort("effort_disturbance"), push)
         self.simulator = Simulator(builder.Build())
         self.context = self.simulator.get_mutable_context()
         self.station.set_positions(self.station.GetMyMutableContextFromRoot(self.context), self.start)
@@ -151,13 +169,12 @@ class FaultyArm:
 
     def step(self):
         time = PERIOD * self.ticks
-        if self._controller is not None:
+        if self.controller is not None:
             status = self.driver.GetOutputPort("lcmt_dvrk_status").Eval(self.driver.GetMyContextFromRoot(self.context))
-            desired = self._desired(time) if self._use == "effort" else None
-            self.driver.Receive(self._controller.answer(status, time, desired).encode())
+            self.driver.Receive(self.controller.answer(status, time, self.lead(status, time)).encode())
         elif self._use == "position":
             context = self._sender.GetMyMutableContextFromRoot(self.context)
-            self._sender.GetInputPort("desired_state").FixValue(context, self._desired(time))
+            self._sender.GetInputPort("desired_state").FixValue(context, self.desired(time))
         self.ticks += 1
         self.simulator.AdvanceTo(PERIOD * self.ticks)
 

@@ -137,15 +137,14 @@ class FrozenPosition:
         self._least_time = settings.frozen_time + counts / settings.frozen_speed
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector]:
-        """Effort at the last change of position, and the time since then, both (n,)."""
+        """Effort at the last change of position, and the time for which it has differed too much, both (n,)."""
         return sample.net_effort, np.zeros_like(sample.q)
 
     def check(self, sample: Sample, state: tuple[Vector, Vector]) -> tuple[tuple[Vector, Vector], Mask]:
         """See `Check.check`."""
-        stands = sample.step == 0
-        effort = np.where(stands, state[0], sample.net_effort)
-        still = stands * (state[1] + sample.dt)
-        return (effort, still), (np.abs(sample.net_effort - effort) > self._allowed) & (still > self._least_time)
+        effort = np.where(sample.step == 0, state[0], sample.net_effort)
+        time = (np.abs(sample.net_effort - effort) > self._allowed) * (state[1] + sample.dt)
+        return (effort, time), time > self._least_time
 
 
 class Response:
