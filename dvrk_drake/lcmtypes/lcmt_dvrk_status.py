@@ -52,6 +52,8 @@ class lcmt_dvrk_status(object):
     """ a measurement is not plausible: it jumps, is frozen, or contradicts another one """
     FAULT_OSCILLATION = 8
     """ the commanded efforts oscillate """
+    FAULT_NOT_FINITE = 9
+    """ the guard computed a number that is not finite, e.g. since its model did """
     REFUSAL_NONE = 0
     """
     refusal_code, why a command was not taken: none was refused so far. A refused command does not act and does not keep

@@ -246,7 +246,11 @@ class CommandGuard:
         if self.state in _REGULATED and (away := self._follower.astray(self._q())):
             self.report_fault(away, lcmt_dvrk_status.FAULT_FOLLOWING)
         self.output = self._output(min(max(dt, 0.0), _LONGEST_STEP))
-        if self.state == lcmt_dvrk_status.STATE_EFFORT:
+        if not self.output.is_finite():
+            self.report_fault("the guard's output is not finite", lcmt_dvrk_status.FAULT_NOT_FINITE)
+            self._follower.latch(self._q(), np.zeros(self.num_joints))
+            self.output = self._follower.hold(0.0)
+        elif self.state == lcmt_dvrk_status.STATE_EFFORT:
             joint = self._oscillation.add(self.output.effort, min(max(dt, 0.0), _LONGEST_STEP))
             if joint is not None:
                 text = f"{self.limits.names[joint]}: the commanded effort oscillates"

@@ -28,6 +28,11 @@ class GuardOutput:
     effort: Vector
     joint_flags: Flags
 
+    def is_finite(self) -> bool:
+        """Returns whether all numbers are finite."""
+        zero = np.zeros(len(self.position))  # times a number that is not finite, it is NaN
+        return bool(self.position @ zero + self.velocity @ zero + self.effort @ zero == 0.0)
+
 
 class Follower:
     """Follows commands inside the limits, each kind from what the arm does when it begins. All arrays are (n,).
