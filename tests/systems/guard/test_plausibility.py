@@ -105,7 +105,7 @@ def test_a_velocity_that_disagrees_with_the_position_is_found_in_time(joint, spe
 
 
 def test_a_velocity_with_the_delay_of_a_filter_is_plausible():
-    """A first-order filter of 30 Hz, as in the arm files, at full acceleration from rest to the speed limit and back."""
+    """A first-order filter of 30 Hz, as in the arm files, at up to 0.4 of the speed limit in both directions."""
     sensors = Sensors()
     limit = GuardLimits(ARM, GuardSettings()).speed
     filtered = np.zeros(N)
