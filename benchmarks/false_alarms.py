@@ -145,9 +145,8 @@ def main():
     with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
         results = pool.map(task, tasks, chunksize=1)
     alarms = sum(bool(problem) for _, problem in results)
-    print(
-        f"{sum(seconds for seconds, _ in results) / 60:.1f} simulated minutes, {alarms} with an interference of the guard"
-    )
+    minutes = sum(seconds for seconds, _ in results) / 60
+    print(f"{minutes:.1f} simulated minutes, {alarms} uses in which the guard interfered")
     return int(alarms > 0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,8 +31,7 @@ class GuardOutput:
 
     def is_finite(self) -> bool:
         """Returns whether all numbers are finite."""
-        zero = np.zeros(len(self.position))  # times a number that is not finite, it is NaN
-        return bool(self.position @ zero + self.velocity @ zero + self.effort @ zero == 0.0)
+        return math.isfinite((self.position + self.velocity + self.effort).sum())
 
 
 class Follower:

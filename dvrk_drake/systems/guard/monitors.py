@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -68,16 +69,16 @@ class OscillationMonitor:
         if self._mean is None:
             self._mean = scaled
             self._side = self._reversals = np.zeros_like(scaled)
+            self._since = 0.0
             return None
         alternating = scaled - self._mean
         self._mean = self._mean + dt / _MEAN_TIME * alternating
-        self._reversals = (1.0 - dt / self._time) * self._reversals
-        # Rounded to the side on which it is beyond the threshold, or 0 between both.
-        side = np.trunc(alternating)
-        if not side.any():
+        self._since += dt
+        if np.abs(alternating).max() < 1.0:
             return None
-        side = np.where(side == 0, self._side, np.sign(side))
-        self._reversals = self._reversals + (side * self._side < 0)
+        side = np.where(np.abs(alternating) < 1.0, self._side, np.sign(alternating))
+        self._reversals = math.exp(-self._since / self._time) * self._reversals + (side * self._side < 0)
+        self._since = 0.0
         self._side = side
         worst = int(self._reversals.argmax())
         return worst if self._reversals[worst] > self._allowed else None

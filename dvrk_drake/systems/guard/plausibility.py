@@ -270,13 +270,11 @@ class Plausibility:
             speed = np.abs(v)
             fastest = np.maximum(speed, speed_before)
             sample = Sample(dt, q, v, q - q_before, fastest, effort, effort - self.gravity, commanded)
-            states = []
-            for check, state in zip(self._checks, self._states, strict=True):
-                next_state, joints = check.check(sample, state)
-                states.append(next_state)
-                if joints.any():
+            results = [check.check(sample, state) for check, state in zip(self._checks, self._states, strict=True)]
+            self._states = [state for state, _ in results]
+            if np.logical_or.reduce([joints for _, joints in results]).any():
+                for check, (_, joints) in zip(self._checks, results, strict=True):
                     self._find(check, joints)
-            self._states = states
             self._pose_age += dt
             if self._pose_age > self._detection_time:
                 self._poses, self._pose_age = (self._poses[1], q), 0.0
@@ -288,6 +286,8 @@ class Plausibility:
         self._reject(~self._none)
 
     def _find(self, check: Check, joints: Mask) -> None:
+        if not joints.any():
+            return
         if not self.fault:
             self.fault = f"{', '.join(self._names[j] for j in np.flatnonzero(joints))}: {check.text}"
         if check.about_position:

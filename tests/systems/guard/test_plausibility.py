@@ -218,7 +218,7 @@ def test_a_joint_without_a_valid_position_keeps_its_gravity_effort_and_the_other
     np.testing.assert_array_equal(output.joint_flags & Status.FLAG_IMPLAUSIBLE != 0, unit(joint).astype(bool))
     gravity = Heavy().gravity_effort(Q)
     np.testing.assert_allclose(output.effort, gravity, rtol=0, atol=1e-12)
-    # The others are held by springs and dampers, within 0.3 of their limits; this one has no feedback, wherever it goes.
+    # The others are held by springs and dampers, within 0.3 of their limits; this one has no feedback.
     kp, others = np.array(ARM.gains.kp), np.arange(N) != joint
     for away in (1e-3, -1e-3, 9e-3):
         bench.q = Q + unit(joint, 0.3) + away
