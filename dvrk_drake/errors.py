@@ -25,6 +25,10 @@ class ControllerError(DvrkDrakeError):
     """A controller that was given gains, limits or a period that it cannot run with."""
 
 
+class KeyFileError(DvrkDrakeError):
+    """A key for the authentication of messages that cannot be read, made or used."""
+
+
 class StationError(DvrkDrakeError):
     """A station that cannot be built or used as asked."""
 

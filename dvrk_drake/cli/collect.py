@@ -70,13 +70,13 @@ def _add_random_poses(options: argparse.Namespace) -> None:
 def _teach(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.pose_file import load_poses_if_any
-    from dvrk_drake.processes.control import ArmLink, control
+    from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_line import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.processes.teacher import EnterKey, Teacher
 
     load_poses_if_any(options.poses, load_arm(options.arm))  # refused before the arm is asked
-    controller, url, _ = ready_controller(options, "gravity")
+    controller, link, _ = ready_controller(options, "gravity")
     line, stopped = LiveLine(sys.stderr), stop_on_signals()
     teacher = Teacher(
         controller, options.poses, at_rest=options.at_rest, told=EnterKey(sys.stdin), report=_reporter(line)
@@ -85,7 +85,7 @@ def _teach(options: argparse.Namespace) -> None:
     print(f"the weight of {controller.arm.name} is carried: move it by hand; {when} a pose, Ctrl-C ends", flush=True)
     try:
         control(
-            ArmLink(controller.arm, url),
+            link(),
             controller,
             stopped,
             lambda text: line.show(lambda: f"{len(teacher.poses)} poses; {text}"),
@@ -102,7 +102,7 @@ def _visit(options: argparse.Namespace) -> None:
     from dvrk_drake.models.collection_file import CollectionFile
     from dvrk_drake.models.pose_file import load_poses
     from dvrk_drake.processes.collector import CollectionSettings, Collector
-    from dvrk_drake.processes.control import ArmLink, control
+    from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_line import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
@@ -115,13 +115,13 @@ def _visit(options: argparse.Namespace) -> None:
     if num_done == len(poses):
         print(f"{options.output}: has all {len(poses)} poses already")
         return
-    controller, url, _ = ready_controller(options, "hold")
+    controller, link, _ = ready_controller(options, "hold")
     line, stopped = LiveLine(sys.stderr), stop_on_signals()
     collector = Collector(poses, controller, output, settings, stopped=stopped, report=_reporter(line))
     print(f"{len(poses) - num_done} poses of {arm.name} to visit; Ctrl-C stops, the same command goes on", flush=True)
     try:
         control(
-            ArmLink(arm, url),
+            link(),
             controller,
             lambda: collector.finished,
             lambda text: line.show(lambda: f"{collector.describe()}; {text}"),

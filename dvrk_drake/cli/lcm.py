@@ -7,12 +7,15 @@ import sys
 from contextlib import closing, nullcontext
 from typing import TYPE_CHECKING
 
-from dvrk_drake.cli.support import add_gravity, mounted, quiet_drake
+from dvrk_drake.cli.support import add_gravity, add_key, load_key, mounted, quiet_drake
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm_schema import Gains
     from dvrk_drake.processes.arm_controller import ArmController
+    from dvrk_drake.processes.control import ArmLink
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
     from dvrk_drake.systems.gravity_pid_controller import Mode
 
@@ -21,6 +24,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     """Adds the verbs and their options."""
     _add_arm(verbs)
     _add_run(verbs)
+    _add_key(verbs)
 
 
 def _add_arm(verbs: argparse._SubParsersAction) -> None:
@@ -31,6 +35,7 @@ def _add_arm(verbs: argparse._SubParsersAction) -> None:
     verb.add_argument("--pose", nargs="+", type=float, metavar="Q", help="where it starts [rad, m]; default: near zero")
     verb.add_argument("--meshcat", action="store_true", help="draw it in a browser")
     verb.add_argument("--realtime", action="store_true", help="real-time scheduling, or a warning where not permitted")
+    add_key(verb)
     add_gravity(verb)
     verb.set_defaults(run=_arm)
 
@@ -46,6 +51,7 @@ def _arm(options: argparse.Namespace) -> None:
     quiet_drake()
     arm = mounted(load_arm(options.arm), options.gravity)
     driver = DvrkDriver() if options.driver is None else load_driver(options.driver)
+    driver.key_file = options.key or driver.key_file
     pose = start_pose(arm, options.pose)
     url = open_lcm(options.lcm_url or driver.lcm_url).get_lcm_url()
     simulated = SimulatedArm(arm, driver, url, pose)
@@ -87,14 +93,27 @@ def _add_run(verbs: argparse._SubParsersAction) -> None:
     verb.set_defaults(run=_run)
 
 
+def _add_key(verbs: argparse._SubParsersAction) -> None:
+    verb = verbs.add_parser("key", help="make a key file, with which both sides authenticate their LCM messages")
+    verb.add_argument("file", metavar="FILE", help="a new file, which only its owner may read")
+    verb.set_defaults(run=_key)
+
+
+def _key(options: argparse.Namespace) -> None:
+    from dvrk_drake.models.message_key import create_key_file
+
+    create_key_file(options.file)
+    print(f"{options.file}: copy it to the other side, e.g. with scp -p, and name it there and here with --key")
+
+
 def _run(options: argparse.Namespace) -> None:
-    from dvrk_drake.processes.control import ArmLink, control
+    from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_line import LiveLine
     from dvrk_drake.processes.live_status import LiveStatus
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
     compensator, gains = _friction_compensator(options), _gains(options)
-    controller, url, period = ready_controller(options, options.mode, compensator, gains)
+    controller, link, period = ready_controller(options, options.mode, compensator, gains)
     arm = controller.arm
     stopped = stop_on_signals()
     print(
@@ -114,7 +133,7 @@ def _run(options: argparse.Namespace) -> None:
 
     try:
         # A link of its own: what was said while the controller was compiled is past.
-        control(ArmLink(arm, url), controller, stopped, tell)
+        control(link(), controller, stopped, tell)
     finally:
         line.clear()
     print(f"{arm.name} holds by itself", flush=True)
@@ -197,6 +216,7 @@ def add_control(verb: argparse.ArgumentParser) -> None:
         action="store_true",
         help="say which fault the arm has or why it took over, if it did, and clear that before it is controlled",
     )
+    add_key(verb)
 
 
 def ready_controller(
@@ -204,14 +224,16 @@ def ready_controller(
     mode: Mode,
     friction: FrictionCompensator | None = None,
     gains: Gains | None = None,
-) -> tuple[ArmController, str, float]:
-    """A controller of an arm that may be controlled, the URL of the network, and the period of its statuses [s].
+) -> tuple[ArmController, Callable[[], ArmLink], float]:
+    """A controller of an arm that may be controlled, what opens a link to it, and the period of its statuses [s].
 
     With `friction` it compensates that as well; `gains` are what it holds with. With --reset a latched fault is said
-    and cleared first, and an arm whose watchdog took over resumes.
+    and cleared first, and an arm whose watchdog took over resumes. The link is to the session that was looked at: an
+    arm that is restarted meanwhile is none.
 
     Raises:
         ModelError: the model is of another arm.
+        KeyFileError: the key cannot be used.
         ControllerError: no arm there, or one that may not be controlled now.
     """
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -223,23 +245,23 @@ def ready_controller(
     from dvrk_drake.processes.pace import make_realtime, settle_memory
 
     quiet_drake()
-    arm = load_arm(options.arm)
+    arm, key = load_arm(options.arm), load_key(options.key)
     model = IdentifiedModel.from_arm(arm) if options.model is None else IdentifiedModel.load(options.model)
     if model.load_arm().name != arm.name:
         raise ModelError(f"{options.model}: is of {model.load_arm().name}, not of {arm.name}")
     if options.model is not None and (warning := model_warning(options.model, model)):
         _warn(warning)
     url = open_lcm(options.lcm_url).get_lcm_url()
-    with closing(ArmLink(arm, url)) as link:
+    with closing(ArmLink(arm, url, key=key)) as link:
         if options.reset:
             reset_fault(link, _warn)
-        _, period = first_status(link)
+        status, period = first_status(link)
     controller = ArmController(arm, model, mode, period, friction, gains)
     if options.realtime:
         for warning in make_realtime():
             _warn(warning)
     settle_memory()
-    return controller, url, period
+    return controller, lambda: ArmLink(arm, url, key=key, before=status), period
 
 
 def model_warning(path: str, model: IdentifiedModel) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from dvrk_drake.cli.support import print_notes, seconds
+from dvrk_drake.cli.support import add_key, load_key, print_notes, seconds
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -19,6 +19,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
         "--duration", type=seconds, default=float("inf"), metavar="S", help="from the first status; default: to Ctrl-C"
     )
     verb.add_argument("--lcm-url", default="", metavar="URL", help="default: LCM_DEFAULT_URL, or LCM's own")
+    add_key(verb)
     verb.set_defaults(run=_record)
 
 
@@ -33,7 +34,7 @@ def _record(options: argparse.Namespace) -> None:
     arm = load_arm(options.arm)
     check_stream_output(options.output)
     url = open_lcm(options.lcm_url).get_lcm_url()
-    recorder = Recorder(arm, options.output, url)
+    recorder = Recorder(arm, options.output, url, load_key(options.key))
     line = LiveLine(sys.stderr)
     stopped = stop_on_signals()
     print(f"recording {arm.name} on LCM {url}; end with Ctrl-C", flush=True)
@@ -42,4 +43,4 @@ def _record(options: argparse.Namespace) -> None:
     finally:
         line.clear()
     print(f"{options.output}: {recorder.stream.num_taken} rows", flush=True)
-    print_notes(options.output, recorder.stream.notes())
+    print_notes(options.output, recorder.notes())

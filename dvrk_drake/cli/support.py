@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from dvrk_drake.models.arm import Arm
+    from dvrk_drake.models.message_key import MessageKey
 
 
 def import_interruptibly() -> None:
@@ -50,6 +51,22 @@ def import_interruptibly() -> None:
 def quiet_drake() -> None:
     """Keeps Drake's remarks (Meshcat's address) off the terminal; its import sets the level, so this comes after."""
     logging.getLogger("drake").setLevel(logging.WARNING)
+
+
+def add_key(verb: argparse.ArgumentParser) -> None:
+    """Adds the option --key, for `load_key`."""
+    verb.add_argument("--key", metavar="FILE", help="from dvrk-drake key, one for both sides: authenticates messages")
+
+
+def load_key(path: str | None) -> MessageKey | None:
+    """Returns the key in the file that --key names, or None.
+
+    Raises:
+        KeyFileError: it cannot be used.
+    """
+    from dvrk_drake.models.message_key import MessageKey
+
+    return None if path is None else MessageKey.load(path)
 
 
 def add_overwrite(verb: argparse.ArgumentParser) -> None:

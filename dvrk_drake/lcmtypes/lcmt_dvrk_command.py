@@ -19,11 +19,11 @@ import struct
 
 class lcmt_dvrk_command(object):
 
-    __slots__ = ["utime", "sequence", "sender_id", "session_id", "status_utime", "arm_name", "control_mode", "reset_fault", "num_joints", "position", "velocity", "effort"]
+    __slots__ = ["utime", "sequence", "sender_id", "session_id", "status_utime", "arm_name", "control_mode", "reset_fault", "num_joints", "position", "velocity", "effort", "mac_size", "mac"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "string", "int8_t", "boolean", "int32_t", "double", "double", "double"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "string", "int8_t", "boolean", "int32_t", "double", "double", "double", "int8_t", "byte"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, None, ["num_joints"], ["num_joints"], ["num_joints"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, ["num_joints"], ["num_joints"], ["num_joints"], None, ["mac_size"]]
 
     INVALID = 0
     """ control_mode: none, what a command has that was never filled in; always refused """
@@ -35,8 +35,8 @@ class lcmt_dvrk_command(object):
     """ the motors apply `effort` """
     OFF = 4
     """
-    motors without power; an arm without brakes falls, so it is taken from an arm that holds only, after a HOLD of the
-    same sender, and never in a fault. It is no emergency stop: that is a button
+    motors without power; an arm without brakes falls, so it is accepted only if the driver is configured to, from an arm
+    that holds, after a HOLD of the same sender, and never in a fault. It is no emergency stop: that is a button
     """
 
     def __init__(self):
@@ -48,7 +48,7 @@ class lcmt_dvrk_command(object):
 
         self.sequence = 0
         """
-        increases with every command of this sender, by one if none is left out
+        increases with every command of this sender, by one if none is left out; while it commands, by at most 1000
         LCM Type: int64_t
         """
 
@@ -114,6 +114,19 @@ class lcmt_dvrk_command(object):
         LCM Type: double[num_joints]
         """
 
+        self.mac_size = 0
+        """
+        16 if the message is authenticated, else 0
+        LCM Type: int8_t
+        """
+
+        self.mac = b""
+        """
+        message authentication code: BLAKE2b with the key of both sides and a digest of 16 bytes, over all bytes of the
+        encoded message before mac_size
+        LCM Type: byte[mac_size]
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -131,6 +144,8 @@ class lcmt_dvrk_command(object):
         buf.write(struct.pack('>%dd' % self.num_joints, *self.position[:self.num_joints]))
         buf.write(struct.pack('>%dd' % self.num_joints, *self.velocity[:self.num_joints]))
         buf.write(struct.pack('>%dd' % self.num_joints, *self.effort[:self.num_joints]))
+        buf.write(struct.pack(">b", self.mac_size))
+        buf.write(bytearray(self.mac[:self.mac_size]))
 
     @staticmethod
     def decode(data: bytes):
@@ -154,12 +169,14 @@ class lcmt_dvrk_command(object):
         self.position = struct.unpack('>%dd' % self.num_joints, buf.read(self.num_joints * 8))
         self.velocity = struct.unpack('>%dd' % self.num_joints, buf.read(self.num_joints * 8))
         self.effort = struct.unpack('>%dd' % self.num_joints, buf.read(self.num_joints * 8))
+        self.mac_size = struct.unpack(">b", buf.read(1))[0]
+        self.mac = buf.read(self.mac_size)
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if lcmt_dvrk_command in parents: return 0
-        tmphash = (0xad4aba5526c6ce03) & 0xffffffffffffffff
+        tmphash = (0x5a47d3b9557efa1f) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

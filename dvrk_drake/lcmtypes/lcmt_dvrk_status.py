@@ -13,11 +13,11 @@ import struct
 
 class lcmt_dvrk_status(object):
 
-    __slots__ = ["utime", "sequence", "session_id", "arm_name", "guard_state", "accepted_modes", "gravity_compensation", "fault_code", "fault_text", "command_sender_id", "command_sequence", "command_utime", "num_accepted", "num_lost", "num_refused", "num_expired", "refusal_code", "num_joints", "position", "velocity", "effort_measured", "position_commanded", "effort_commanded", "joint_flags", "num_grippers", "gripper_position"]
+    __slots__ = ["utime", "sequence", "session_id", "arm_name", "guard_state", "accepted_modes", "gravity_compensation", "fault_code", "fault_text", "command_sender_id", "command_sequence", "command_utime", "num_accepted", "num_lost", "num_refused", "num_ignored", "num_expired", "refusal_code", "ignored_code", "num_joints", "position", "velocity", "effort_measured", "position_commanded", "effort_commanded", "joint_flags", "num_grippers", "gripper_position", "mac_size", "mac"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t", "string", "int8_t", "int8_t", "boolean", "int8_t", "string", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int8_t", "int32_t", "double", "double", "double", "double", "double", "int8_t", "int8_t", "double"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "string", "int8_t", "int8_t", "boolean", "int8_t", "string", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int64_t", "int8_t", "int8_t", "int32_t", "double", "double", "double", "double", "double", "int8_t", "int8_t", "double", "int8_t", "byte"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], None, ["num_grippers"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], ["num_joints"], None, ["num_grippers"], None, ["mac_size"]]
 
     STATE_OFF = 0
     """ guard_state, what decides over the motors: motors without power """
@@ -36,8 +36,6 @@ class lcmt_dvrk_status(object):
     """
     FAULT_NONE = 0
     """ fault_code; a fault is latched, only a command with reset_fault clears it: none """
-    FAULT_DUPLICATE_SENDER = 1
-    """ two senders commanded at the same time """
     FAULT_POSITION_LIMIT = 2
     """ pushed beyond a position limit while effort commands acted """
     FAULT_MEASUREMENT = 3
@@ -56,9 +54,9 @@ class lcmt_dvrk_status(object):
     """ the guard computed a number that is not finite, e.g. since its model did """
     REFUSAL_NONE = 0
     """
-    refusal_code, why a command was not taken: none was refused so far. A refused command does not act and does not keep
-    an older one alive; it changes nothing, but that its sender starts anew if it was STARTING (and see
-    REFUSAL_OTHER_SENDER and REFUSAL_CLOCK_JUMP)
+    refusal_code and ignored_code, why a command was not accepted: all were so far. A command that is not accepted does
+    not act and does not keep an older one in force. It changes nothing, except that a sender that is STARTING starts
+    anew if its command was refused for its content
     """
     REFUSAL_UNREADABLE = 1
     """ not an lcmt_dvrk_command: garbage, or another version of this file """
@@ -79,7 +77,7 @@ class lcmt_dvrk_status(object):
     REFUSAL_OUT_OF_ORDER = 9
     """ sequence is not above that of the last command of this sender """
     REFUSAL_CLOCK_JUMP = 10
-    """ the sender's utime and the arm's clock advanced differently; its next commands must start anew """
+    """ the sender's utime and the arm's clock advanced differently since its last accepted command """
     REFUSAL_FAULT = 11
     """ a fault is latched and this is not HOLD """
     REFUSAL_BAD_RESET = 12
@@ -92,13 +90,19 @@ class lcmt_dvrk_status(object):
     REFUSAL_START_OUTSIDE = 14
     """ starting with efforts while the pose is beyond a position limit by more than half of the margin """
     REFUSAL_OTHER_SENDER = 15
-    """ another sender is in command; this is a fault as well """
+    """ another sender came first and is still sending; it stays in command """
     REFUSAL_SUDDEN_OFF = 16
     """ OFF that does not follow a HOLD of the same sender """
     REFUSAL_RESUME = 17
     """ POSITION or EFFORT after the watchdog took over, before an operator resumed; fault_text is why it did """
     REFUSAL_START_GRAVITY = 18
     """ starting with efforts while the measured effort is not the gravity effort of the pose """
+    REFUSAL_NOT_AUTHENTIC = 19
+    """ the arm has a key, and the command has no valid message authentication code """
+    REFUSAL_SEQUENCE_JUMP = 20
+    """ sequence is too far above that of the last accepted command of this sender """
+    REFUSAL_FLOOD = 21
+    """ more commands came within one period than are examined """
     FLAG_EFFORT_CLAMPED = 1
     """ joint_flags, bits: the commanded effort was beyond the motor's limit """
     FLAG_RATE_LIMITED = 2
@@ -146,8 +150,9 @@ class lcmt_dvrk_status(object):
 
         self.accepted_modes = 0
         """
-        bit 1 << control_mode for each mode that a command may have now: in a fault only HOLD; OFF only in HOLD and OFF.
-        Not POSITION and EFFORT after the watchdog took over, until an operator resumes
+        bit 1 << control_mode for each mode that a command may have now: in a fault only HOLD; OFF only in HOLD and OFF, and
+        if the driver is configured to accept it. Not POSITION and EFFORT after the watchdog took over, until an operator
+        resumes
         LCM Type: int8_t
         """
 
@@ -196,13 +201,20 @@ class lcmt_dvrk_status(object):
 
         self.num_lost = 0
         """
-        commands missing in the sequence since the arm started, at most 2^63 - 1
+        commands missing in the sequence of the sender in command since the arm started
         LCM Type: int64_t
         """
 
         self.num_refused = 0
         """
-        commands refused since the arm started
+        commands of the sender in command, or of one that may become it, that were refused since the arm started
+        LCM Type: int64_t
+        """
+
+        self.num_ignored = 0
+        """
+        messages ignored since the arm started because they do not belong to its session and sender: unreadable, for another
+        arm, size or session, without a valid authentication code, from another sender, or too many
         LCM Type: int64_t
         """
 
@@ -215,6 +227,12 @@ class lcmt_dvrk_status(object):
         self.refusal_code = 0
         """
         of the last refused command: one of REFUSAL_*
+        LCM Type: int8_t
+        """
+
+        self.ignored_code = 0
+        """
+        of the last ignored message: one of REFUSAL_*
         LCM Type: int8_t
         """
 
@@ -272,6 +290,18 @@ class lcmt_dvrk_status(object):
         LCM Type: double[num_grippers]
         """
 
+        self.mac_size = 0
+        """
+        16 if the message is authenticated, else 0
+        LCM Type: int8_t
+        """
+
+        self.mac = b""
+        """
+        as in lcmt_dvrk_command
+        LCM Type: byte[mac_size]
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -290,7 +320,7 @@ class lcmt_dvrk_status(object):
         buf.write(struct.pack('>I', len(__fault_text_encoded)+1))
         buf.write(__fault_text_encoded)
         buf.write(b"\0")
-        buf.write(struct.pack(">qqqqqqqbi", self.command_sender_id, self.command_sequence, self.command_utime, self.num_accepted, self.num_lost, self.num_refused, self.num_expired, self.refusal_code, self.num_joints))
+        buf.write(struct.pack(">qqqqqqqqbbi", self.command_sender_id, self.command_sequence, self.command_utime, self.num_accepted, self.num_lost, self.num_refused, self.num_ignored, self.num_expired, self.refusal_code, self.ignored_code, self.num_joints))
         buf.write(struct.pack('>%dd' % self.num_joints, *self.position[:self.num_joints]))
         buf.write(struct.pack('>%dd' % self.num_joints, *self.velocity[:self.num_joints]))
         buf.write(struct.pack('>%dd' % self.num_joints, *self.effort_measured[:self.num_joints]))
@@ -299,6 +329,8 @@ class lcmt_dvrk_status(object):
         buf.write(struct.pack('>%db' % self.num_joints, *self.joint_flags[:self.num_joints]))
         buf.write(struct.pack(">b", self.num_grippers))
         buf.write(struct.pack('>%dd' % self.num_grippers, *self.gripper_position[:self.num_grippers]))
+        buf.write(struct.pack(">b", self.mac_size))
+        buf.write(bytearray(self.mac[:self.mac_size]))
 
     @staticmethod
     def decode(data: bytes):
@@ -321,7 +353,7 @@ class lcmt_dvrk_status(object):
         self.fault_code = struct.unpack(">b", buf.read(1))[0]
         __fault_text_len = struct.unpack('>I', buf.read(4))[0]
         self.fault_text = buf.read(__fault_text_len)[:-1].decode('utf-8', 'replace')
-        self.command_sender_id, self.command_sequence, self.command_utime, self.num_accepted, self.num_lost, self.num_refused, self.num_expired, self.refusal_code, self.num_joints = struct.unpack(">qqqqqqqbi", buf.read(61))
+        self.command_sender_id, self.command_sequence, self.command_utime, self.num_accepted, self.num_lost, self.num_refused, self.num_ignored, self.num_expired, self.refusal_code, self.ignored_code, self.num_joints = struct.unpack(">qqqqqqqqbbi", buf.read(70))
         self.position = struct.unpack('>%dd' % self.num_joints, buf.read(self.num_joints * 8))
         self.velocity = struct.unpack('>%dd' % self.num_joints, buf.read(self.num_joints * 8))
         self.effort_measured = struct.unpack('>%dd' % self.num_joints, buf.read(self.num_joints * 8))
@@ -330,12 +362,14 @@ class lcmt_dvrk_status(object):
         self.joint_flags = struct.unpack('>%db' % self.num_joints, buf.read(self.num_joints))
         self.num_grippers = struct.unpack(">b", buf.read(1))[0]
         self.gripper_position = struct.unpack('>%dd' % self.num_grippers, buf.read(self.num_grippers * 8))
+        self.mac_size = struct.unpack(">b", buf.read(1))[0]
+        self.mac = buf.read(self.mac_size)
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if lcmt_dvrk_status in parents: return 0
-        tmphash = (0x28a436ae6d1120b0) & 0xffffffffffffffff
+        tmphash = (0x7a968dbc874eb4cc) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

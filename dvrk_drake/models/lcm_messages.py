@@ -1,16 +1,24 @@
-"""The LCM messages of an arm: which channel is whose, and decoding that garbage cannot stop."""
+"""The LCM messages of an arm: which channel is whose, decoding that garbage cannot stop, and which statuses to use."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeVar
+import math
+import struct
+from collections import Counter
+from typing import TYPE_CHECKING, TypeVar
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
-from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.message_key import MessageKey
+
+if TYPE_CHECKING:
+    from dvrk_drake.models.arm import Arm
 
 Message = TypeVar("Message", lcmt_dvrk_command, lcmt_dvrk_status)
 
 STATUS_PREFIX = "DVRK_STATUS_"
+
+#: No arm sends more statuses in a second; so many may come at once, after a pause of the arm's process.
+_FASTEST, _AHEAD = 2000, 100
 
 _STATE_NAMES = {
     value: name.removeprefix("STATE_").lower()
@@ -38,6 +46,9 @@ _REFUSALS = {
     lcmt_dvrk_status.REFUSAL_SUDDEN_OFF: "off without a hold before",
     lcmt_dvrk_status.REFUSAL_RESUME: "before an operator resumed",
     lcmt_dvrk_status.REFUSAL_START_GRAVITY: "starting while the measured effort is not the gravity effort",
+    lcmt_dvrk_status.REFUSAL_NOT_AUTHENTIC: "not signed with the arm's key (--key)",
+    lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP: "after a jump of the sequence",
+    lcmt_dvrk_status.REFUSAL_FLOOD: "too many at once",
 }
 
 
@@ -49,16 +60,6 @@ def command_channel(arm: Arm) -> str:
 def status_channel(arm: Arm) -> str:
     """DVRK_STATUS_<ARM>."""
     return STATUS_PREFIX + arm.name.upper()
-
-
-def is_status_of(arm: Arm) -> Callable[[lcmt_dvrk_status], bool]:
-    """Whether a status is of `arm`, by name and size."""
-    return lambda status: status.arm_name == arm.name and status.num_joints == arm.num_joints
-
-
-def is_old(status: lcmt_dvrk_status, last: lcmt_dvrk_status) -> bool:
-    """Whether `status` was sent before `last` or is it: of a log that is played on the arm's network, or overtaken."""
-    return status.session_id == last.session_id and status.sequence <= last.sequence
 
 
 def decode(message_type: type[Message], data: bytes) -> Message | None:
@@ -80,3 +81,106 @@ def describe_state(guard_state: int, fault_text: str = "") -> str:
 def describe_refusal(refusal_code: int) -> str:
     """Why a command was refused, in words."""
     return _REFUSALS.get(refusal_code, f"refusal {refusal_code}")
+
+
+class StatusFilter:
+    """Selects the statuses of one session of one arm from the messages of its status channel.
+
+    The first session that is seen is kept. A status is ignored, and counted with the reason, if it is not authentic, is
+    of another session, was sent before the last one, or is so far ahead in sequence or time that the arm cannot have
+    sent it yet: above 2 kHz since the last one, plus a tenth of a second. So one spoofed status with a huge sequence
+    does not make the true ones look old.
+
+    Attributes:
+        last: the newest status that was taken, or None.
+        ignored: number of messages since then, for each reason: OTHER_SESSION, JUMP, OLD, NOT_AUTHENTIC, UNREADABLE.
+    """
+
+    OTHER_SESSION = "of another session"
+    JUMP = "with a jump of sequence or time"
+    OLD = "not newer than the last one"
+    NOT_AUTHENTIC = "not signed with this key"
+    UNREADABLE = "unreadable or of another arm"
+
+    def __init__(
+        self,
+        arm_name: str,
+        num_joints: int,
+        key: MessageKey | None = None,
+        *,
+        session_id: int = 0,
+        follow_after: float = math.inf,
+    ) -> None:
+        """Filter for one arm.
+
+        Args:
+            arm_name: the arm's name.
+            num_joints: its number of joints.
+            key: must have signed the statuses; None: not verified.
+            session_id: the session to keep; 0: the first one that is seen.
+            follow_after: if the session was silent for this time, another one is followed, or this one after a jump
+                [s]. For recordings; a controller must not go on with an arm that was restarted.
+        """
+        self.last: lcmt_dvrk_status | None = None
+        self.ignored: Counter[str] = Counter()
+        self._arm_name, self._num_joints, self._key, self._follow_after = arm_name, num_joints, key, follow_after
+        self._session_id = session_id
+        self._fingerprint = lcmt_dvrk_status()._get_packed_fingerprint()
+        self._heard = 0.0
+        self._reference = (0, 0, 0.0)
+
+    def take(self, data: bytes, now: float, *, settle: bool = True) -> lcmt_dvrk_status | None:
+        """Returns the status in a message, or None if it is ignored; arguments as of `examine`."""
+        return None if self.examine(data, now, settle=settle) else self.last
+
+    def examine(self, data: bytes, now: float, *, settle: bool = True) -> str:
+        """Takes a message, as `last`, or ignores it.
+
+        Args:
+            data: the message, as it came over the wire.
+            now: time of arrival on a clock that never jumps [s].
+            settle: False: `settle` is called after each batch of messages. Messages that waited in a queue arrive all
+                at once, so they are compared with the last one before the batch.
+
+        Returns:
+            Why it is ignored, or "".
+        """
+        reason = self._reason(data, now)
+        status = None if reason else decode(lcmt_dvrk_status, data)
+        if status is None or (status.arm_name, status.num_joints) != (self._arm_name, self._num_joints):
+            reason = reason or self.UNREADABLE
+            self.ignored[reason] += 1
+            return reason
+        is_first = self.last is None
+        self.last, self._heard, self._session_id = status, now, status.session_id
+        self.ignored.clear()
+        if settle or is_first:
+            self.settle(now)
+        return ""
+
+    def settle(self, now: float) -> None:
+        """Compares later statuses with the last one, as one that arrived at `now` [s]."""
+        if self.last is not None:
+            self._reference = (self.last.sequence, self.last.utime, now)
+
+    def _reason(self, data: bytes, now: float) -> str:
+        """Returns why a message is ignored, by its first bytes and its code, or ""."""
+        if len(data) < 32 or data[:8] != self._fingerprint:
+            return self.UNREADABLE
+        utime, sequence, session_id = struct.unpack_from(">qqq", data, 8)
+        last = self.last
+        if last is None:
+            if self._session_id not in (0, session_id):
+                return self.OTHER_SESSION
+        elif now - self._heard <= self._follow_after:
+            if session_id != last.session_id:
+                return self.OTHER_SESSION
+            if sequence <= last.sequence:
+                return self.OLD
+            from_sequence, from_utime, then = self._reference
+            most = _FASTEST * (now - then) + _AHEAD
+            if sequence - from_sequence > most or not last.utime <= utime <= from_utime + 1e3 * most:
+                return self.JUMP
+        if self._key is not None and not self._key.verify(data):
+            return self.NOT_AUTHENTIC
+        return ""

@@ -13,14 +13,8 @@ from pydrake.common.value import AbstractValue
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import (
-    command_channel,
-    decode,
-    describe_state,
-    is_old,
-    is_status_of,
-    status_channel,
-)
+from dvrk_drake.models.lcm_messages import StatusFilter, command_channel, decode, describe_state, status_channel
+from dvrk_drake.models.message_key import MessageKey
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.processes.live_status import AnswerTimes, LiveStatus, LiveStatusMaker, takeover_reason
@@ -31,6 +25,10 @@ _SILENCE, _FIRST_WAIT = 1.0, 10.0
 
 #: Measurements may not be further apart [us]: a PSM held with its own gains swings at 7 ms, an MTM at 10 ms.
 _SLOWEST = 5000
+
+#: Statuses that wait, beyond which new ones are dropped; and how many are handled at once, so that a flood cannot keep
+#: a controller from answering.
+_QUEUE, _MESSAGES_AT_ONCE = 100, 200
 
 #: How many statuses are looked at before an arm is controlled.
 _FIRST_STATUSES = 60
@@ -54,21 +52,33 @@ _TELL = 0.2
 class ArmLink:
     """Both channels of one arm, for a loop that is driven by its messages: only the newest status counts."""
 
-    def __init__(self, arm: Arm, url: str, *, replays: bool = False) -> None:
+    def __init__(
+        self,
+        arm: Arm,
+        url: str,
+        *,
+        key: MessageKey | None = None,
+        before: lcmt_dvrk_status | None = None,
+        replays: bool = False,
+    ) -> None:
         """Of `arm` on the LCM network `url`.
 
         Args:
             arm: whose statuses count.
             url: of the network.
-            replays: also take statuses older than the last one, as of a log that is played again. Never for a
+            key: must have signed statuses, and signs commands; None: neither is signed.
+            before: a status of the session that is controlled; None: the first session that is seen.
+            replays: also take statuses of any session and time, as of a log that is played again. Never for a
                 controller: what it is told of the arm's past would go into what it answers to the present.
         """
-        self.arm, self.lost, self._replays = arm, 0, replays
+        self.arm, self.lost, self._replays, self._key = arm, 0, replays, key
+        self._session = 0 if before is None else before.session_id
+        self._filter = StatusFilter(arm.name, arm.num_joints, key, session_id=self._session)
         self._lcm = lcm.LCM(url)
-        self._is_of_arm = is_status_of(arm)
         self._last: lcmt_dvrk_status | None = None
         self._is_new = False
         self._subscription = self._lcm.subscribe(status_channel(arm), self._hear)
+        self._subscription.set_queue_capacity(_QUEUE)
 
     def close(self) -> None:
         """Hears no more, and ends LCM's reading thread, which would wake for every message for nothing."""
@@ -81,34 +91,51 @@ class ArmLink:
         return time.monotonic()
 
     def next_status(self, seconds: float) -> lcmt_dvrk_status:
-        """The newest status that comes within `seconds`.
+        """The newest status of the session that comes within `seconds`.
 
         Raises:
-            ControllerError: none came.
+            ControllerError: none came; the message names what came instead.
         """
         end = time.monotonic() + seconds
         self._is_new = False
         while not self._is_new and (left := end - time.monotonic()) > 0:
             handle_message(self._lcm, left)
-        while handle_message(self._lcm, 0.0):
-            pass
+        for _ in range(_MESSAGES_AT_ONCE):
+            if not handle_message(self._lcm, 0.0):
+                break
+        self._filter.settle(self.now())
         if not self._is_new or self._last is None:
-            raise ControllerError(f"no status of {self.arm.name} for {seconds:g} s on {status_channel(self.arm)}")
+            raise ControllerError(
+                f"no status of {self.arm.name} for {seconds:g} s on {status_channel(self.arm)}{self._instead()}"
+            )
         return self._last
 
     def send(self, command: lcmt_dvrk_command) -> None:
         """Publishes a command."""
-        self._lcm.publish(command_channel(self.arm), command.encode())
+        data = command.encode()
+        self._lcm.publish(command_channel(self.arm), data if self._key is None else self._key.sign(data))
 
     def _hear(self, channel: str, data: bytes) -> None:
-        status = decode(lcmt_dvrk_status, data)
-        if status is None or not self._is_of_arm(status):
+        if self._replays:
+            status = decode(lcmt_dvrk_status, data)
+            if status is None or (status.arm_name, status.num_joints) != (self.arm.name, self.arm.num_joints):
+                return
+        elif (status := self._filter.take(data, self.now(), settle=False)) is None:
             return
-        if self._last is not None and not self._replays and is_old(status, self._last):
-            return
-        if self._last is not None and status.session_id == self._last.session_id:
-            self.lost += max(0, status.sequence - self._last.sequence - 1)
+        elif self._last is not None:
+            self.lost += status.sequence - self._last.sequence - 1
         self._last, self._is_new = status, True
+
+    def _instead(self) -> str:
+        """Returns which statuses came and were ignored since the last one, in words, or ""."""
+        ignored = self._filter.ignored.most_common()
+        if not ignored:
+            return ""
+        advice = {
+            StatusFilter.OTHER_SESSION: f"; {self.arm.name} was restarted: look at it, then start again",
+            StatusFilter.NOT_AUTHENTIC: "; both sides need the same key (--key)",
+        }
+        return f"; ignored: {', '.join(f'{n} {reason}' for reason, n in ignored)}{advice.get(ignored[0][0], '')}"
 
 
 def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
@@ -116,10 +143,10 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
 
     Raises:
         ControllerError: no arm, a fault, an arm that waits for an operator, a state that is not known, a pose outside
-            the limits, an arm that takes no efforts, is restarted, or is measured too seldom.
+            the limits, an arm that takes no efforts, or is measured too seldom.
     """
     status, name = link.next_status(_FIRST_WAIT), link.arm.name
-    _check(status, name, status.session_id)
+    _check(status, name)
     if not np.all(np.isfinite([*status.position, *status.velocity, *status.effort_measured])):
         raise ControllerError(f"{name} does not know its state: a position, velocity or effort is not finite")
     if violations := link.arm.limit_violations(status.position):
@@ -129,7 +156,7 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
     utimes = [status.utime]
     for _ in range(_FIRST_STATUSES):
         later = link.next_status(_SILENCE)
-        _check(later, name, status.session_id)
+        _check(later, name)
         utimes.append(later.utime)
     if not (later.sequence > status.sequence and later.utime > status.utime):
         raise ControllerError(f"{name} tells nothing new: its utime or sequence does not increase")
@@ -170,7 +197,7 @@ def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
         sender.GetInputPort("lcmt_dvrk_status").FixValue(context, AbstractValue.Make(status))
         link.send(sender.get_output_port().Eval(context))
         status = link.next_status(_SILENCE)
-    # Whoever comes while this sender is still remembered would be a second one: a guard may wait a second for that.
+    # A sender that comes while this one still has its place would be ignored: a guard may keep it for a second.
     end = link.now() + _FORGOTTEN
     while link.now() < end:
         status = link.next_status(_SILENCE)
@@ -180,13 +207,11 @@ def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
         raise ControllerError(f"{name} does not resume: {status.fault_text}")
 
 
-def _check(status: lcmt_dvrk_status, name: str, session: int, late: Callable[[], str] = lambda: "") -> None:
-    """Refuses an arm that was restarted, has a fault, waits for an operator, or adds its own gravity compensation.
+def _check(status: lcmt_dvrk_status, name: str, late: Callable[[], str] = lambda: "") -> None:
+    """Refuses an arm that has a fault, waits for an operator, or adds its own gravity compensation.
 
     `late` says whether answers came too seldom, which may be why the arm took over.
     """
-    if status.session_id != session:
-        raise ControllerError(f"{name} was restarted: look at it, then start again")
     if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
         raise ControllerError(f"{name} has a fault: {status.fault_text}. {_RESET}")
     if status.fault_text:
@@ -220,7 +245,7 @@ def control(
         lead: where to, asked once a status.
 
     Raises:
-        ControllerError: the arm fell silent, faulted, took over, was restarted, or lets no command act.
+        ControllerError: the arm fell silent, as one that was restarted, faulted, took over, or lets no command act.
     """
     start = link.now()
     first = link.next_status(_SILENCE)
@@ -230,7 +255,7 @@ def control(
         status = link.next_status(_SILENCE)
         now = link.now() - start
         answers.add(now)
-        _check(status, link.arm.name, first.session_id, answers.lateness)
+        _check(status, link.arm.name, answers.lateness)
         link.send(controller.answer(status, now, lead(status, now)))
         live.answer(status, now)
         if controller.acting:
@@ -241,15 +266,15 @@ def control(
         if now >= tell_at:
             tell(live.make(status, now, link.lost))
             tell_at = now + _TELL
-    _release(link, controller, start, first.session_id)
+    _release(link, controller, start)
 
 
-def _release(link: ArmLink, controller: ArmController, start: float, session: int) -> None:
+def _release(link: ArmLink, controller: ArmController, start: float) -> None:
     """Asks the arm to hold until it says that it does."""
     end = link.now() + _RELEASE
     while link.now() < end:
         status = link.next_status(_SILENCE)
-        _check(status, link.arm.name, session)
+        _check(status, link.arm.name)
         if status.guard_state in (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_OFF):
             return
         command = controller.answer(status, link.now() - start)

@@ -16,8 +16,11 @@ _WINDOW, _LATE = 1.0, 0.02
 _REFUSED_IF_LATE = (
     lcmt_dvrk_status.REFUSAL_STALE,
     lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER,
+    lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP,
     lcmt_dvrk_status.REFUSAL_CLOCK_JUMP,
 )
+#: What a guard refuses until the last accepted command expires.
+_EXPIRED_IF_REFUSED = (lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP, lcmt_dvrk_status.REFUSAL_CLOCK_JUMP)
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,8 @@ class LiveStatusMaker:
         problem = []
         if status.num_refused > self._before.num_refused:
             problem.append(f"refused: {describe_refusal(status.refusal_code)}")
+        if status.num_ignored > self._before.num_ignored:
+            problem.append(f"messages that the arm ignores: {describe_refusal(status.ignored_code)}")
         if status.num_expired > self._before.num_expired:
             problem.append("no command for so long that the arm took over")
         self._before, self._told_at, self._answered = status, time, 0
@@ -102,8 +107,10 @@ def takeover_reason(status: lcmt_dvrk_status, before: lcmt_dvrk_status, answers:
     late = answers.lateness()
     if late and (expired or not refused or status.refusal_code in _REFUSED_IF_LATE):
         return late
-    if expired:
+    if expired and not (refused and status.refusal_code in _EXPIRED_IF_REFUSED):
         return "commands came too late for it (use --realtime)"
     if refused:
         return f"the last refusal is: {describe_refusal(status.refusal_code)}"
+    if status.num_ignored > before.num_ignored:
+        return f"messages that it ignores: {describe_refusal(status.ignored_code)}"
     return f"its state is {describe_state(status.guard_state)}"

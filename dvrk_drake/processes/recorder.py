@@ -11,13 +11,20 @@ import lcm
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import STATUS_PREFIX, describe_state, status_channel
+from dvrk_drake.models.lcm_messages import STATUS_PREFIX, StatusFilter, describe_state, status_channel
+from dvrk_drake.models.message_key import MessageKey
 from dvrk_drake.models.recording_stream import RecordingFile, check_stream_output, open_recording_file
 from dvrk_drake.models.status_stream import StatusStream
 from dvrk_drake.processes.lcm_network import handle_message
 
 #: How long the first status may take [s], and after how long without one the live line says so.
 FIRST_STATUS, SILENCE = 10.0, 0.5
+#: After so long without a status of its session an arm was restarted, and is recorded again [s].
+_RESTART = 1.0
+#: Messages that wait while the computer does something else, beyond which new ones are lost.
+_QUEUE = 20_000
+#: Why messages do not belong to the arm's session.
+_FOREIGN = (StatusFilter.OTHER_SESSION, StatusFilter.JUMP, StatusFilter.NOT_AUTHENTIC)
 #: Longest wait for a message before it is looked whether to stop [s].
 _POLL = 0.1
 
@@ -28,10 +35,13 @@ class Recorder:
     Attributes:
         stream: what was taken and what not.
         num_received: messages on the arm's status channel.
+        foreign: messages that were not recorded because they do not belong to the arm's session, for each reason.
     """
 
-    def __init__(self, arm: Arm, path: str | Path, url: str) -> None:
+    def __init__(self, arm: Arm, path: str | Path, url: str, key: MessageKey | None = None) -> None:
         """Of `arm` on the LCM network `url`; the file is made when its first status is there.
+
+        With `key`, only statuses that are signed with it are recorded.
 
         Raises:
             RecordingError: there can be no new file at `path`.
@@ -39,6 +49,8 @@ class Recorder:
         check_stream_output(path)
         self.stream = StatusStream(arm.name, arm.num_joints)
         self.num_received = 0
+        self.foreign: Counter[str] = Counter()
+        self._filter = StatusFilter(arm.name, arm.num_joints, key, follow_after=_RESTART)
         self._arm, self._path, self._url = arm, path, url
         self._channel = status_channel(arm)
         self._file: RecordingFile | None = None
@@ -47,7 +59,7 @@ class Recorder:
         self._lcm = lcm.LCM(url)
         # All arms' statuses, to say what there is where this one's are not.
         self._subscription = self._lcm.subscribe(f"{STATUS_PREFIX}.*", self._receive)
-        self._subscription.set_queue_capacity(0)
+        self._subscription.set_queue_capacity(_QUEUE)
 
     def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
         """Records until `stopped`, or for `duration` [s] from the first message on.
@@ -58,8 +70,7 @@ class Recorder:
             show: called after every message, or every 0.1 s without, with what gives the live line.
 
         Raises:
-            RecordingError: ended before the first status, none within 10 s, the file cannot be written, or two arms of
-                this name.
+            RecordingError: ended before the first status, none within 10 s, or the file cannot be written.
         """
         try:
             end = time.monotonic() + FIRST_STATUS
@@ -95,12 +106,22 @@ class Recorder:
         ]
         return ", ".join(parts)
 
+    def notes(self) -> list[str]:
+        """Returns what was left out and lost, a line each."""
+        left_out = [f"messages not recorded, {reason}: {count}" for reason, count in self.foreign.items()]
+        return [*left_out, *self.stream.notes()]
+
     def _receive(self, channel: str, data: bytes) -> None:
         if channel != self._channel:
             self._heard[channel] += 1
             return
         self.num_received += 1
-        self._arrivals.append(time.monotonic())
+        now = time.monotonic()
+        reason = self._filter.examine(data, now)
+        if reason in _FOREIGN:
+            self.foreign[reason] += 1
+            return
+        self._arrivals.append(now)
         status = self.stream.take(data)
         if self._file is None:
             if self.stream.last is None:
@@ -111,7 +132,7 @@ class Recorder:
     def _why_silent(self) -> str:
         where = f"on channel {self._channel} of {self._url}"
         if self.num_received:
-            reasons = "; ".join(self.stream.notes())
+            reasons = "; ".join(self.notes())
             return f"no status of {self._arm.name} within {FIRST_STATUS:.0f} s {where}: {reasons}"
         if others := ", ".join(sorted(self._heard)):
             return f"no message within {FIRST_STATUS:.0f} s {where}; there is {others}"

@@ -25,8 +25,9 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
-#: More commands in one step are a flood: the rest waits, and is stale when it is looked at.
-_MESSAGES_A_STEP = 200
+#: Messages that wait for the arm, beyond which new ones are dropped; and how many are handled when a tick begins. Most
+#: are handled while the arm waits for its tick, so this bounds how long a flood can delay it.
+_QUEUE, _MESSAGES_A_STEP = 200, 10
 
 
 def monotonic_utime() -> int:
@@ -45,6 +46,7 @@ def load_driver(path: str | Path) -> DvrkDriver:
         driver.check()
     except StationError as error:
         raise StationError(f"{path}: {error}") from error
+    driver.relative_to(Path(path).parent)
     return driver
 
 
@@ -142,7 +144,7 @@ class SimulatedArm:
         # Opened here, as LCM's reading thread is scheduled like the thread that opens it. Drake's own subscription
         # would keep one message between two steps; a second sender must not hide there.
         network = lcm.LCM(self._url)
-        network.subscribe(command_channel(self.arm), self.hear).set_queue_capacity(_MESSAGES_A_STEP)
+        network.subscribe(command_channel(self.arm), self.hear).set_queue_capacity(_QUEUE)
         self.step()
         pace = Pace(self.driver.status_period, sleep=lambda seconds: listen(network, seconds))
         told = ""

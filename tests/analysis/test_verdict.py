@@ -253,7 +253,9 @@ def test_run_warns_before_it_looks_for_the_arm(files, monkeypatch, capsys):
     capsys.readouterr()
     for path, warnings in ((model, 1), (None, 0)):
         with pytest.raises(ModelError, match="no network"):
-            lcm.ready_controller(SimpleNamespace(arm="mtmr", model=path, lcm_url="", realtime=False), "gravity")
+            lcm.ready_controller(
+                SimpleNamespace(arm="mtmr", model=path, lcm_url="", realtime=False, key=None), "gravity"
+            )
         assert capsys.readouterr().err.count("shoulder_pitch (do not use)") == warnings
 
 

@@ -25,7 +25,7 @@ def simulated(monkeypatch):
     def ready(options, mode):
         controller = ArmController(arm, IdentifiedModel.from_arm(arm), mode, PERIOD)
         what.arms.append(StickyArm(arm, IdentifiedModel.from_arm(arm), np.zeros(7), near_poses()[0]))
-        return controller, "", PERIOD
+        return controller, lambda: None, PERIOD
 
     def control(link, controller, stopped, tell, lead):
         sticky = what.arms[-1]
@@ -36,7 +36,6 @@ def simulated(monkeypatch):
 
     monkeypatch.setattr("dvrk_drake.cli.collect.ready_controller", ready)
     monkeypatch.setattr("dvrk_drake.processes.control.control", control)
-    monkeypatch.setattr("dvrk_drake.processes.control.ArmLink", lambda arm, url: None)
     monkeypatch.setattr(
         "dvrk_drake.processes.simulated_arm.stop_on_signals", lambda: lambda: what.stopped(what.arms[-1])
     )

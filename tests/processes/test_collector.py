@@ -179,10 +179,10 @@ def lead_until_obeyed(tmp_path):
     """A collector that leads an arm behind a guard, until it has measured a pose; with an old refusal in the status."""
     made = make_collector(tmp_path / "o.csv", near_poses(), np.zeros(7), both_sides=False, arm_type=GuardedArm)
     collector, controller, arm = made
-    stranger = controller.answer(arm.status(), 0.0)
-    stranger.arm_name = "PSM1"
-    arm.step(stranger)
-    assert arm.guard.refusal_code == Status.REFUSAL_WRONG_ARM
+    bad = controller.answer(arm.status(), 0.0)
+    bad.effort = [np.nan] * 7
+    arm.step(bad)
+    assert arm.guard.refusal_code == Status.REFUSAL_NOT_FINITE
     lead(collector, controller, arm, 10.0, collector.done.any)
     assert collector.done.any() and arm.guard.state == Status.STATE_EFFORT
     return made
@@ -192,7 +192,9 @@ def problem_after(made, pause):
     """What the collector says if its own clock goes on by `pause` [s] and it then answers as ever."""
     collector, controller, arm = made
     start = PERIOD * arm.ticks + pause
-    for tick in range(5):
+    for tick in range(60):  # longer than the expiry
+        if collector.finished:
+            break
         status, time = arm.status(), start + PERIOD * tick
         arm.step(controller.answer(status, time, collector.lead(status, time)))
     collector.close()
@@ -221,10 +223,11 @@ def test_a_pause_of_the_arms_computer_is_not_a_clock_jump(tmp_path):
 def test_a_refusal_without_a_pause_is_named(tmp_path):
     made = lead_until_obeyed(tmp_path)
     collector, controller, arm = made
-    status, time = arm.status(), PERIOD * arm.ticks
-    command = controller.answer(status, time, collector.lead(status, time))
-    command.utime -= 10**6
-    arm.step(command)
+    while not collector.finished:
+        status, time = arm.status(), PERIOD * arm.ticks
+        command = controller.answer(status, time, collector.lead(status, time))
+        command.utime -= 10**6
+        arm.step(command)
     problem = problem_after(made, 0.0)
     assert "the last refusal is: after a jump of the sender's clock" in problem
 
@@ -237,3 +240,6 @@ def test_a_refusal_of_an_earlier_time_is_not_named():
     assert takeover_reason(status, before, AnswerTimes()) == "its state is hold"
     status.num_refused += 1
     assert takeover_reason(status, before, AnswerTimes()) == "the last refusal is: from a second sender"
+    status.num_refused, status.num_ignored, status.ignored_code = 3, 1, Status.REFUSAL_NOT_AUTHENTIC
+    problem = takeover_reason(status, before, AnswerTimes())
+    assert problem == "messages that it ignores: not signed with the arm's key (--key)"

@@ -15,6 +15,8 @@ LIMIT = ARM.effort_limits
 SESSION = 77
 Q = np.array([0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5])  # inside all limits
 MS = 1000
+#: For tests that switch the arm off, which a guard accepts only if it is configured to.
+WITH_OFF = (Command.POSITION, Command.EFFORT, Command.OFF)
 
 
 def modes(*allowed):

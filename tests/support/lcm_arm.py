@@ -29,7 +29,7 @@ class SimulatedArm:
         self.arm = load_arm(name)
         builder = DiagramBuilder()
         self.station = builder.AddSystem(ArmStation(self.arm, modify_plant=modify_plant))
-        apply_driver_config(driver or DvrkDriver(), self.station, lcm, builder, start_utime=START)
+        self.driver = apply_driver_config(driver or DvrkDriver(), self.station, lcm, builder, start_utime=START)
         self.statuses = []
         lcm.Subscribe(f"DVRK_STATUS_{self.arm.name}", lambda data: self.statuses.append(Status.decode(data)))
         self.simulator = Simulator(builder.Build())
@@ -41,6 +41,10 @@ class SimulatedArm:
     def step(self):
         self.tick += 1
         self.simulator.AdvanceTo(1e-3 * self.tick)
+
+    @property
+    def guard(self):
+        return self.driver.GetGuard(self.driver.GetMyContextFromRoot(self.simulator.get_context()))
 
     def drift(self):
         return np.abs(self.station.get_positions(self.context) - POSES[self.arm.name.lower()]).max()

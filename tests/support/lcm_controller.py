@@ -59,5 +59,19 @@ def main(arguments: list[str]) -> None:
         controller.lcm.handle()
 
 
+def flood(arguments: list) -> None:
+    """Publishes one good command of a stranger as fast as it can; arguments: URL, a status to answer as bytes."""
+    url, data = arguments
+    network, status, command = lcm.LCM(url), lcmt_dvrk_status.decode(data), lcmt_dvrk_command()
+    n = status.num_joints
+    command.utime, command.sequence, command.sender_id = 1, 2, draw_id()
+    command.session_id, command.status_utime = status.session_id, status.utime
+    command.arm_name, command.num_joints, command.control_mode = status.arm_name, n, lcmt_dvrk_command.EFFORT
+    command.position = command.velocity = command.effort = [0.0] * n
+    message = command.encode()
+    while True:
+        network.publish(f"DVRK_COMMAND_{status.arm_name}", message)
+
+
 if __name__ == "__main__":
     main(sys.argv[1:])

@@ -5,16 +5,18 @@ Processes are forked from one that has compiled everything; where a test starts 
 """
 
 import os
+import re
 import signal
 import subprocess
 import time
 from pathlib import Path
 
 import lcm
+import lcm_controller
 import numpy as np
 import pytest
 from arm_observer import NETWORK_URL, Observer, check_clock, holds, takes_efforts
-from arm_processes import PATIENT_DRIVER, POSES, CommandLine, start_arm, start_controller, start_run
+from arm_processes import PATIENT_DRIVER, POSES, CommandLine, Forked, start_arm, start_controller, start_run
 from own_network import inside, outside, run_inside, watchdog
 from patience import PATIENCE, wait_until
 
@@ -22,10 +24,13 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.message_key import create_key_file
 from dvrk_drake.processes.pace import Pace, make_realtime
 from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
 
 OTHER_URL = "udpm://239.255.76.67:7668?ttl=0"
+#: Of tests that publish garbage, which observers do not read.
+THIRD_URL = "udpm://239.255.76.67:7669?ttl=0"
 #: Options of a patient arm, and its expiry [s] and a little: so long it remembers a sender that is silent.
 PATIENT, FORGOTTEN = ("--driver", PATIENT_DRIVER), 0.6
 #: Speed at which logs are played: the network loses nothing when a busy computer delays the player.
@@ -248,32 +253,42 @@ def test_run_starts_ramps_in_and_leaves_the_arm_to_its_hold(arm, mode):
 
 
 @inside
-def test_run_stops_when_the_arm_faults_and_refuses_one_that_has_a_fault(arm):
-    name, _, observer = arm
-    process = start_run(name)
-    other = None
+def test_run_stops_when_the_arm_faults_and_refuses_one_that_has_a_fault():
+    arm = ScriptedArm(OTHER_URL)
+
+    def ends(*options):
+        process = start_run("mtml", "--realtime", "--lcm-url", OTHER_URL, *options)
+        try:
+            yield process
+            arm.say_until(lambda: process.poll() is not None, "end of run")
+            assert process.wait() == 2
+        finally:
+            process.end()
+        yield process.said()
+
+    run = ends()
+    process = next(run)
+    arm.say_until(lambda: arm.commands, "first command", process)
+    arm.status.guard_state, arm.status.accepted_modes = Status.STATE_FAULT, 0b10
+    arm.status.fault_code, arm.status.fault_text = Status.FAULT_DRIVER, "the amplifier is hot"
+    assert "MTML has a fault: the amplifier is hot" in next(run)
+    again = ends()
+    next(again)
+    assert "Look at the arm, then start again with --reset" in next(again)
+    arm.commands.clear()
+    meant = start_run("mtml", "--reset", "--realtime", "--lcm-url", OTHER_URL)
     try:
-        observer.until(takes_efforts, "run", process=process)
-        other = start_controller(name, "--echo")
-        observer.until(lambda status: status.guard_state == Status.STATE_FAULT, "fault")
-        assert process.wait() == 2
+        arm.say_until(lambda: any(command.reset_fault for command in arm.commands), "reset", meant)
+        arm.status.guard_state, arm.status.accepted_modes = Status.STATE_HOLD, 0b1110
+        arm.status.fault_code, arm.status.fault_text = Status.FAULT_NONE, ""
+        count = len(arm.commands)
+        arm.say_until(lambda: arm.commands[count:] and arm.commands[-1].control_mode == Command.EFFORT, "run", meant)
+        meant.send_signal(signal.SIGINT)
+        arm.say_until(lambda: meant.poll() is not None, "end of run")
     finally:
-        process.end()
-        if other is not None:
-            other.end()
-    assert "has a fault: senders" in process.said()
-    again = start_run(name)
-    assert again.wait() == 2
-    assert "Look at the arm, then start again with --reset" in again.said()
-    observer.during(FORGOTTEN)
-    meant = start_run(name, "--reset")
-    try:
-        observer.until(takes_efforts, "run after the reset", process=meant)
-    finally:
-        said = meant.end(signal.SIGINT)
+        said = meant.end()
     assert meant.wait() == 0, said
-    assert f"{name.upper()} has a fault, which is reset now: senders" in said
-    assert drift(*observer.during(0.1)) < 1e-3
+    assert "MTML has a fault, which is reset now: the amplifier is hot" in said
 
 
 @inside
@@ -286,7 +301,11 @@ def test_garbage_neither_stops_nor_moves_the_arm(arm):
     command.arm_name, command.num_joints, command.control_mode = name.upper(), n, Command.EFFORT
     command.session_id, command.sender_id = draw_id(), draw_id()
     command.position, command.velocity, command.effort = [0.0] * n, [0.0] * n, [1e3] * n
-    refused, first = observer.last.num_refused, len(observer.heard)
+
+    def unaccepted(status):
+        return status.num_refused + status.num_ignored
+
+    before, first = unaccepted(observer.last), len(observer.heard)
     for k in range(10_000):
         command.status_utime, command.sequence, command.utime = observer.last.utime, k, observer.last.utime
         data = bytearray(command.encode() if k % 2 else generator.bytes(int(generator.integers(0, 400))))
@@ -296,9 +315,9 @@ def test_garbage_neither_stops_nor_moves_the_arm(arm):
         network.publish(f"DVRK_COMMAND_{name.upper()}", bytes(data))
         if k % 20 == 0:
             # No faster than the arm reads on a busy machine: what the system drops says nothing about the arm.
-            wait_until(lambda k=k: k <= observer.last.num_refused - refused + 100, "refusals", process)
+            wait_until(lambda k=k: k <= unaccepted(observer.last) - before + 100, "refusals", process)
     # UDP may lose a few.
-    observer.until(lambda status: status.num_refused - refused > 9_000, "refusals", first, process)
+    observer.until(lambda status: unaccepted(status) - before > 9_000, "refusals", first, process)
     heard = observer.heard[first:]
     check_clock(heard)
     assert all(map(holds, heard))
@@ -315,8 +334,9 @@ def test_a_jump_of_the_controllers_clock_is_followed_by_a_hold_and_a_new_start(a
         jumped = observer.until(
             lambda status: status.refusal_code == Status.REFUSAL_CLOCK_JUMP, "refusal", begun, controller
         )
-        assert holds(observer.heard[jumped])
-        observer.until(takes_efforts, "a new start", jumped, controller)
+        # The last good command expires first.
+        held = observer.until(holds, "hold", jumped, controller)
+        observer.until(takes_efforts, "a new start", held, controller)
         observer.during(0.2)
     finally:
         controller.end()
@@ -391,19 +411,18 @@ def test_an_arm_that_is_killed_and_restarted_hears_nothing_from_run_nor_from_a_l
             arm = start_arm("mtml", *PATIENT, *on_other)
             first = observer.until(lambda status: status.session_id != killed, "a new session", process=arm)
             assert run.wait() == 2
-        # By whichever it notices first: a second of silence, or a session that it did not start with.
-        assert "no status of MTML for 1 s" in run.said() or "MTML was restarted: look at it" in run.said()
+        assert "no status of MTML for 1 s" in run.said()
         assert observer.last.num_refused == 0
         assert log.count("mtml") > 500
         log.play()
         enough = 0.9 * log.count("mtml")
-        observer.until(lambda status: status.num_refused > enough, "refusals", first)
+        observer.until(lambda status: status.num_ignored > enough, "ignored commands", first)
     finally:
         print(run.end(), arm.end())
     heard = observer.heard[first:]
     assert all(map(holds, heard))
     assert heard[-1].num_accepted == 0
-    assert heard[-1].refusal_code == Status.REFUSAL_WRONG_SESSION
+    assert heard[-1].ignored_code == Status.REFUSAL_WRONG_SESSION
     assert drift(*heard) < 1e-3
 
 
@@ -413,6 +432,7 @@ class ScriptedArm:
     def __init__(self, url):
         self.commands, self.lcm, self.pace = [], lcm.LCM(url), Pace(1e-3)
         self.lcm.subscribe("DVRK_COMMAND_MTML", lambda _, data: self.commands.append(Command.decode(data)))
+        self.foreign = list  # what others publish after each status
         self.held = IdentifiedModel.from_arm(load_arm("mtml")).holding_torque(POSES["mtml"])
         self.status = status = Status()
         status.arm_name, status.num_joints, status.session_id, status.utime = "MTML", 7, draw_id(), 10**15
@@ -436,47 +456,121 @@ class ScriptedArm:
             self.pace.wait()
             self.status.utime, self.status.sequence = self.status.utime + 1000, self.status.sequence + 1
             self.lcm.publish("DVRK_STATUS_MTML", self.status.encode())
+            for message in self.foreign():
+                self.lcm.publish("DVRK_STATUS_MTML", message)
             while self.lcm.handle_timeout(0):
                 pass
 
 
 @inside
-def test_run_goes_on_when_the_arms_clock_jumps_and_ends_when_its_session_changes():
-    arm, run = ScriptedArm(OTHER_URL), start_run("mtml", "--mode", "hold", "--realtime", "--lcm-url", OTHER_URL)
+@pytest.mark.parametrize("ends", ["restarted", "clock"])
+def test_run_goes_on_beside_foreign_statuses_and_ends_when_its_session_is_silent(ends):
+    arm, run = ScriptedArm(THIRD_URL), start_run("mtml", "--mode", "hold", "--realtime", "--lcm-url", THIRD_URL)
+    session = arm.status.session_id
+
+    def foreign():
+        """Corrupted and spoofed copies of the status, with another pose."""
+        data = arm.status.encode()
+        yield data[:-60]
+        yield os.urandom(300)
+        for field, value in (("session_id", 5), ("sequence", 2**62), ("utime", 2**62), ("sequence", 1), ("utime", 0)):
+            spoofed = Status.decode(data)
+            spoofed.sequence, spoofed.position = spoofed.sequence + 1, [0.0] * 7
+            setattr(spoofed, field, value)
+            yield spoofed.encode()
+
     try:
         arm.say_until(lambda: arm.commands, "first command", run)
         arm.status.guard_state, arm.status.command_sender_id = Status.STATE_EFFORT, arm.commands[0].sender_id
         arm.say(1500)
-        first = len(arm.commands)
-        for jump in (3_600_000_000, -7_200_000_000):
-            arm.status.utime, count = arm.status.utime + jump, len(arm.commands)
-            # Run answers the newest status; a busy computer makes it leave some out.
-            arm.say_until(lambda count=count: len(arm.commands) >= count + 300, "300 commands", run)
-            assert abs(arm.commands[-1].status_utime - arm.status.utime) < 600_000_000
+        first, arm.foreign = len(arm.commands), foreign
+        # Run answers the newest status; a busy computer makes it leave some out.
+        arm.say_until(lambda: len(arm.commands) >= first + 300, "300 commands", run)
+        arm.foreign = list
         answers = arm.commands[first:]
         np.testing.assert_allclose([command.effort for command in answers], len(answers) * [arm.held], atol=1e-9)
-        advance = np.diff([command.utime for command in answers])
-        assert np.all((advance > 0) & (advance < 600_000_000))  # of its own clock, which did not jump
-        assert {command.session_id for command in arm.commands} == {arm.status.session_id}
-        session, arm.status.session_id = arm.status.session_id, draw_id()
+        assert {command.session_id for command in arm.commands} == {session}
+        if ends == "clock":
+            arm.status.utime += 3_600_000_000
+        else:
+            arm.status.session_id = draw_id()
         arm.say_until(lambda: run.poll() is not None, "end of run")
         assert run.wait() == 2
     finally:
-        run.end()
-    assert "MTML was restarted: look at it, then start again" in run.said()
+        said = run.end()
+    assert "no status of MTML for 1 s" in said
+    assert ("MTML was restarted: look at it, then start again" in said) == (ends == "restarted")
+    most = {"restarted": "of another session", "clock": "with a jump of sequence or time"}[ends]
+    assert re.search(rf"; ignored: \d+ {most}", said), said
     assert {command.session_id for command in arm.commands} == {session}
+    assert all(command.status_utime <= 10**15 + 600_000_000 for command in arm.commands)
 
 
 @inside
-def test_two_controllers_are_noticed_and_a_reset_must_be_meant(arm):
+def test_of_two_controllers_the_first_stays_in_command(arm):
     name, _, observer = arm
-    first, second = start_controller(name, "--echo"), start_controller(name, "--echo")
+    first = start_controller(name)
+    second = None
     try:
-        fault = observer.until(lambda status: status.fault_code == Status.FAULT_DUPLICATE_SENDER, "fault")
-        observer.during(0.2)
+        begun = observer.until(takes_efforts, "start of the controller", process=first)
+        sender = observer.heard[begun].command_sender_id
+        second = start_controller(name)
+        ignored = observer.last.num_ignored
+        last = observer.until(lambda status: status.num_ignored > ignored + 500, "the second controller", begun, second)
     finally:
         first.end()
-        second.end()
-    assert {status.guard_state for status in observer.heard[fault:]} == {Status.STATE_FAULT}
-    reset(name, observer)
-    assert drift(*observer.during(0.1)) < 1e-3
+        if second is not None:
+            second.end()
+    heard = observer.heard[begun : last + 1]
+    assert {(status.guard_state, status.command_sender_id) for status in heard} == {(Status.STATE_EFFORT, sender)}
+    assert heard[-1].ignored_code == Status.REFUSAL_OTHER_SENDER
+    assert drift(*heard) < 1e-3
+
+
+@inside
+def test_with_a_key_a_flood_of_foreign_commands_neither_slows_nor_moves_the_arm(tmp_path):
+    """Good commands of a stranger, as fast as a process can publish them.
+
+    Other work of a busy computer slows the arm as well, so one undisturbed attempt of five is enough.
+    """
+    key = tmp_path / "a.key"
+    create_key_file(key)
+    options = ("--lcm-url", OTHER_URL, "--key", key)
+    observer = Observer("mtml", OTHER_URL)
+    arm = start_arm("mtml", *PATIENT, *options)
+    observer.until(lambda status: True, "first status", process=arm)
+    run, flood = start_run("mtml", "--mode", "hold", "--realtime", *map(str, options)), None
+
+    def rate():
+        """Milliseconds of the arm's clock in one by the wall clock."""
+        first = len(observer.heard)
+        observer.during(2.0)
+        utimes = [status.utime for status in observer.heard[first:]]
+        times = observer.times[first : first + len(utimes)]
+        return 1e-6 * (utimes[-1] - utimes[0]) / (times[-1] - times[0])
+
+    try:
+        first = observer.until(takes_efforts, "run", process=run)
+        for _ in range(5):
+            observer.until(takes_efforts, "run", process=run)
+            alone, ignored = rate(), observer.last.num_ignored
+            flood = Forked(lcm_controller.flood, OTHER_URL, observer.last.encode())
+            begun = observer.until(
+                lambda status, ignored=ignored: status.num_ignored > ignored + 100, "flood", process=flood
+            )
+            beside, heard = rate(), observer.heard[begun:]
+            flood.end()
+            acting = np.mean([takes_efforts(status) for status in heard])
+            print(f"rate beside a flood to that without: {beside / alone:.3f}; efforts act in {acting:.3f} of the time")
+            if beside > 0.9 * alone and acting == 1.0:
+                break
+        else:
+            pytest.fail(run.said() + arm.said())
+    finally:
+        if flood is not None:
+            flood.end()
+        said = run.end(signal.SIGINT)
+        said += arm.end(signal.SIGINT)
+    assert heard[-1].ignored_code == Status.REFUSAL_NOT_AUTHENTIC, said
+    assert {status.command_sender_id for status in observer.heard[first:]} <= {0, heard[0].command_sender_id}
+    assert drift(*observer.heard[first:]) < 1e-3

@@ -210,17 +210,3 @@ def test_silence_is_explained(tmp_path, played):
     assert alone.wait(PATIENCE) == 2
     assert "does the arm's process or bridge run, on this network?" in alone.stdout.read()
     assert not list(tmp_path.glob("*.csv"))
-
-
-@inside
-def test_two_arms_of_one_name_end_the_recording(tmp_path, played):
-    other = tmp_path / "other.log"
-    other.write_bytes(log_bytes(statuses(2000, session_id=5)))
-    (recorder,) = start_records([tmp_path / "a.csv"])
-    while recorder.poll() is None:
-        players = [start(str(TOOLS / "lcm-logplayer"), str(path)) for path in (played, other)]
-        for player in players:
-            player.wait(PATIENCE)
-    assert recorder.returncode == 2
-    assert "two arms called MTML send at the same time" in recorder.stdout.read()
-    assert len(read_recording(tmp_path / "a.csv", ARM)) > 0

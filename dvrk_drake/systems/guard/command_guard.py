@@ -11,11 +11,14 @@ from numpy.typing import ArrayLike
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.systems.guard.command_stream import (
+    FOREIGN,
+    OUT_OF_STREAM,
     CommandInForce,
     CommandStream,
     GuardCounts,
     WallClock,
-    refusal_by_itself,
+    content_refusal,
+    foreign_refusal,
 )
 from dvrk_drake.systems.guard.follower import Follower, GuardOutput
 from dvrk_drake.systems.guard.limits import GuardLimits, Vector
@@ -58,7 +61,7 @@ class CommandGuard:
         HOLD --OFF after a HOLD--> OFF --HOLD--> HOLD       any --HOLD--> HOLD, but from FAULT
         HOLD --POSITION, EFFORT--> STARTING --good for start_time--> POSITION, EFFORT
         STARTING --refused, expired--> HOLD
-        POSITION, EFFORT --HOLD--> HOLD; --expired, sender's clock jumped--> HOLD until a resume
+        POSITION, EFFORT --HOLD--> HOLD; --expired--> HOLD until a resume
         POSITION, EFFORT --the other mode--> STARTING
         any --fault--> FAULT --HOLD with reset_fault, changed from false to true--> HOLD
 
@@ -67,19 +70,23 @@ class CommandGuard:
     two: by the arm's clock, and by the wall clock if there is one. So a command expires also if the arm's clock is late
     or was stopped. Then the arm holds.
 
-    **Resume**: when a command in force expired, the sender's clock jumped or `_take_over` was called, the watchdog took
+    **Resume**: when a command in force expired or `_take_over` was called, the watchdog took
     over. The guard then refuses POSITION and EFFORT until an operator resumes, in the way in which a fault is reset;
     `hold_reason` is why. It is no fault: the arm holds, and OFF is allowed. A HOLD command before the silence, and
     STARTING that ends, need no resume. `GuardSettings.resume_automatically` switches this off; the next sender is then
     watched as the first was.
 
-    **What is refused** (`lcmt_dvrk_status.REFUSAL_*` has the list): what is unreadable, of another arm, size or
-    session, not finite, expired when it comes, out of order or sent twice, in a mode that is not accepted now. It does
-    not act and does not keep an older command alive, so bad commands end in HOLD.
+    **What is refused** (`lcmt_dvrk_status.REFUSAL_*` has the list): commands that are not finite, expired when they
+    come, out of order or sent twice, after a jump of the sender's sequence or clock, in a mode that is not accepted
+    now. They do not act and do not keep an older command alive, so a stream of bad commands ends in HOLD.
 
-    **OFF** drops an arm without brakes, so no single message does it: the arm must hold, and the sender's last command
-    must have been HOLD. In a fault it is refused: somebody is confused then, and the arm is held. An emergency is what
-    the stop button is for, not a message.
+    **What is ignored**: messages that are unreadable, not authentic, of another arm, size or session, or of a second
+    sender while the first one still sends. They are counted separately and change nothing: the first sender stays in
+    command. Without a key, a sender is only as good as its sender_id, which anybody on the network can copy.
+
+    **OFF** drops an arm without brakes, so it must be in `modes`, and no single message does it: the arm must hold, and
+    the sender's last command must have been HOLD. In a fault it is refused: somebody is confused then, and the arm is
+    held. An emergency is what the stop button is for, not a message.
 
     **Start guard**: before commands act they must have come without a gap of `expiry` and without a refusal for
     `start_time`, all near the present: efforts near the measured ones, positions near the measured ones, also where the
@@ -87,7 +94,7 @@ class CommandGuard:
     present effort beyond what commands may use. A sender that starts with something else is refused, so a restarted or
     confused controller moves nothing.
 
-    **Faults** are latched: two senders at once, a pose beyond a limit (by half the margin) while efforts act, a joint
+    **Faults** are latched: a pose beyond a limit (by half the margin) while efforts act, a joint
     that does not follow position commands, a measurement that is not finite or too old, the arm's clock going backwards
     or standing still, and what a driver reports. The reset must be meant: the flag must change from false to true in a
     HOLD command, and a cause that lasts faults again.
@@ -97,7 +104,8 @@ class CommandGuard:
     soft wall, for whoever starts inside it, comes on in `start_time`; each at its limited rate.
 
     **Clocks**: the sender's and the arm's are never compared, only how far each went between two commands; so they need
-    not be synchronised, and a jump of either is seen. A jump of the arm's clock forward expires what is in force.
+    not be synchronised. Commands after a jump of the sender's clock are refused until what is in force has expired; a
+    jump of the arm's clock forward expires it.
     """
 
     def __init__(
@@ -117,7 +125,7 @@ class CommandGuard:
             model: of the arm, mounted as it is, e.g. `ControlModel(IdentifiedModel.from_arm(arm))`; an identified model
                 detects more.
             settings: the defaults of GuardSettings if None.
-            modes: which of POSITION and EFFORT are accepted; both if None.
+            modes: which of POSITION, EFFORT and OFF are accepted; POSITION and EFFORT if None.
             wall_clock: monotonic time of the computer [us], by which commands expire as well; None: by the arm's clock
                 only, as for an arm in a simulated Diagram. Copies of the guard share it.
 
@@ -134,13 +142,15 @@ class CommandGuard:
         self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
         #: Why the watchdog took over, until an operator resumes; or "".
         self.hold_reason = ""
-        self.refusal_code = lcmt_dvrk_status.REFUSAL_NONE
+        self.refusal_code = self.ignored_code = lcmt_dvrk_status.REFUSAL_NONE
         self.counts = GuardCounts()
         self._modes = tuple(_ACTIVE) if modes is None else modes
         self._expiry = round(1e6 * self.settings.expiry)
         self._wall = None if wall_clock is None else WallClock(wall_clock)
         self._stepped = 0
-        self._stream = CommandStream(self._expiry, round(1e6 * self.settings.clock_tolerance))
+        self._stream = CommandStream(
+            self._expiry, round(1e6 * self.settings.clock_tolerance), self.settings.sequence_jump
+        )
         self._force = CommandInForce()
         self._powered = True
         self._measured = Measurement(arm.num_joints, round(1e6 * self.settings.measurement_age))
@@ -174,17 +184,22 @@ class CommandGuard:
         """Bit 1 << mode for each mode that a command may have now."""
         if self.state == lcmt_dvrk_status.STATE_FAULT:
             return 1 << lcmt_dvrk_command.HOLD
-        modes = [lcmt_dvrk_command.HOLD]
-        if self.state in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_HOLD):
-            modes.append(lcmt_dvrk_command.OFF)
-        if self.state != lcmt_dvrk_status.STATE_OFF and not self.hold_reason:
-            modes.extend(self._modes)
+        modes = {lcmt_dvrk_command.HOLD, *self._modes}
+        if self.state == lcmt_dvrk_status.STATE_OFF or self.hold_reason:
+            modes -= set(_ACTIVE)
+        if self.state not in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_HOLD):
+            modes -= {lcmt_dvrk_command.OFF}
         return sum(1 << mode for mode in modes)
 
     @property
     def sender_id(self) -> int:
         """Whose commands are in force or being watched; 0: nobody's."""
         return self._stream.sender_id if self._is_watched_or_in_force() else 0
+
+    @property
+    def last_sender_id(self) -> int:
+        """Whose commands came last and were not ignored; 0: nobody's."""
+        return self._stream.sender_id
 
     @property
     def last_command(self) -> lcmt_dvrk_command:
@@ -203,21 +218,30 @@ class CommandGuard:
             lcmt_dvrk_status.REFUSAL_NONE, or why it was refused.
         """
         self._expire(utime)
-        code = refusal_by_itself(command, self.arm_name, self.num_joints, self.session_id)
+        code = foreign_refusal(command, self.arm_name, self.num_joints, self.session_id)
         if command is not None and code == lcmt_dvrk_status.REFUSAL_NONE:
             code = self._refusal_now(command, utime)
-        if command is not None and code == lcmt_dvrk_status.REFUSAL_NONE:
-            self._accept(command, utime)
+            if code == lcmt_dvrk_status.REFUSAL_NONE:
+                self._accept(command, utime)
+                return code
+        if code in FOREIGN:
+            self.ignore(code)
             return code
         self.counts.refused += 1
         self.refusal_code = code
-        if (
-            command is not None
-            and command.sender_id == self.sender_id
-            and self.state == lcmt_dvrk_status.STATE_STARTING
-        ):
+        if code not in OUT_OF_STREAM and self.state == lcmt_dvrk_status.STATE_STARTING:
             self._hold()
         return code
+
+    def ignore(self, code: int, count: int = 1) -> None:
+        """Counts messages that were not given to `receive` because they do not belong to the session.
+
+        Args:
+            code: lcmt_dvrk_status.REFUSAL_*, why the last one was ignored.
+            count: how many there were.
+        """
+        self.counts.ignored += count
+        self.ignored_code = code
 
     def step(self, utime: int, measured_utime: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> GuardOutput:
         """What to do from `utime` [us] on.
@@ -340,18 +364,16 @@ class CommandGuard:
             self.hold_reason = self.hold_reason or reason
 
     def _refusal_now(self, command: lcmt_dvrk_command, utime: int) -> int:
-        """REFUSAL_* of a command that is good by itself, given who sent what before and what the arm is doing."""
+        """REFUSAL_* of a command of this session, given who sent what before and what the arm is doing."""
+        if self._stream.is_other_sender(command, utime):
+            return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
+        if (code := content_refusal(command)) != lcmt_dvrk_status.REFUSAL_NONE:
+            return code
         if self._measured.utime is None or not 0 <= utime - command.status_utime <= self._expiry:
             return lcmt_dvrk_status.REFUSAL_STALE
-        before, code = self._stream.sender_id, self._stream.refusal(command, utime)
-        if code == lcmt_dvrk_status.REFUSAL_OTHER_SENDER:
-            both = f"senders {before} and {command.sender_id} command at the same time"
-            self.report_fault(both, lcmt_dvrk_status.FAULT_DUPLICATE_SENDER)
-        elif code == lcmt_dvrk_status.REFUSAL_CLOCK_JUMP and self.state == lcmt_dvrk_status.STATE_STARTING:
-            self._hold()
-        elif code == lcmt_dvrk_status.REFUSAL_CLOCK_JUMP and self._is_watched_or_in_force():
-            self._take_over(f"the clock of sender {command.sender_id} jumped")
-        if code != lcmt_dvrk_status.REFUSAL_NONE:
+        if command.control_mode == lcmt_dvrk_command.OFF and lcmt_dvrk_command.OFF not in self._modes:
+            return lcmt_dvrk_status.REFUSAL_BAD_MODE
+        if (code := self._stream.refusal(command, utime)) != lcmt_dvrk_status.REFUSAL_NONE:
             return code
         if self.state == lcmt_dvrk_status.STATE_FAULT and command.control_mode != lcmt_dvrk_command.HOLD:
             return lcmt_dvrk_status.REFUSAL_FAULT

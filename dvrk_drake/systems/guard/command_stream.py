@@ -1,4 +1,4 @@
-"""What can be said against a command whatever the arm is doing: by itself, and after its sender's others."""
+"""Checks of a command that do not depend on what the arm does: by itself, and after its sender's other commands."""
 
 from __future__ import annotations
 
@@ -18,8 +18,30 @@ ABSURD = 1e6
 #: The longest expiry, 1 s, has so many measurements at 2 kHz.
 _MOST_MEASUREMENTS = 2000
 
-#: Commands are counted in an int64 of the status; nobody loses as many, but a sequence may jump by more.
-_MOST_LOST = 2**63 - 1
+#: Refusals of messages that do not belong to the session or to the sender in command. They are counted separately.
+FOREIGN = frozenset(
+    {
+        lcmt_dvrk_status.REFUSAL_UNREADABLE,
+        lcmt_dvrk_status.REFUSAL_WRONG_ARM,
+        lcmt_dvrk_status.REFUSAL_WRONG_SIZE,
+        lcmt_dvrk_status.REFUSAL_NO_SENDER,
+        lcmt_dvrk_status.REFUSAL_WRONG_SESSION,
+        lcmt_dvrk_status.REFUSAL_NOT_AUTHENTIC,
+        lcmt_dvrk_status.REFUSAL_OTHER_SENDER,
+        lcmt_dvrk_status.REFUSAL_FLOOD,
+    }
+)
+
+#: Refusals of commands that do not continue their sender's stream, as copies and replays of its commands. They do not
+#: interrupt it.
+OUT_OF_STREAM = frozenset(
+    {
+        lcmt_dvrk_status.REFUSAL_STALE,
+        lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER,
+        lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP,
+        lcmt_dvrk_status.REFUSAL_CLOCK_JUMP,
+    }
+)
 
 
 def is_finite(*arrays: Any) -> bool:
@@ -27,8 +49,8 @@ def is_finite(*arrays: Any) -> bool:
     return bool((np.abs(np.concatenate(arrays)) < ABSURD).all())
 
 
-def refusal_by_itself(command: lcmt_dvrk_command | None, arm_name: str, num_joints: int, session_id: int) -> int:
-    """lcmt_dvrk_status.REFUSAL_* of a command that is wrong whatever the arm is doing, else REFUSAL_NONE.
+def foreign_refusal(command: lcmt_dvrk_command | None, arm_name: str, num_joints: int, session_id: int) -> int:
+    """Returns lcmt_dvrk_status.REFUSAL_* of a command that is not meant for this arm and session, else REFUSAL_NONE.
 
     Args:
         command: as received; None: it was not readable.
@@ -43,12 +65,17 @@ def refusal_by_itself(command: lcmt_dvrk_command | None, arm_name: str, num_join
     vectors = (command.position, command.velocity, command.effort)
     if command.num_joints != num_joints or any(len(vector) != num_joints for vector in vectors):
         return lcmt_dvrk_status.REFUSAL_WRONG_SIZE
-    if not is_finite(*vectors):
-        return lcmt_dvrk_status.REFUSAL_NOT_FINITE
     if command.sender_id == 0:
         return lcmt_dvrk_status.REFUSAL_NO_SENDER
     if command.session_id != session_id:
         return lcmt_dvrk_status.REFUSAL_WRONG_SESSION
+    return lcmt_dvrk_status.REFUSAL_NONE
+
+
+def content_refusal(command: lcmt_dvrk_command) -> int:
+    """Returns lcmt_dvrk_status.REFUSAL_* of a command whose numbers or flags are wrong, else REFUSAL_NONE."""
+    if not is_finite(command.position, command.velocity, command.effort):
+        return lcmt_dvrk_status.REFUSAL_NOT_FINITE
     if command.reset_fault and command.control_mode != lcmt_dvrk_command.HOLD:
         return lcmt_dvrk_status.REFUSAL_BAD_RESET
     return lcmt_dvrk_status.REFUSAL_NONE
@@ -56,11 +83,12 @@ def refusal_by_itself(command: lcmt_dvrk_command | None, arm_name: str, num_join
 
 @dataclass
 class GuardCounts:
-    """Commands since the guard was made: taken, missing, refused; and how often one in force expired."""
+    """Commands since the guard was made: accepted, missing, refused, ignored; and how often one in force expired."""
 
     accepted: int = 0
     lost: int = 0
     refused: int = 0
+    ignored: int = 0
     expired: int = 0
 
 
@@ -123,20 +151,27 @@ class CommandInForce:
 
 @dataclass
 class CommandStream:
-    """The commands of whoever was heard last. All times in us, arrivals on the arm's clock.
+    """The commands of one sender. All times in us, arrivals on the arm's clock.
 
-    A sender keeps its place as long as it is heard, with good commands or refused ones; another one that comes in
-    within `expiry` of it is the second of two at once.
+    A sender keeps its place while its commands arrive, accepted or refused. A second sender is refused until the first
+    one has been silent for `expiry`.
+
+    Sequence and time of a command are compared with those of the last accepted command, unless that is older than
+    `expiry`. A refused command changes neither, so a spoofed sequence or time does not end the control of the true
+    sender; a sender whose own clock or sequence jumped starts anew when its last accepted command has expired.
 
     Attributes:
-        expiry: after which a sender that is silent may be followed by another.
+        expiry: time after which a silent sender may be followed by another one, and after which sequence and time of
+            the last accepted command no longer count.
         clock_tolerance: by how much the sender's clock and the arm's may differ from one accepted command to the next.
-        sender_id: of who was heard last; 0: nobody yet.
+        sequence_jump: largest difference in sequence from one accepted command to the next.
+        sender_id: the sender; 0: none yet.
         lost: commands missing between accepted ones.
     """
 
     expiry: int
     clock_tolerance: int
+    sequence_jump: int
     sender_id: int = 0
     lost: int = 0
     _heard: int = 0
@@ -145,20 +180,28 @@ class CommandStream:
     _can_reset: bool = False
     _can_turn_off: bool = False
 
+    def is_other_sender(self, command: lcmt_dvrk_command, utime: int) -> bool:
+        """Returns whether the command is of another sender than the one that still has its place."""
+        return command.sender_id != self.sender_id != 0 and utime - self._heard <= self.expiry
+
     def refusal(self, command: lcmt_dvrk_command, utime: int) -> int:
-        """Of a command good by itself: REFUSAL_OTHER_SENDER, _OUT_OF_ORDER, _CLOCK_JUMP, _SUDDEN_OFF or _NONE."""
+        """Returns REFUSAL_* of a command that is good by itself, or REFUSAL_NONE; it keeps or takes the place."""
+        if self.is_other_sender(command, utime):
+            return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
         if command.sender_id != self.sender_id:
-            if self.sender_id != 0 and utime - self._heard <= self.expiry:
-                return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
             self.forget()
             self.sender_id = command.sender_id
         self._heard = utime
-        if self._last is not None and command.sequence <= self._last.sequence:
-            return lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER
-        if self._last is not None and self._jumped(command.utime - self._last.utime, utime - self._arrival):
-            # What follows is compared with the clock as it is now.
-            self._last, self._arrival = command, utime
-            return lcmt_dvrk_status.REFUSAL_CLOCK_JUMP
+        if self._last is not None and utime - self._arrival > self.expiry:
+            self._last = None
+        if self._last is not None:
+            step = command.sequence - self._last.sequence
+            if step <= 0:
+                return lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER
+            if step > self.sequence_jump:
+                return lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP
+            if self._jumped(command.utime - self._last.utime, utime - self._arrival):
+                return lcmt_dvrk_status.REFUSAL_CLOCK_JUMP
         if command.control_mode == lcmt_dvrk_command.OFF and not self._can_turn_off:
             return lcmt_dvrk_status.REFUSAL_SUDDEN_OFF
         return lcmt_dvrk_status.REFUSAL_NONE
@@ -166,7 +209,7 @@ class CommandStream:
     def accept(self, command: lcmt_dvrk_command, utime: int) -> bool:
         """Goes on to this command; True if it asks for a reset: reset_fault changed from false to true."""
         if self._last is not None:
-            self.lost = min(self.lost + command.sequence - self._last.sequence - 1, _MOST_LOST)
+            self.lost += command.sequence - self._last.sequence - 1
         self._last, self._arrival = command, utime
         resets = command.reset_fault and self._can_reset
         self._can_reset = not command.reset_fault

@@ -64,6 +64,8 @@ class GuardSettings:
         measurement_age: above this age a measurement is none [s].
         start_time: how long commands must be good before they act [s].
         clock_tolerance: by how much a sender's clock and the arm's may differ between two commands [s].
+        sequence_jump: by how much the sequence of a sender's commands may grow from one to the next; 1000 is one second
+            at 1 kHz. A command beyond it is refused.
         start_effort: how far from the present effort effort commands may start, as a fraction of the effort limit.
         margin: least width of the soft wall before each position limit [rad], how far from the present pose position
             commands may start, and twice how far beyond a limit is a fault while efforts act; at most
@@ -91,6 +93,7 @@ class GuardSettings:
     measurement_age: float = field(default=0.02, metadata=within(0.001, 0.1, "s"))
     start_time: float = field(default=0.25, metadata=within(0.05, 10.0, "s"))
     clock_tolerance: float = field(default=0.05, metadata=within(0.001, 1.0, "s"))
+    sequence_jump: int = field(default=1000, metadata=within(1, 100_000))
     start_effort: float = field(default=0.1, metadata=within(0.001, 0.25))
     margin: float = field(default=0.05, metadata=within(0.001, 0.3, "rad"))
     margin_fraction: float = field(default=0.05, metadata=within(0.001, 0.25))

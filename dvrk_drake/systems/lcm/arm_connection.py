@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import time
+
 from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubscriberSystem
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import command_channel, is_old, is_status_of, status_channel
+from dvrk_drake.models.lcm_messages import StatusFilter, command_channel, status_channel
 from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
@@ -22,26 +24,32 @@ def connect_arm(
 
     Args:
         builder: of the Diagram.
-        arm: whose channels they are; messages that are not of it are ignored, and those older than the last one.
-        driver: its configuration.
+        arm: whose channels they are; what does not continue the first session that it tells of is ignored, see
+            `StatusFilter`.
+        driver: its configuration. Its key verifies statuses and signs commands.
         lcm: whose `HandleSubscriptions` somebody else calls; None: one at `driver.lcm_url` that a Simulator handles.
 
     Returns:
         What receives the status, and what sends the command.
+
+    Raises:
+        KeyFileError: the driver's key cannot be used.
     """
+    key = driver.load_key()
+    statuses = StatusFilter(arm.name, arm.num_joints, key)
     if lcm is None:
         lcm = builder.AddNamedSystem("lcm", LcmInterfaceSystem(lcm=DrakeLcm(driver.lcm_url)))
-    is_of_arm = is_status_of(arm)
-    serializer = TolerantSerializer(
-        lcmt_dvrk_status, lambda status, last: is_of_arm(status) and not is_old(status, last)
-    )
+    serializer = TolerantSerializer(lcmt_dvrk_status, read=lambda data: statuses.take(data, time.monotonic()))
     subscriber = builder.AddNamedSystem("status_subscriber", LcmSubscriberSystem(status_channel(arm), serializer, lcm))
     receiver = builder.AddNamedSystem("status_receiver", DvrkStatusReceiver(arm))
     sender = builder.AddNamedSystem("command_sender", DvrkCommandSender(arm))
     publisher = builder.AddNamedSystem(
         "command_publisher",
         LcmPublisherSystem(
-            command_channel(arm), TolerantSerializer(lcmt_dvrk_command), lcm, publish_period=driver.status_period
+            command_channel(arm),
+            TolerantSerializer(lcmt_dvrk_command, key=key),
+            lcm,
+            publish_period=driver.status_period,
         ),
     )
     for system in (receiver, sender):

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import decode
+from dvrk_drake.models.message_key import MessageKey
 from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.guard.command_inbox import CommandInbox
 from dvrk_drake.systems.guard.command_stream import is_finite
 from dvrk_drake.systems.lcm.arm_clock import ArmClock
-
-#: Messages kept from one update to the next; more is a flood, of which the newest are looked at.
-_INBOX = 256
 
 
 class DvrkCommandReceiver(LeafSystem):
@@ -42,8 +38,8 @@ class DvrkCommandReceiver(LeafSystem):
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
     - `lcmt_dvrk_command`: a command, e.g. from an LcmSubscriberSystem; the same one is taken once. Drake keeps only the
-      newest message of a channel, which can hide a second sender: a process that moves an arm gives every message to
-      `Receive` instead.
+      newest message of a channel, and no bytes that a key could verify: a process that moves an arm gives every message
+      to `Receive` instead.
     - `state_estimated` (2n): q, then v, measured. `effort_measured` (n): what the motors apply.
     - `position_control_effort` (n): what the arm's own position controller asks for now.
     - `gravity_effort` (n): the arm's own gravity compensation. Connected, it is added to commanded efforts, and
@@ -68,6 +64,7 @@ class DvrkCommandReceiver(LeafSystem):
         arm: Arm,
         guard: CommandGuard,
         clock: ArmClock | None = None,
+        key: MessageKey | None = None,
     ) -> None:
         """Of `arm` with a `guard` of it.
 
@@ -75,6 +72,7 @@ class DvrkCommandReceiver(LeafSystem):
             arm: for the number of its joints and their effort limits.
             guard: its state at first; each context has its own.
             clock: by which commands are judged, once a period; None: ArmClock().
+            key: must have signed what `Receive` takes; None: not verified.
         """
         super().__init__()
         n = arm.num_joints
@@ -96,11 +94,11 @@ class DvrkCommandReceiver(LeafSystem):
         self.DeclareAbstractOutputPort("guard", lambda: AbstractValue.Make(guard), self._calc_guard, own)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._update)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self._clock.period, 0.0, self._update)
-        self._inbox: deque[bytes] = deque(maxlen=_INBOX)
+        self._inbox = CommandInbox(guard, key)
 
     def Receive(self, data: bytes) -> None:
         """Puts a message, as it came over the wire, into the inbox that the next update takes."""
-        self._inbox.append(data)
+        self._inbox.put(data)
 
     def GetGuard(self, context: Context) -> CommandGuard:
         """The guard of this context, to be read only."""
@@ -111,8 +109,7 @@ class DvrkCommandReceiver(LeafSystem):
             return
         guard = state.get_mutable_abstract_state(int(self._guard)).get_mutable_value()
         utime = self._clock.utime(context)
-        while self._inbox:
-            guard.receive(decode(lcmt_dvrk_command, self._inbox.popleft()), utime)
+        self._inbox.deliver(guard, utime)
         if self._command.HasValue(context):
             command = self._command.Eval(context)
             taken = (command.sender_id, command.sequence, command.utime)

@@ -4,13 +4,19 @@ No postponed annotations here: yaml_load_typed reads the types at run time.
 """
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
+from dvrk_drake.models.message_key import MessageKey
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.systems.guard.settings import GuardSettings
 
-_MODES = {"position": lcmt_dvrk_command.POSITION, "effort": lcmt_dvrk_command.EFFORT}
+_MODES = {
+    "position": lcmt_dvrk_command.POSITION,
+    "effort": lcmt_dvrk_command.EFFORT,
+    "off": lcmt_dvrk_command.OFF,
+}
 
 
 @dataclass
@@ -20,7 +26,11 @@ class DvrkDriver:
     Attributes:
         lcm_url: of the LCM network; empty: the environment's LCM_DEFAULT_URL, or LCM's default.
         status_period: in which the arm says what it measures, and controllers answer [s].
-        control_modes: what the arm accepts beside hold and off: position, effort.
+        control_modes: modes that the arm accepts beside hold: position, effort, "off" (quoted: to YAML off is false).
+            An arm that is off falls, so it is not in the default.
+        key_file: key that commands must be signed with and statuses are signed with, as `dvrk-drake key` makes it,
+            relative to the driver's YAML file; empty: messages are not authenticated, and any process on the network
+            can command the arm.
         gravity_compensation: the arm adds its own gravity compensation to commanded efforts, as a dVRK does on request.
         model: file of the identified model with which the guard checks measurements; empty: what the arm's SDF states.
         guard: what its command guard allows.
@@ -29,6 +39,7 @@ class DvrkDriver:
     lcm_url: str = ""
     status_period: float = field(default=1e-3, metadata=within(0.0005, 0.01, "s"))
     control_modes: list[str] = field(default_factory=lambda: ["position", "effort"])
+    key_file: str = ""
     gravity_compensation: bool = False
     model: str = ""
     guard: GuardSettings = field(default_factory=GuardSettings)
@@ -47,6 +58,19 @@ class DvrkDriver:
             raise StationError(f"control_modes must be a list of {', '.join(_MODES)}; got {list(self.control_modes)}")
         if fault := number_fault(self):
             raise StationError(fault)
+
+    def relative_to(self, folder: Path) -> None:
+        """Resolves a relative `key_file`, which is meant relative to `folder`."""
+        if self.key_file:
+            self.key_file = str(folder / self.key_file)
+
+    def load_key(self) -> MessageKey | None:
+        """Returns the key in `key_file`, or None without one.
+
+        Raises:
+            KeyFileError: as `MessageKey.load`.
+        """
+        return MessageKey.load(self.key_file) if self.key_file else None
 
     def accepted_modes(self) -> tuple[int, ...]:
         """`control_modes` as values of lcmt_dvrk_command.control_mode."""

@@ -85,5 +85,6 @@ def fill_in_guard(status: lcmt_dvrk_status, guard: CommandGuard) -> None:
     counts = guard.counts
     status.num_accepted, status.num_lost, status.num_refused = counts.accepted, counts.lost, counts.refused
     status.num_expired, status.refusal_code = counts.expired, guard.refusal_code
+    status.num_ignored, status.ignored_code = counts.ignored, guard.ignored_code
     status.position_commanded = guard.output.position.tolist()
     status.joint_flags = guard.output.joint_flags.tolist()

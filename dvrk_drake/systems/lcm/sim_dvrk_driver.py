@@ -13,6 +13,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
+from dvrk_drake.models.message_key import MessageKey
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.guard.command_guard import CommandGuard
@@ -50,6 +51,7 @@ class SimDvrkDriver(Diagram):
         model: IdentifiedModel | None = None,
         start_utime: int = 0,
         wall_clock: Callable[[], int] | None = None,
+        key: MessageKey | None = None,
     ) -> None:
         """Driver of `arm`.
 
@@ -60,6 +62,7 @@ class SimDvrkDriver(Diagram):
                 driver's if None, or else what the arm's SDF states.
             start_utime: the arm's clock at time zero of the context [us].
             wall_clock: of the guard [us]; None: commands expire by the context's time only.
+            key: must have signed what `Receive` takes; None: not verified.
 
         Raises:
             ModelError: the driver's model cannot be read, or is of another arm.
@@ -71,7 +74,7 @@ class SimDvrkDriver(Diagram):
         guard_model = ControlModel(model, with_gravity=not driver.gravity_compensation)
         guard = CommandGuard(arm, draw_id(), guard_model, driver.guard, driver.accepted_modes(), wall_clock)
         builder = DiagramBuilder()
-        self._receiver = builder.AddNamedSystem("command_receiver", DvrkCommandReceiver(arm, guard, clock))
+        self._receiver = builder.AddNamedSystem("command_receiver", DvrkCommandReceiver(arm, guard, clock, key))
         position_controller = builder.AddNamedSystem(
             "position_controller", GravityPidController(model, period=clock.period)
         )
@@ -136,7 +139,7 @@ def apply_driver_config(
     """Puts a simulated station behind LCM: DVRK_COMMAND_<ARM> moves it, DVRK_STATUS_<ARM> tells of it.
 
     Args:
-        driver: its configuration; its `lcm_url` is not read.
+        driver: its configuration; its `lcm_url` is not read. Its key verifies commands and signs statuses.
         station: in `builder`, with its effort input free.
         lcm: whose `HandleSubscriptions` is called by somebody else, e.g. an LcmInterfaceSystem or a loop.
         builder: of the Diagram.
@@ -148,10 +151,13 @@ def apply_driver_config(
 
     Returns:
         The driver that was added.
+
+    Raises:
+        KeyFileError: the driver's key cannot be used.
     """
-    arm, name = station.arm, station.arm.name.lower()
+    arm, name, key = station.arm, station.arm.name.lower(), driver.load_key()
     sim_driver = builder.AddSystem(
-        SimDvrkDriver(arm, driver, model=model, start_utime=start_utime, wall_clock=wall_clock)
+        SimDvrkDriver(arm, driver, model=model, start_utime=start_utime, wall_clock=wall_clock, key=key)
     )
     if subscribe:
         lcm.Subscribe(command_channel(arm), sim_driver.Receive)
@@ -162,7 +168,7 @@ def apply_driver_config(
         f"{name}_status_publisher",
         LcmPublisherSystem(
             status_channel(arm),
-            TolerantSerializer(lcmt_dvrk_status),
+            TolerantSerializer(lcmt_dvrk_status, key=key),
             lcm,
             publish_period=driver.status_period,
         ),

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, Bench, N, Q, Weightless
+from guard_bench import ARM, LIMIT, WITH_OFF, Bench, N, Q, Weightless
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -37,7 +37,7 @@ def random_command(bench, generator):
 @pytest.mark.parametrize("seed", range(4))
 def test_fuzz_never_an_unlimited_output(seed):
     generator = np.random.default_rng(seed)
-    bench = Bench()
+    bench = Bench(modes=WITH_OFF)
     limits = bench.guard.limits
     states, codes = set(), set()
     last_effort, last_flags, last_mode = None, None, Command.HOLD
@@ -64,6 +64,8 @@ def test_fuzz_never_an_unlimited_output(seed):
         bench.effort = bench.output.effort + generator.normal(size=N) * 0.01 * LIMIT
         if generator.random() < 5e-4:
             bench.q[generator.integers(N)] = np.nan
+        if generator.random() < 2e-4:
+            bench.guard.report_fault("the amplifier is hot")
         output = bench.tick()
         bench.q = np.nan_to_num(bench.q)
 

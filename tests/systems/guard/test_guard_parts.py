@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from guard_bench import ARM, SESSION, Bench, N
+from guard_bench import Bench, N
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.systems.guard.command_stream import CommandInForce, CommandStream, is_finite, refusal_by_itself
+from dvrk_drake.systems.guard.command_stream import CommandInForce, CommandStream, content_refusal, is_finite
 from dvrk_drake.systems.guard.measurement import Measurement
 from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
 
@@ -98,7 +98,7 @@ class Stream:
     """Commands of a sender whose clock reads what the arm's does, less a million seconds."""
 
     def __init__(self, **fields):
-        self.stream = CommandStream(expiry=50 * MS, clock_tolerance=30 * MS, **fields)
+        self.stream = CommandStream(expiry=50 * MS, clock_tolerance=30 * MS, sequence_jump=1000, **fields)
         self.sequence = 0
 
     def send(self, utime, mode=Command.HOLD, *, sender=5, ahead=0, step=1, reset=False):
@@ -125,12 +125,22 @@ def test_another_sender_must_wait_for_silence(silence, code):
 
 
 @pytest.mark.parametrize(
-    ("step", "code"), [(-1, Status.REFUSAL_OUT_OF_ORDER), (0, Status.REFUSAL_OUT_OF_ORDER), (1, 0)]
+    ("step", "code"),
+    [
+        (-1, Status.REFUSAL_OUT_OF_ORDER),
+        (0, Status.REFUSAL_OUT_OF_ORDER),
+        (1, 0),
+        (1000, 0),
+        (1001, Status.REFUSAL_SEQUENCE_JUMP),
+        (2**62, Status.REFUSAL_SEQUENCE_JUMP),
+    ],
 )
-def test_commands_come_in_order(step, code):
+def test_commands_come_in_order_and_do_not_jump(step, code):
     stream = Stream()
     stream.send(0)
     assert stream.send(MS, step=step) == code
+    if code:
+        assert stream.send(2 * MS, step=1 - step) is False  # the refused one moved nothing
 
 
 @pytest.mark.parametrize(
@@ -141,15 +151,29 @@ def test_a_senders_clock_goes_on_as_the_arms_does(ahead, jumps):
     stream = Stream()
     stream.send(0)
     assert stream.send(40 * MS, ahead=ahead) == (Status.REFUSAL_CLOCK_JUMP if jumps else 0)
-    # What follows is compared with the clock as it is now.
-    assert stream.send(41 * MS, ahead=ahead) is False
+    if jumps:  # the refused one moved nothing
+        assert stream.send(41 * MS) is False
+
+
+@pytest.mark.parametrize("jump", [{"ahead": 10**9}, {"ahead": -(10**9)}, {"step": 2**62}, {"step": -(2**62)}])
+def test_a_sender_that_really_jumped_begins_anew_when_its_last_accepted_command_has_expired(jump):
+    stream, (name, size) = Stream(), next(iter(jump.items()))
+    stream.send(0)
+    first = stream.send(MS, **jump)
+    assert first in (Status.REFUSAL_CLOCK_JUMP, Status.REFUSAL_SEQUENCE_JUMP, Status.REFUSAL_OUT_OF_ORDER)
+    goes_on = {"ahead": size} if name == "ahead" else {}
+    for k in range(2, 51):
+        assert stream.send(k * MS, **goes_on) == first
+    assert stream.send(50 * MS + 1, **goes_on) is False
+    assert stream.stream.lost == 0
+    assert stream.send(51 * MS + 1, **goes_on) is False
 
 
 def test_a_senders_clock_that_stands_still_jumps():
     stream = Stream()
     stream.send(0)
     assert stream.send(1, ahead=-1) == Status.REFUSAL_CLOCK_JUMP
-    assert stream.send(2, ahead=-1) is False
+    assert stream.send(2, ahead=-1) is False  # it went on since the last accepted one
 
 
 def test_commands_that_are_missing_are_counted():
@@ -158,8 +182,9 @@ def test_commands_that_are_missing_are_counted():
         stream.send(k * MS, step=step)
     assert stream.stream.lost == 2 + 1
     stream.send(9 * MS, step=2**62)
-    stream.send(10 * MS, step=2**62)
-    assert stream.stream.lost == 2**63 - 1
+    assert stream.stream.lost == 2 + 1
+    stream.send(10 * MS, step=1 - 2**62 + 999)
+    assert stream.stream.lost == 2 + 1 + 999
 
 
 def test_off_follows_a_hold_of_the_same_sender():
@@ -208,7 +233,7 @@ def test_the_command_in_force_has_numbers_of_its_own():
 @pytest.mark.parametrize("mode", [Command.OFF, Command.HOLD, Command.POSITION, Command.EFFORT])
 @pytest.mark.parametrize("reset", [False, True])
 def test_only_a_hold_resets(mode, reset):
-    code = refusal_by_itself(Bench().command(mode, reset_fault=reset), ARM.name, N, SESSION)
+    code = content_refusal(Bench().command(mode, reset_fault=reset))
     assert code == (Status.REFUSAL_BAD_RESET if reset and mode != Command.HOLD else Status.REFUSAL_NONE)
 
 
@@ -220,6 +245,7 @@ SETTINGS = {
     "measurement_age": (0.001, 0.02, 0.1),
     "start_time": (0.05, 0.25, 10.0),
     "clock_tolerance": (0.001, 0.05, 1.0),
+    "sequence_jump": (1, 1000, 100_000),
     "start_effort": (0.001, 0.1, 0.25),
     "margin": (0.001, 0.05, 0.3),
     "margin_fraction": (0.001, 0.05, 0.25),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from guard_bench import ARM, MS, SESSION, Bench, Weightless
+from guard_bench import ARM, MS, SESSION, WITH_OFF, Bench, Weightless
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -14,17 +14,9 @@ from dvrk_drake.systems.guard.settings import GuardSettings
 @pytest.mark.parametrize(
     ("fields", "code"),
     [
-        ({"arm_name": "MTMR"}, Status.REFUSAL_WRONG_ARM),
-        ({"arm_name": ""}, Status.REFUSAL_WRONG_ARM),
-        ({"num_joints": 6}, Status.REFUSAL_WRONG_SIZE),
-        ({"num_joints": -1}, Status.REFUSAL_WRONG_SIZE),
-        ({"effort": [0.0] * 6}, Status.REFUSAL_WRONG_SIZE),
-        ({"velocity": []}, Status.REFUSAL_WRONG_SIZE),
         ({"effort": [0.0] * 6 + [np.nan]}, Status.REFUSAL_NOT_FINITE),
         ({"position": [np.inf] + [0.0] * 6}, Status.REFUSAL_NOT_FINITE),
         ({"velocity": [-1e7] + [0.0] * 6}, Status.REFUSAL_NOT_FINITE),
-        ({"sender_id": 0}, Status.REFUSAL_NO_SENDER),
-        ({"session_id": SESSION + 1}, Status.REFUSAL_WRONG_SESSION),
         ({"control_mode": 0}, Status.REFUSAL_BAD_MODE),
         ({"control_mode": Command().control_mode}, Status.REFUSAL_BAD_MODE),
         ({"control_mode": Command.OFF}, Status.REFUSAL_SUDDEN_OFF),
@@ -34,18 +26,83 @@ from dvrk_drake.systems.guard.settings import GuardSettings
     ],
 )
 def test_bad_commands_are_refused_and_end_in_a_hold(fields, code):
-    bench = Bench().started()
+    bench = Bench(modes=WITH_OFF).started()
     for _ in range(52):
         assert bench.send(**fields) == code
         bench.tick()
     assert bench.guard.state == Status.STATE_HOLD
-    assert (bench.guard.refusal_code, bench.guard.counts.refused) == (code, 52)
+    assert (bench.guard.refusal_code, bench.guard.counts.refused, bench.guard.counts.ignored) == (code, 52, 0)
 
 
-def test_unreadable_messages_are_refused():
+@pytest.mark.parametrize("mode", [Command.EFFORT, Command.POSITION])
+@pytest.mark.parametrize(
+    ("fields", "code"),
+    [
+        ({"arm_name": "MTMR"}, Status.REFUSAL_WRONG_ARM),
+        ({"arm_name": ""}, Status.REFUSAL_WRONG_ARM),
+        ({"num_joints": 6}, Status.REFUSAL_WRONG_SIZE),
+        ({"num_joints": -1}, Status.REFUSAL_WRONG_SIZE),
+        ({"effort": [0.0] * 6}, Status.REFUSAL_WRONG_SIZE),
+        ({"velocity": []}, Status.REFUSAL_WRONG_SIZE),
+        ({"sender_id": 0}, Status.REFUSAL_NO_SENDER),
+        ({"session_id": SESSION + 1}, Status.REFUSAL_WRONG_SESSION),
+        ({"sender_id": 6}, Status.REFUSAL_OTHER_SENDER),
+        ({"sender_id": 6, "control_mode": Command.HOLD}, Status.REFUSAL_OTHER_SENDER),
+        ({"sender_id": 6, "effort": [np.nan] * 7}, Status.REFUSAL_OTHER_SENDER),
+        ({"sender_id": 6, "control_mode": Command.OFF}, Status.REFUSAL_OTHER_SENDER),
+        (None, Status.REFUSAL_UNREADABLE),
+    ],
+)
+@pytest.mark.parametrize("watched", [False, True])
+def test_foreign_messages_are_counted_and_interrupt_nothing(mode, fields, code, watched):
     bench = Bench()
-    assert decode(Command, b"garbage") is None
-    assert bench.guard.receive(None, bench.utime) == Status.REFUSAL_UNREADABLE
+    bench.run(mode, 100 if watched else 260)
+    state = bench.guard.state
+    for _ in range(100):
+        foreign = None if fields is None else bench.command(mode, **fields)
+        assert bench.guard.receive(foreign, bench.utime) == code
+        bench.run(mode, 1)
+        assert bench.guard.state == state
+    bench.run(mode, 60)
+    assert bench.guard.output.control_mode == mode
+    assert (bench.guard.counts.ignored, bench.guard.ignored_code) == (100, code)
+    assert (bench.guard.counts.refused, bench.guard.refusal_code) == (0, Status.REFUSAL_NONE)
+    assert (bench.guard.fault_code, bench.guard.sender_id) == (Status.FAULT_NONE, 5)
+
+
+def test_foreign_messages_keep_no_command_in_force():
+    bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
+    for _ in range(60):
+        bench.send(sender=6)
+        bench.guard.receive(decode(Command, b"garbage"), bench.utime)
+        bench.tick()
+    # A second sender may follow the first when that one was silent for the expiry, and is watched.
+    assert (bench.guard.state, bench.guard.sender_id) == (Status.STATE_STARTING, 6)
+    assert bench.guard.counts.expired == 1
+
+
+@pytest.mark.parametrize(
+    ("fields", "code"),
+    [
+        ({"sequence": 2**62}, Status.REFUSAL_SEQUENCE_JUMP),
+        ({"sequence": -(2**62)}, Status.REFUSAL_OUT_OF_ORDER),
+        ({"utime": 2**62}, Status.REFUSAL_CLOCK_JUMP),
+        ({"utime": 0}, Status.REFUSAL_CLOCK_JUMP),
+        ({"status_utime": 2**62}, Status.REFUSAL_STALE),
+        ({"status_utime": 0}, Status.REFUSAL_STALE),
+    ],
+)
+@pytest.mark.parametrize("watched", [False, True])
+def test_a_copied_sender_id_with_another_sequence_or_time_interrupts_nothing(fields, code, watched):
+    bench = Bench()
+    bench.run(Command.EFFORT, 100 if watched else 260)
+    for _ in range(200):
+        spoofed = bench.command(effort=[1e3] * 7, **fields)
+        assert bench.guard.receive(spoofed, bench.utime) == code
+        output = bench.run(Command.EFFORT, 1)
+    assert bench.guard.state == Status.STATE_EFFORT
+    np.testing.assert_allclose(output.effort, bench.effort, atol=1e-12)
+    assert (bench.guard.counts.refused, bench.guard.counts.lost) == (200, 200)
 
 
 def test_a_command_that_answers_an_old_status_is_stale():
@@ -74,14 +131,18 @@ def test_out_of_order_and_duplicates_are_refused_and_gaps_are_counted():
     assert bench.guard.counts.lost == 3
 
 
-@pytest.mark.parametrize("jump", [-MS - 1, -3600 * 10**6, 51 * MS, 3600 * 10**6])
+@pytest.mark.parametrize("jump", [-51 * MS, -3600 * 10**6, 51 * MS, 3600 * 10**6])
 def test_a_jump_of_the_senders_clock_ends_in_a_hold_and_a_new_start(jump):
     bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
     base = bench.utime - 10**15
-    assert bench.send(utime=base + jump) == Status.REFUSAL_CLOCK_JUMP
-    assert bench.guard.state == Status.STATE_HOLD
+    for _ in range(50):
+        assert bench.send(utime=base + jump) == Status.REFUSAL_CLOCK_JUMP
+        assert bench.guard.state == Status.STATE_EFFORT
+        bench.tick()
+        base += MS
     for _ in range(251):
         bench.tick()
+        assert bench.guard.state in (Status.STATE_HOLD, Status.STATE_STARTING)
         assert bench.send(utime=bench.utime - 10**15 + jump) == Status.REFUSAL_NONE
     assert bench.guard.state == Status.STATE_EFFORT
 

@@ -11,6 +11,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.message_key import MessageKey
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 DOCUMENT = ROOT / "docs" / "connecting_a_real_dvrk.md"
@@ -83,13 +84,22 @@ class Scene:
     def __init__(self, script, periods, settings=None):
         self.crtk, self.network, self.utime, self.statuses = Crtk(lambda: self.utime), Network(), 10**15, []
         self.script, self.periods, self.k, self.settings = script, periods, -1, settings or GuardSettings()
+        self.modes, self.key = None, None
 
     def run(self):
         namespace = {}
         for block in re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL):
             exec(block, namespace)
         namespace["run_bridge"](
-            self.crtk, ARM, MODEL, self.settings, self.network, lambda: self.utime, self.next_period
+            self.crtk,
+            ARM,
+            MODEL,
+            self.settings,
+            self.network,
+            lambda: self.utime,
+            self.next_period,
+            self.key,
+            self.modes,
         )
         self.hear()
         return self
@@ -98,6 +108,7 @@ class Scene:
         while self.network.published:
             channel, data = self.network.published.pop(0)
             assert channel == "DVRK_STATUS_MTML"
+            assert self.key is None or self.key.verify(data)
             self.statuses.append(Status.decode(data))
 
     def next_period(self):
@@ -197,23 +208,54 @@ def test_an_arm_that_is_switched_off_is_sent_no_pose_and_held_where_it_fell():
     assert scene.statuses[-1].guard_state == Status.STATE_HOLD
 
 
-def test_off_disables_the_arm():
+def test_off_is_not_accepted():
     scene = Scene(lambda scene, k: scene.send(Command.OFF if k >= 300 else Command.HOLD), 320).run()
+    assert scene.topics(0, 320) == {"servo_jp"}
+    assert scene.statuses[-1].refusal_code == Status.REFUSAL_BAD_MODE
+
+
+def test_off_disables_the_arm_of_a_bridge_that_accepts_it():
+    scene = Scene(lambda scene, k: scene.send(Command.OFF if k >= 300 else Command.HOLD), 320)
+    scene.modes = (Command.POSITION, Command.EFFORT, Command.OFF)
+    scene.run()
     assert scene.topics(0, 300) == {"servo_jp"}
     topics = [topic for topic, _ in scene.crtk.told[300:]]
     assert topics[0] == "disable" and set(topics[1:]) == {"hold"}
     assert scene.statuses[-1].fault_text == "operating_state is DISABLED"
 
 
-def test_two_controllers_are_a_fault():
+def test_a_second_controller_is_ignored_and_counted():
     def script(scene, k):
         scene.send(Command.EFFORT)
-        if k == 300:
+        if k >= 300:
             scene.send(Command.EFFORT, sender=4)
 
-    scene = Scene(script, 320).run()
-    assert scene.statuses[-1].fault_code == Status.FAULT_DUPLICATE_SENDER
-    assert scene.topics(301, 320) == {"servo_jp"}
+    scene = Scene(script, 400).run()
+    assert scene.topics(301, 400) == {"servo_jf"}
+    last = scene.statuses[-1]
+    assert (last.num_ignored, last.ignored_code) == (100, Status.REFUSAL_OTHER_SENDER)
+    assert (last.num_refused, last.fault_code, last.command_sender_id) == (0, Status.FAULT_NONE, 3)
+
+
+def test_a_bridge_with_a_key_takes_signed_commands_only_and_signs_its_statuses():
+    key = MessageKey(bytes(range(32)))
+
+    def script(scene, k):
+        if not scene.statuses:
+            return
+        if k >= 300:
+            scene.send(Command.EFFORT, effort=list(ARM.effort_limits), sequence=scene.statuses[-1].sequence + 1)
+        scene.send(Command.EFFORT)
+        scene.network.queue[-1] = key.sign(scene.network.queue[-1])
+
+    scene = Scene(script, 400)
+    scene.key = key
+    scene.run()
+    assert scene.topics(301, 400) == {"servo_jf"}
+    np.testing.assert_allclose(scene.crtk.told[399][1], HELD, atol=1e-12)
+    last = scene.statuses[-1]
+    assert (last.num_ignored, last.ignored_code) == (100, Status.REFUSAL_NOT_AUTHENTIC)
+    assert {status.mac_size for status in scene.statuses} == {16}
 
 
 def test_a_tenth_of_the_limits_as_the_checklist_has_it():

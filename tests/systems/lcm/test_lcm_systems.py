@@ -12,7 +12,8 @@ from pydrake.systems.lcm import LcmSubscriberSystem
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.lcm_messages import is_status_of
+from dvrk_drake.models.lcm_messages import StatusFilter
+from dvrk_drake.models.message_key import create_key_file
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
 from dvrk_drake.systems.lcm.serializer import TolerantSerializer
@@ -78,14 +79,15 @@ def test_the_status_echoes_the_last_accepted_command():
     assert command.session_id == status.session_id != 0
 
 
-def test_two_controllers_fault_the_arm():
+def test_of_two_controllers_the_first_stays_in_command():
     lcm = DrakeLcm("memq://")
     arm, first, second = SimulatedArm(lcm), Controller(lcm), Controller(lcm)
     run(lcm, 300, arm, first)
-    run(lcm, 3, arm, first, second)
-    assert arm.statuses[-1].fault_code == Status.FAULT_DUPLICATE_SENDER
-    run(lcm, 500, arm, first)
-    assert arm.statuses[-1].guard_state == Status.STATE_FAULT
+    sender, begun = arm.statuses[-1].command_sender_id, len(arm.statuses)
+    run(lcm, 300, arm, first, second)
+    assert {(s.guard_state, s.command_sender_id) for s in arm.statuses[begun:]} == {(Status.STATE_EFFORT, sender)}
+    assert arm.statuses[-1].num_ignored >= 290
+    assert arm.statuses[-1].ignored_code == Status.REFUSAL_OTHER_SENDER
     assert arm.drift() < 1e-3
 
 
@@ -125,18 +127,19 @@ def test_position_commands_move_the_arm():
 def test_a_fault_is_reset_through_the_sender():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm)
-    first, second = Sending(lcm), Sending(lcm)
-    run(lcm, 3, arm, first, second)
-    assert arm.statuses[-1].guard_state == Status.STATE_FAULT
+    first = Sending(lcm)
+    run(lcm, 3, arm, first)
+    arm.guard.report_fault("the amplifier is hot")
     run(lcm, 100, arm, first)
+    assert arm.statuses[-1].guard_state == Status.STATE_FAULT
     first.fix("reset_fault", [1.0])
     run(lcm, 3, arm, first)
     assert arm.statuses[-1].guard_state == Status.STATE_HOLD
 
 
-def test_off_lets_the_arm_fall():
+def test_off_lets_the_arm_fall_if_its_driver_accepts_it():
     lcm = DrakeLcm("memq://")
-    arm = SimulatedArm(lcm)
+    arm = SimulatedArm(lcm, driver=DvrkDriver(control_modes=["off"]))
     sender = Sending(lcm, control_mode=[float(Command.HOLD)])
     run(lcm, 10, arm, sender)
     sender.fix("control_mode", [float(Command.OFF)])
@@ -184,7 +187,8 @@ def full_status(arm_name="MTML", n=7, utime=1):
 def test_the_status_receiver_knows_nothing_before_the_first_status_and_ignores_what_is_not_of_its_arm():
     lcm = DrakeLcm("memq://")
     builder = DiagramBuilder()
-    serializer = TolerantSerializer(Status, lambda status, last: is_status_of(ARM)(status))
+    statuses = StatusFilter("MTML", 7)
+    serializer = TolerantSerializer(Status, read=lambda data: statuses.take(data, 0.0))
     subscriber = builder.AddSystem(LcmSubscriberSystem("DVRK_STATUS_MTML", serializer, lcm))
     receiver = builder.AddSystem(DvrkStatusReceiver(ARM))
     builder.Connect(subscriber.get_output_port(), receiver.get_input_port())
@@ -247,7 +251,7 @@ def test_driver_is_loaded_from_yaml_and_checked():
         schema=DvrkDriver, data="{status_period: 0.002, guard: {expiry: 0.02}}", defaults=DvrkDriver()
     )
     assert (driver.status_period, driver.guard.expiry, driver.guard.start_time) == (0.002, 0.02, 0.25)
-    with pytest.raises(StationError, match="control_modes must be a list of position, effort; got \\['speed'\\]"):
+    with pytest.raises(StationError, match="control_modes must be a list of position, effort, off; got \\['speed'\\]"):
         DvrkDriver(control_modes=["speed"])
     with pytest.raises(StationError, match="status_period"):
         DvrkDriver(status_period=0.0)
@@ -255,3 +259,30 @@ def test_driver_is_loaded_from_yaml_and_checked():
         DvrkDriver(guard=type(driver.guard)(expiry=5.0))
     with pytest.raises(StationError, match=r"margin is .*; allowed: 0\.001\.\.0\.3"):
         type(driver.guard)(margin=float("nan"))
+
+
+def test_with_a_key_only_its_owners_talk_to_each_other(tmp_path):
+    create_key_file(tmp_path / "a.key")
+    lcm, driver = DrakeLcm("memq://"), DvrkDriver(key_file=str(tmp_path / "a.key"))
+    arm, stranger = SimulatedArm(lcm, driver=driver), Controller(lcm)
+    run(lcm, 300, arm, stranger)
+    last = arm.statuses[-1]
+    assert (last.guard_state, last.num_accepted, last.ignored_code) == (
+        Status.STATE_HOLD,
+        0,
+        Status.REFUSAL_NOT_AUTHENTIC,
+    )
+    owner = Controller(lcm, driver=driver)
+    run(lcm, 300, arm, stranger, owner)
+    assert arm.statuses[-1].guard_state == Status.STATE_EFFORT
+    # And the owner's station does not take an unsigned status.
+    spoofed = full_status(utime=arm.statuses[-1].utime + 1000)
+    spoofed.sequence, spoofed.session_id = arm.statuses[-1].sequence + 1, arm.statuses[-1].session_id
+    station = owner.simulator.get_system().GetSubsystemByName("mtml_station")
+    port, context = station.GetOutputPort("mtml.position_measured"), owner.simulator.get_context()
+    for _ in range(20):
+        lcm.Publish("DVRK_STATUS_MTML", spoofed.encode())
+        lcm.HandleSubscriptions(0)
+        owner.step()
+        np.testing.assert_allclose(port.Eval(station.GetMyContextFromRoot(context)), POSES["mtml"], atol=1e-3)
+    assert arm.drift() < 1e-3

@@ -1,0 +1,90 @@
+"""Inbox between the network and a command guard: drops foreign messages at once and bounds what a flood costs."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.lcm_messages import decode
+from dvrk_drake.models.message_key import MAC_SIZE, MessageKey
+from dvrk_drake.systems.guard.command_guard import CommandGuard
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+#: Most commands that are kept from one step to the next, of the sender in command and of all others [each].
+_CAPACITY = 16
+#: Where sender_id and session_id are in an encoded command, and where arm_name begins [bytes].
+_SENDER, _SESSION, _NAME = slice(24, 32), slice(32, 40), 48
+
+_UNREADABLE = lcmt_dvrk_status.REFUSAL_UNREADABLE
+
+
+class CommandInbox:
+    """Commands that arrived since the guard's last step, not decoded yet.
+
+    `put` looks at the bytes only: length, type, arm, session and, with a key, the authentication code. What fails is
+    counted and dropped, in a few microseconds. Of the rest it keeps a bounded number, with room of its own for the
+    sender in command, so that a flood of other senders does not displace its commands. `deliver` decodes what was kept
+    and gives it to the guard.
+    """
+
+    def __init__(self, guard: CommandGuard, key: MessageKey | None = None, capacity: int = _CAPACITY) -> None:
+        """Empty inbox for one guard.
+
+        Args:
+            guard: whose arm and session the commands must be meant for; copies of it can be delivered to as well.
+            key: must have signed the commands; None: codes are not verified.
+            capacity: most commands that are kept of the sender in command, and of all others together.
+        """
+        name = guard.arm_name.encode() + b"\0"
+        self._fingerprint = lcmt_dvrk_command()._get_packed_fingerprint()
+        self._session = struct.pack(">q", guard.session_id)
+        self._name = struct.pack(">I", len(name)) + name
+        bare = _NAME + len(self._name) + struct.calcsize(f">bbi{3 * guard.num_joints}db")
+        self._lengths = (bare, bare + MAC_SIZE)
+        self._verify: Callable[[bytes], bool] | None = key.verify if key else None
+        self._capacity = capacity
+        self._sender = b""
+        self._own: list[bytes] = []
+        self._others: list[bytes] = []
+        self._ignored, self._code = 0, lcmt_dvrk_status.REFUSAL_NONE
+
+    def put(self, data: bytes) -> None:
+        """Takes a message of the command channel, as it came over the wire."""
+        code = self._refusal(data)
+        if code == lcmt_dvrk_status.REFUSAL_NONE:
+            messages = self._own if data[_SENDER] == self._sender else self._others
+            if len(messages) < self._capacity:
+                messages.append(data)
+                return
+            code = lcmt_dvrk_status.REFUSAL_FLOOD
+        self._ignored += 1
+        self._code = code
+
+    def deliver(self, guard: CommandGuard, utime: int) -> None:
+        """Gives what was kept to the guard, as arrived at `utime` [us], and what was dropped to its counts."""
+        if self._ignored:
+            guard.ignore(self._code, self._ignored)
+            self._ignored = 0
+        # Commands of the sender in command come first, in their order; the order between senders does not matter.
+        for messages in (self._own, self._others):
+            for data in messages:
+                guard.receive(decode(lcmt_dvrk_command, data), utime)
+            messages.clear()
+        self._sender = struct.pack(">q", guard.last_sender_id)
+
+    def _refusal(self, data: bytes) -> int:
+        """Returns lcmt_dvrk_status.REFUSAL_* by the bytes of a message."""
+        if data[:8] != self._fingerprint:
+            return _UNREADABLE
+        if data[_SESSION] != self._session:
+            return lcmt_dvrk_status.REFUSAL_WRONG_SESSION
+        if not data.startswith(self._name, _NAME):
+            return lcmt_dvrk_status.REFUSAL_WRONG_ARM
+        if len(data) not in self._lengths:
+            return lcmt_dvrk_status.REFUSAL_WRONG_SIZE
+        if self._verify is not None and not self._verify(data):
+            return lcmt_dvrk_status.REFUSAL_NOT_AUTHENTIC
+        return lcmt_dvrk_status.REFUSAL_NONE

@@ -1,0 +1,121 @@
+"""Keys of messages: which files are keys, what is signed, and what is not authentic."""
+
+import hashlib
+import os
+import stat
+
+import pytest
+
+from dvrk_drake.cli import main
+from dvrk_drake.errors import KeyFileError
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.message_key import MessageKey, create_key_file
+from dvrk_drake.processes.simulated_arm import load_driver
+
+KEY = bytes(range(32))
+
+
+def write(path, content, mode=0o600):
+    path.write_bytes(content)
+    path.chmod(mode)
+    return path
+
+
+@pytest.mark.parametrize("message", [Command(), Status()])
+def test_a_signed_message_is_verified_and_read_as_ever(message):
+    key, message.utime, message.arm_name = MessageKey(KEY), 12345, "MTML"
+    data = message.encode()
+    signed = key.sign(data)
+    assert key.verify(signed) and not key.verify(data)
+    back = type(message).decode(signed)
+    assert (back.utime, back.arm_name, back.mac_size) == (12345, "MTML", 16)
+    # What a bridge in another language computes.
+    assert back.mac == hashlib.blake2b(data[:-1], key=KEY, digest_size=16).digest()
+    assert back.encode() == signed
+
+
+def test_any_other_byte_length_or_key_is_not_authentic():
+    key, data = MessageKey(KEY), Command().encode()
+    signed = key.sign(data)
+    for k in range(len(signed)):
+        for bit in range(8):
+            assert not key.verify(signed[:k] + bytes([signed[k] ^ 1 << bit]) + signed[k + 1 :])
+        assert not key.verify(signed[:k])
+    assert not key.verify(signed + b"\0") and not key.verify(b"") and not key.verify(bytes(17))
+    assert not MessageKey(KEY[:-1]).verify(signed)
+    # The type is signed as well: a status cannot be sent as a command.
+    other = key.sign(Status().encode())
+    assert not key.verify(signed[:8] + other[8:])
+
+
+@pytest.mark.parametrize("size", [16, 32, 64])
+def test_a_key_is_the_content_of_its_file(tmp_path, size):
+    content = os.urandom(size)
+    signed = MessageKey.load(write(tmp_path / "a.key", content)).sign(Command().encode())
+    assert MessageKey(content).verify(signed)
+
+
+@pytest.mark.parametrize(
+    ("content", "mode", "message"),
+    [
+        (KEY, 0o640, r"a\.key: other users may access this key \(mode 0640\); run: chmod 600 .*a\.key"),
+        (KEY, 0o604, r"a\.key: other users may access this key \(mode 0604\)"),
+        (KEY, 0o602, r"a\.key: other users may access this key \(mode 0602\)"),
+        (KEY[:15], 0o600, r"a\.key: not a key of 16 to 64 bytes, it has 15; make one: dvrk-drake key FILE"),
+        (b"", 0o600, r"a\.key: not a key of 16 to 64 bytes, it has 0"),
+        (bytes(65), 0o600, r"a\.key: not a key of 16 to 64 bytes, it has more"),
+        (None, 0o600, r"a\.key: no such file"),
+    ],
+)
+def test_bad_keys_are_refused_in_one_line(tmp_path, content, mode, message, capsys):
+    path = tmp_path / "a.key"
+    if content is not None:
+        write(path, content, mode)
+    with pytest.raises(KeyFileError, match=message):
+        MessageKey.load(path)
+    for command in (
+        ["run", "--arm", "mtml"],
+        ["arm", "--arm", "mtml"],
+        ["record", str(tmp_path / "a.csv"), "--arm", "mtml"],
+    ):
+        assert main([*command, "--key", str(path), "--lcm-url", "memq://"]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("dvrk-drake: error: ") and said.count("\n") == 1 and "a.key: " in said
+
+
+def test_a_folder_is_no_key(tmp_path):
+    with pytest.raises(KeyFileError, match="is not a file but a folder"):
+        MessageKey.load(tmp_path)
+
+
+def test_the_command_makes_a_key_that_is_not_overwritten(tmp_path, capsys):
+    first, second = tmp_path / "a.key", tmp_path / "b.key"
+    before = os.umask(0)
+    try:
+        assert main(["key", str(first)]) == main(["key", str(second)]) == 0
+    finally:
+        os.umask(before)
+    assert f"{first}: copy it to the other side" in capsys.readouterr().out
+    assert stat.S_IMODE(first.stat().st_mode) == 0o600
+    content = first.read_bytes()
+    assert len(content) == 32 and content != second.read_bytes()
+    MessageKey.load(first)
+    assert main(["key", str(first)]) == 2
+    assert "a.key: exists already, and a key is not overwritten; name another file" in capsys.readouterr().err
+    assert first.read_bytes() == content
+    with pytest.raises(KeyFileError, match="cannot be written: No such file or directory"):
+        create_key_file(tmp_path / "no" / "a.key")
+
+
+def test_a_drivers_key_is_found_beside_its_file(tmp_path):
+    write(tmp_path / "a.key", KEY)
+    (tmp_path / "driver.yaml").write_text('key_file: a.key\ncontrol_modes: [position, "off"]\n')
+    driver = load_driver(tmp_path / "driver.yaml")
+    assert driver.load_key().verify(MessageKey(KEY).sign(Command().encode()))
+    assert driver.accepted_modes() == (Command.POSITION, Command.OFF)
+    (tmp_path / "driver.yaml").write_text(f"key_file: {tmp_path / 'b.key'}\n")
+    with pytest.raises(KeyFileError, match=r"b\.key: no such file"):
+        load_driver(tmp_path / "driver.yaml").load_key()
+    (tmp_path / "driver.yaml").write_text("{}\n")
+    assert load_driver(tmp_path / "driver.yaml").load_key() is None

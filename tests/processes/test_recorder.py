@@ -1,0 +1,77 @@
+"""What a recorder writes of the messages on an arm's channel, by a clock that the test sets."""
+
+from types import SimpleNamespace
+
+import pytest
+from status_logs import ARM, statuses
+
+from dvrk_drake.models.lcm_messages import status_channel
+from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.models.recording import read_recording
+from dvrk_drake.processes import recorder as module
+from dvrk_drake.processes.recorder import Recorder
+
+KEY = MessageKey(bytes(range(32)))
+
+
+@pytest.fixture(params=[".csv", ".log"])
+def recorder(request, tmp_path, monkeypatch):
+    """Makes recorders, with `hear` for messages that arrive at a time [s]."""
+    clock = SimpleNamespace(now=100.0)
+    monkeypatch.setattr(module.time, "monotonic", lambda: clock.now)
+
+    def make(key=None):
+        made = Recorder(ARM, tmp_path / f"a{request.param}", "memq://", key)
+        made.path = tmp_path / f"a{request.param}"
+
+        def hear(message, seconds):
+            clock.now = 100.0 + seconds
+            made._receive(status_channel(ARM), message if isinstance(message, bytes) else message.encode())
+
+        made.hear = hear
+        return made
+
+    return make
+
+
+def test_of_two_arms_of_one_name_the_first_is_recorded(recorder):
+    made = recorder()
+    for k, (first, second) in enumerate(zip(statuses(50), statuses(50, session_id=5), strict=True)):
+        made.hear(first, 1e-3 * k)
+        made.hear(second, 1e-3 * k)
+    assert len(read_recording(made.path, ARM)) == 50
+    assert made.notes() == ["messages not recorded, of another session: 50"]
+
+
+@pytest.mark.parametrize("field", ["sequence", "utime", "session_id"])
+def test_a_spoofed_status_does_not_end_a_recording(recorder, field):
+    made = recorder()
+    for k, status in enumerate(statuses(50)):
+        made.hear(status, 1e-3 * k)
+        if k == 20:
+            (spoofed,) = statuses(1, sequence=status.sequence + 1, utime=status.utime + 500)
+            setattr(spoofed, field, 2**62)
+            made.hear(spoofed, 1e-3 * k)
+    assert len(read_recording(made.path, ARM)) == 50
+    assert sum(made.foreign.values()) == 1
+
+
+@pytest.mark.parametrize(("silence", "rows"), [(0.9, 20), (1.1, 40)])
+def test_an_arm_that_was_restarted_is_recorded_after_a_second_of_silence(recorder, silence, rows):
+    made, messages = recorder(), statuses(40)
+    for k, status in enumerate(messages[:20]):
+        made.hear(status, 1e-3 * k)
+    for k, status in enumerate(messages[20:]):
+        status.session_id = 78
+        made.hear(status, 0.019 + silence + 1e-3 * k)
+    assert len(read_recording(made.path, ARM)) == rows
+    assert made.foreign.total() == 40 - rows
+
+
+def test_with_a_key_only_signed_statuses_are_recorded(recorder):
+    made = recorder(KEY)
+    for k, status in enumerate(statuses(50)):
+        made.hear(status, 1e-3 * k)
+        made.hear(KEY.sign(status.encode()), 1e-3 * k)
+    assert len(read_recording(made.path, ARM)) == 50
+    assert made.notes() == ["messages not recorded, not signed with this key: 50"]

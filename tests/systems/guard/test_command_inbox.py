@@ -1,0 +1,207 @@
+"""The inbox before a guard: which bytes it drops, what a flood leaves, and what only a key can tell apart."""
+
+import numpy as np
+import pytest
+from guard_bench import LIMIT, SESSION, Bench
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.systems.guard.command_inbox import CommandInbox
+
+KEY = MessageKey(bytes(range(32)))
+#: More than an inbox keeps.
+FLOOD = 100
+
+
+class Networked(Bench):
+    """A bench whose commands go through an inbox, as bytes."""
+
+    def __init__(self, key=None, **arguments):
+        super().__init__(**arguments)
+        self.key, self.sent = key, []
+        self.inbox = CommandInbox(self.guard, key)
+
+    def put(self, *messages):
+        for data in messages:
+            self.inbox.put(data)
+
+    def good(self, **fields):
+        data = self.command(**fields).encode()
+        return data if self.key is None else self.key.sign(data)
+
+    def round(self, before=(), after=()):
+        """A millisecond with a good command between other messages."""
+        self.sent.append(self.good())
+        self.put(*before, self.sent[-1], *after)
+        self.inbox.deliver(self.guard, self.utime)
+        return self.tick()
+
+    def acting(self):
+        for _ in range(260):
+            self.round()
+        assert self.guard.state == Status.STATE_EFFORT
+        return self
+
+
+def stranger(bench, **fields):
+    """A command that the bench's sender did not send; its own sequence does not notice."""
+    command = bench.command(**{"effort": list(LIMIT), **fields})
+    bench.sequence -= 1
+    return command.encode()
+
+
+@pytest.mark.parametrize(
+    ("fields", "code"),
+    [
+        ({"session_id": SESSION + 1}, Status.REFUSAL_WRONG_SESSION),
+        ({"arm_name": "MTMR"}, Status.REFUSAL_WRONG_ARM),
+        ({"arm_name": "MTMLX"}, Status.REFUSAL_WRONG_ARM),
+        ({"num_joints": 6}, Status.REFUSAL_WRONG_SIZE),
+        (dict.fromkeys(("position", "velocity", "effort"), [0.0] * 8) | {"num_joints": 8}, Status.REFUSAL_WRONG_SIZE),
+        ({"sender_id": 6}, Status.REFUSAL_OTHER_SENDER),
+        ({"sender_id": 0}, Status.REFUSAL_NO_SENDER),
+        (b"", Status.REFUSAL_UNREADABLE),
+        (b"garbage", Status.REFUSAL_UNREADABLE),
+        (Status().encode(), Status.REFUSAL_UNREADABLE),
+        (Command().encode(), Status.REFUSAL_WRONG_SESSION),
+    ],
+)
+def test_foreign_bytes_are_counted_with_the_reason(fields, code):
+    bench = Networked().acting()
+    data = fields if isinstance(fields, bytes) else stranger(bench, **fields)
+    bench.round([data] * 3, [data] * 2)
+    assert (bench.guard.counts.ignored, bench.guard.ignored_code) == (5, code)
+    assert (bench.guard.counts.refused, bench.guard.state) == (0, Status.STATE_EFFORT)
+
+
+@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+@pytest.mark.parametrize("key", [None, KEY])
+def test_good_commands_of_any_arm_come_through(name, key):
+    bench = Networked(key, arm=load_arm(name)).acting()
+    assert (bench.guard.counts.accepted, bench.guard.counts.ignored) == (260, 0)
+    # A signed command is one for an arm without a key as well.
+    bench.inbox = CommandInbox(bench.guard)
+    bench.round()
+    assert bench.guard.counts.accepted == 261
+
+
+@pytest.mark.parametrize("kind", ["garbage", "other session", "other senders", "signed by somebody else"])
+@pytest.mark.parametrize("key", [None, KEY])
+def test_a_flood_does_not_displace_the_sender_in_command(kind, key):
+    bench = Networked(key).acting()
+    for _ in range(200):
+        flood = {
+            "garbage": [bytes(300)] * FLOOD,
+            "other session": [stranger(bench, session_id=5)] * FLOOD,
+            "other senders": [stranger(bench, sender_id=1000 + k) for k in range(FLOOD)],
+            "signed by somebody else": [MessageKey(bytes(32)).sign(stranger(bench, sender_id=9))] * FLOOD,
+        }[kind]
+        output = bench.round(flood, flood)
+        assert output.control_mode == Command.EFFORT
+    np.testing.assert_allclose(output.effort, 0.05 * LIMIT, atol=1e-12)
+    assert bench.guard.counts.ignored == 200 * 2 * FLOOD
+    assert (bench.guard.counts.accepted, bench.guard.counts.refused) == (460, 0)
+
+
+def test_of_a_flood_a_bounded_number_is_decoded():
+    bench = Networked().acting()
+    given = []
+    receive = bench.guard.receive
+    bench.guard.receive = lambda command, utime: (given.append(command), receive(command, utime))
+    bench.round([stranger(bench, sender_id=6)] * FLOOD, [bench.sent[-1]] * FLOOD)
+    assert len(given) == 32
+    assert bench.guard.ignored_code == Status.REFUSAL_OTHER_SENDER
+    assert bench.guard.counts.ignored + bench.guard.counts.refused == 2 * FLOOD
+
+
+@pytest.mark.parametrize("key", [None, KEY])
+def test_200_spoofed_commands_that_copy_the_sender_and_continue_its_stream(key):
+    """Only a key tells them from the true ones: without one they act, within the guard's limits."""
+    bench = Networked(key).acting()
+    moved = []
+    for k in range(200):
+        # As soon as the sender's command was read on the network: its sequence and times plus a little.
+        spoofed = stranger(bench, sequence=bench.sequence + 1 + k, utime=bench.utime - 10**15 + 1 + k)
+        output = bench.round([spoofed])
+        moved.append(np.abs(output.effort - 0.05 * LIMIT).max())
+    counts = bench.guard.counts
+    if key is None:
+        assert max(moved) > 0.1
+        return
+    assert max(moved) == 0.0
+    assert (counts.accepted, counts.refused, counts.ignored) == (460, 0, 200)
+    assert bench.guard.ignored_code == Status.REFUSAL_NOT_AUTHENTIC
+
+
+@pytest.mark.parametrize("field", ["sequence", "utime", "status_utime"])
+@pytest.mark.parametrize("key", [None, KEY])
+def test_a_huge_sequence_or_time_locks_nobody_out(field, key):
+    bench = Networked(key).acting()
+    for _ in range(200):
+        output = bench.round([stranger(bench, **{field: 2**62})], [stranger(bench, **{field: -(2**62)})])
+        assert output.control_mode == Command.EFFORT
+    np.testing.assert_allclose(output.effort, 0.05 * LIMIT, atol=1e-12)
+    assert bench.guard.counts.accepted == 460
+    assert (bench.guard.counts.refused, bench.guard.counts.ignored) == ((400, 0) if key is None else (0, 400))
+
+
+def test_replayed_authentic_commands_do_not_act():
+    """At once, while the sender is in command; and later, when it is silent: they are out of order, then stale."""
+    bench = Networked(KEY).acting()
+    for _ in range(100):
+        assert bench.round(bench.sent[-8:]).control_mode == Command.EFFORT
+    accepted, sent = bench.guard.counts.accepted, bench.sent[-16:]
+    assert accepted == 360
+    for _ in range(300):
+        bench.put(*sent)
+        bench.inbox.deliver(bench.guard, bench.utime)
+        bench.tick()
+    assert (bench.guard.state, bench.guard.counts.accepted) == (Status.STATE_HOLD, accepted)
+    assert bench.guard.refusal_code == Status.REFUSAL_STALE
+    # Nor in another session of the arm.
+    other = Networked(KEY)
+    other.guard.session_id = SESSION + 1
+    other.inbox = CommandInbox(other.guard, KEY)
+    other.put(*sent)
+    other.inbox.deliver(other.guard, other.utime)
+    assert other.guard.ignored_code == Status.REFUSAL_WRONG_SESSION
+
+
+@pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT, Command.OFF])
+def test_with_a_key_a_stranger_does_not_even_begin(mode):
+    bench = Networked(KEY, modes=(Command.POSITION, Command.EFFORT, Command.OFF))
+    for _ in range(300):
+        bench.put(bench.command(mode, sender=9).encode(), MessageKey(bytes(32)).sign(bench.command(mode).encode()))
+        bench.inbox.deliver(bench.guard, bench.utime)
+        bench.tick()
+    assert bench.guard.state == Status.STATE_HOLD
+    assert (bench.guard.counts.accepted, bench.guard.counts.ignored) == (0, 600)
+
+
+def test_fuzzed_bytes_of_a_signed_command_never_act():
+    generator = np.random.default_rng(3)
+    bench = Networked(KEY).acting()
+    for k in range(2000):
+        data = bytearray(bench.good(effort=list(LIMIT)))
+        for _ in range(generator.integers(1, 8)):
+            data[generator.integers(len(data))] ^= 1 << generator.integers(8)
+        output = bench.round([bytes(data[: generator.integers(len(data) + 1)] if k % 3 == 0 else data)])
+        assert output.control_mode == Command.EFFORT
+        np.testing.assert_allclose(output.effort, 0.05 * LIMIT, atol=1e-12)
+
+
+def test_the_capacity_is_of_the_sender_in_command_and_of_all_others_each():
+    bench = Networked()
+    bench.inbox = CommandInbox(bench.guard, capacity=3)
+    bench.put(*[bench.good() for _ in range(5)])
+    bench.inbox.deliver(bench.guard, bench.utime)
+    counts = bench.guard.counts
+    # At one time only one command of a sender is accepted: its clock must go on.
+    assert (counts.accepted, counts.refused, counts.ignored) == (1, 2, 2)
+    assert bench.guard.ignored_code == Status.REFUSAL_FLOOD
+    bench.tick()
+    bench.put(*[stranger(bench, sender_id=6)] * 5, *[bench.good() for _ in range(5)])
+    bench.inbox.deliver(bench.guard, bench.utime)
+    assert (counts.accepted, counts.refused, counts.ignored) == (2, 4, 2 + 2 + 5)
