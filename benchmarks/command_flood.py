@@ -11,7 +11,8 @@ without and with the flood in turn. Kinds of flood:
     sender      a good command of another sender
     copy        a good command that copies the sender's id, with a sequence far beyond
 
-"acting" is the share of the statuses in which the controller's efforts act, "expired" how often they expired. Arm,
+"acting" is the share of the statuses in which the controller's efforts act, "expired" how often they expired; the guard
+resumes automatically here. Arm,
 controller and what measures have real-time scheduling where it is permitted, and the flood has the rest.
 
 It needs a multicast route:
@@ -161,7 +162,20 @@ def main() -> None:
         file = Path(folder) / "a.key"
         create_key_file(file)
         key = [] if options.no_key else ["--key", file]
-        command = [sys.executable, "-m", "dvrk_drake.cli", "arm", "--arm", "mtml", "--realtime", *key]
+        driver = Path(folder) / "driver.yaml"
+        driver.write_text("guard: {resume_automatically: true}\n")
+        command = [
+            sys.executable,
+            "-m",
+            "dvrk_drake.cli",
+            "arm",
+            "--arm",
+            "mtml",
+            "--realtime",
+            "--driver",
+            driver,
+            *key,
+        ]
         arm = subprocess.Popen(command, stdout=subprocess.DEVNULL)
         try:
             run(None if options.no_key else file, options)
