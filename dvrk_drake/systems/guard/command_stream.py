@@ -74,7 +74,7 @@ def foreign_refusal(command: lcmt_dvrk_command | None, arm_name: str, num_joints
 
 def content_refusal(command: lcmt_dvrk_command) -> int:
     """Returns lcmt_dvrk_status.REFUSAL_* of a command whose numbers or flags are wrong, else REFUSAL_NONE."""
-    if not is_finite(command.position, command.velocity, command.effort):
+    if not is_finite([*command.position, *command.velocity, *command.effort]):
         return lcmt_dvrk_status.REFUSAL_NOT_FINITE
     if command.reset_fault and command.control_mode != lcmt_dvrk_command.HOLD:
         return lcmt_dvrk_status.REFUSAL_BAD_RESET

@@ -141,10 +141,10 @@ class GuardLimits:
             added = walls @ self.A
             for k in np.flatnonzero(walls):
                 flags[self.A[k] != 0] |= self._wall_flags[k]
-        too_fast = np.abs(v) / self.speed - 1
-        if (too_fast > 0).any():
-            added = added - 4 * limit * np.sign(v) * clip(too_fast, 0.0, 0.5)
-            flags[too_fast > 0] |= lcmt_dvrk_status.FLAG_SPEED_LIMIT
+        too_fast = np.abs(v) > self.speed
+        if too_fast.any():
+            added = added - 4 * limit * np.sign(v) * clip(np.abs(v) / self.speed - 1, 0.0, 0.5)
+            flags[too_fast] |= lcmt_dvrk_status.FLAG_SPEED_LIMIT
         return clip(effort + added, -limit, limit), flags
 
     def limit_position(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:

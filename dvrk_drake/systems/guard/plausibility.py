@@ -200,10 +200,10 @@ class SilentEffort:
     def check(self, sample: Sample, state: Vector) -> tuple[Vector, Mask]:
         """See `Check.check`."""
         if sample.commanded is None:
-            state = np.zeros_like(state)
+            state = 0.0 * state
         else:
-            hidden = np.abs(sample.commanded) > self._commanded
-            hidden &= np.where(sample.commanded > 0, sample.effort, -sample.effort) < self._least
+            size = np.abs(sample.commanded)
+            hidden = (size > self._commanded) & (sample.commanded * sample.effort < self._least * size)
             state = hidden * (state + sample.dt)
         return state, state > self._time
 
@@ -261,13 +261,13 @@ class Plausibility:
             `fault`.
         """
         self.gravity, self.fault = self.model.gravity_effort(q), ""
+        speed = np.abs(v)
         if self._before is None:
-            sample = Sample(dt, q, v, np.zeros_like(q), np.abs(v), effort, effort - self.gravity, commanded)
+            sample = Sample(dt, q, v, 0.0 * q, speed, effort, effort - self.gravity, commanded)
             self._states = [check.begin(sample) for check in self._checks]
             self._poses, self._pose_age = (q, q), 0.0
         else:
             q_before, speed_before = self._before
-            speed = np.abs(v)
             fastest = np.maximum(speed, speed_before)
             sample = Sample(dt, q, v, q - q_before, fastest, effort, effort - self.gravity, commanded)
             results = [check.check(sample, state) for check, state in zip(self._checks, self._states, strict=True)]
@@ -278,7 +278,7 @@ class Plausibility:
             self._pose_age += dt
             if self._pose_age > self._detection_time:
                 self._poses, self._pose_age = (self._poses[1], q), 0.0
-        self._before = q, np.abs(v)
+        self._before = q, speed
         return self.fault
 
     def reject_all(self) -> None:
