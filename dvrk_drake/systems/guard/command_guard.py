@@ -379,9 +379,11 @@ class CommandGuard:
             return lcmt_dvrk_status.REFUSAL_FAULT
         if (self.hold_reason or self._period.fault) and command.control_mode in _ACTIVE:
             return lcmt_dvrk_status.REFUSAL_RESUME
+        if self.state == _ACTIVE.get(command.control_mode):
+            return lcmt_dvrk_status.REFUSAL_NONE
         if command.control_mode < 0 or not self.accepted_modes >> command.control_mode & 1:
             return lcmt_dvrk_status.REFUSAL_BAD_MODE
-        if command.control_mode in _ACTIVE and self.state != _ACTIVE[command.control_mode]:
+        if command.control_mode in _ACTIVE:
             return self.limits.refusal_to_start(command, self._q(), self._measured.effort, self._plausibility.gravity)
         return lcmt_dvrk_status.REFUSAL_NONE
 
