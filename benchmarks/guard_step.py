@@ -1,0 +1,73 @@
+"""What the command guard costs per tick: one command received and one step, while efforts act.
+
+    python benchmarks/guard_step.py [--other CHECKOUT]
+
+With another checkout of this repository, e.g. an older commit, both are measured in turn and their ratio is printed.
+Times are of the process, and the least of many batches counts, since other programs only make them longer.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from argparse import ArgumentParser
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+TURNS = 5
+
+WORKER = """
+import sys, time
+sys.path.insert(0, "tests/support")
+from guard_bench import Bench, Command
+from dvrk_drake.models.arm import load_arm
+
+arm = load_arm(sys.argv[1])
+try:
+    from dvrk_drake.dynamics.control_model import ControlModel
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+
+    bench = Bench(arm, model=ControlModel(IdentifiedModel.from_arm(arm)), checks=True).at_rest()
+except ImportError:
+    bench = Bench(arm)
+bench.started(Command.EFFORT)
+times = []
+for _ in range(60):
+    commands, start = [], bench.utime
+    for k in range(100):
+        command = bench.command(Command.EFFORT)
+        command.utime, command.status_utime = command.utime + 1000 * k, start + 1000 * k
+        commands.append(command)
+    begin = time.process_time()
+    for command in commands:
+        bench.guard.receive(command, bench.utime)
+        bench.utime += 1000
+        bench.step()
+    times.append((time.process_time() - begin) / len(commands))
+assert bench.guard.state == 4, bench.guard.fault_text
+print(1e6 * min(times))
+"""
+
+
+def cost(checkout: Path, arm: str) -> float:
+    """Returns the least time of a tick [us]."""
+    environment = {**os.environ, "PYTHONPATH": str(checkout)}
+    command = [sys.executable, "-c", WORKER, arm]
+    return float(subprocess.run(command, cwd=checkout, env=environment, check=True, capture_output=True).stdout)
+
+
+def main() -> None:
+    """Prints a line for each arm."""
+    parser = ArgumentParser(description=__doc__)
+    parser.add_argument("--other", type=Path)
+    other = parser.parse_args().other
+    for arm in ("mtml", "psm"):
+        turns = [(cost(ROOT, arm), cost(other, arm) if other else float("nan")) for _ in range(TURNS)]
+        own, theirs = (min(turn[i] for turn in turns) for i in (0, 1))
+        compared = f"; other checkout {theirs:.1f} us, ratio {own / theirs:.2f}" if other else ""
+        print(f"{arm}: {own:.1f} us per tick{compared}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

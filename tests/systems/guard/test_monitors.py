@@ -1,0 +1,111 @@
+"""Monitors of the guard's own period and of oscillating efforts."""
+
+import numpy as np
+import pytest
+from guard_bench import ARM, LIMIT, MS, Bench, N, Q, modes
+
+from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.systems.guard.monitors import OscillationMonitor, PeriodMonitor
+from dvrk_drake.systems.guard.settings import GuardSettings
+
+SETTINGS = GuardSettings()
+
+
+@pytest.mark.parametrize(("period", "slow"), [(0.001, False), (0.005, False), (0.0051, True), (0.020, True)])
+def test_a_median_above_the_allowed_one_is_found_after_half_of_the_periods(period, slow):
+    monitor = PeriodMonitor(SETTINGS)
+    faults = [monitor.add(period) for _ in range(200)]
+    assert [bool(fault) for fault in faults] == [slow and k >= 50 for k in range(200)]
+    assert not slow or faults[-1] == "the guard's period has a median above the allowed 5 ms"
+    # Good periods end it.
+    faults = [monitor.add(0.001) for _ in range(100)]
+    assert [bool(fault) for fault in faults] == [slow and k < 49 for k in range(100)]
+
+
+@pytest.mark.parametrize(("period", "long"), [(0.040, False), (0.041, True), (0.049, True)])
+def test_a_period_above_the_longest_one_is_found_at_once(period, long):
+    monitor = PeriodMonitor(SETTINGS)
+    assert monitor.add(0.001) == ""
+    text = f"the guard was not stepped for {1e3 * period:.0f} ms; allowed are 40"
+    assert monitor.add(period) == (text if long else "")
+    assert monitor.add(0.001) == ""
+
+
+def test_a_guard_that_is_stepped_too_seldom_holds_until_an_operator_resumes():
+    """Every 20 ms, efforts at 0.9 of their limits would act on an arm that moves on meanwhile."""
+    bench = Bench(checks=True)
+    bench.run(Command.EFFORT, 260)
+    assert bench.guard.state == Status.STATE_EFFORT
+    for k in range(60):
+        bench.utime += 20 * MS
+        bench.send(Command.EFFORT)
+        bench.step()
+        assert (bench.guard.state == Status.STATE_EFFORT) == (k < 50)
+    assert bench.guard.hold_reason == "the guard's period has a median above the allowed 5 ms"
+    # Also with an operator's reset no command acts while it is so slow.
+    for reset in (False, True):
+        bench.utime += 20 * MS
+        assert bench.send(Command.HOLD, reset_fault=reset) == Status.REFUSAL_NONE
+        bench.step()
+    assert bench.guard.hold_reason == ""
+    assert bench.guard.accepted_modes == modes(Command.HOLD)
+    assert bench.send(Command.EFFORT) == Status.REFUSAL_BAD_MODE
+    bench.tick(100)
+    bench.run(Command.EFFORT, 260)
+    assert bench.guard.state == Status.STATE_EFFORT
+
+
+def test_a_guard_that_was_not_stepped_for_49_ms_holds():
+    bench = Bench(checks=True).started()
+    bench.utime += 49 * MS
+    output = bench.step()
+    assert (output.control_mode, bench.guard.state) == (Command.HOLD, Status.STATE_HOLD)
+    assert bench.guard.hold_reason == "the guard was not stepped for 49 ms; allowed are 40"
+
+
+def reversals(monitor, wave, seconds=6.0):
+    """Time until the monitor finds an oscillation of the effort wave(t) (n,), and the joint; (None, None) if it does not."""
+    for k in range(round(1e3 * seconds)):
+        joint = monitor.add(wave(1e-3 * k), 1e-3)
+        if joint is not None:
+            return 1e-3 * k, joint
+    return None, None
+
+
+@pytest.mark.parametrize("joint", range(N))
+@pytest.mark.parametrize("frequency", [1.5, 5.0, 20.0, 100.0])
+def test_efforts_that_jump_between_their_limits_are_found_after_six_reversals(joint, frequency):
+    unit = np.eye(N)[joint] * LIMIT
+    wave = lambda t: unit * np.sign(np.sin(2 * np.pi * frequency * (t + 1e-4)))  # noqa: E731
+    time, found = reversals(OscillationMonitor(SETTINGS, ARM), wave)
+    # Each half period is a reversal, and four of them are allowed, which fade.
+    assert found == joint
+    assert time <= 8 / (2 * frequency) + 0.01
+
+
+@pytest.mark.parametrize(
+    "wave",
+    [
+        pytest.param(lambda t: 0.35 * LIMIT * np.sign(np.sin(60 * t)), id="friction that changes its side"),
+        pytest.param(lambda t: 0.9 * LIMIT * np.sin(2 * np.pi * 0.25 * t), id="a slow swing of gravity"),
+        pytest.param(lambda t: LIMIT * (1.0 if t < 2 else -1.0), id="one reversal"),
+        pytest.param(lambda t: LIMIT * (t > 1), id="a steady push"),
+    ],
+)
+def test_efforts_of_normal_use_do_not_oscillate(wave):
+    assert reversals(OscillationMonitor(SETTINGS, ARM), wave) == (None, None)
+
+
+def test_a_guard_holds_an_arm_whose_effort_commands_oscillate():
+    bench = Bench().started()
+    for k in range(2000):
+        effort = np.sign(np.sin(2 * np.pi * 10 * 1e-3 * k)) * LIMIT * np.eye(N)[2]
+        bench.send(Command.EFFORT, effort=list(effort))
+        bench.tick()
+        if bench.guard.state == Status.STATE_FAULT:
+            break
+    assert k < 500
+    assert (bench.guard.fault_code, bench.output.control_mode) == (Status.FAULT_OSCILLATION, Command.HOLD)
+    assert bench.guard.fault_text == "elbow_pitch: the commanded effort oscillates"
+    np.testing.assert_array_equal(bench.output.position, Q)
