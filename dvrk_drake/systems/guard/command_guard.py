@@ -185,7 +185,7 @@ class CommandGuard:
         if self.state == lcmt_dvrk_status.STATE_FAULT:
             return 1 << lcmt_dvrk_command.HOLD
         modes = {lcmt_dvrk_command.HOLD, *self._modes}
-        if self.state == lcmt_dvrk_status.STATE_OFF or self.hold_reason:
+        if self.state == lcmt_dvrk_status.STATE_OFF or self.waits_for:
             modes -= set(_ACTIVE)
         if self.state not in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_HOLD):
             modes -= {lcmt_dvrk_command.OFF}
@@ -205,6 +205,14 @@ class CommandGuard:
     def last_command(self) -> lcmt_dvrk_command:
         """The last accepted command."""
         return self._force.command
+
+    @property
+    def waits_for(self) -> str:
+        """Why no POSITION and EFFORT is accepted while there is no fault, in words; "" if they are.
+
+        Either `hold_reason`, until an operator resumes, or a guard that is stepped too seldom.
+        """
+        return self.hold_reason or self._period.fault
 
     @property
     def gravity_effort(self) -> Vector:
@@ -377,7 +385,7 @@ class CommandGuard:
             return code
         if self.state == lcmt_dvrk_status.STATE_FAULT and command.control_mode != lcmt_dvrk_command.HOLD:
             return lcmt_dvrk_status.REFUSAL_FAULT
-        if (self.hold_reason or self._period.fault) and command.control_mode in _ACTIVE:
+        if self.hold_reason and command.control_mode in _ACTIVE:
             return lcmt_dvrk_status.REFUSAL_RESUME
         if self.state == _ACTIVE.get(command.control_mode):
             return lcmt_dvrk_status.REFUSAL_NONE

@@ -79,7 +79,7 @@ def fill_in_guard(status: lcmt_dvrk_status, guard: CommandGuard) -> None:
     """Sets the fields of `status` that tell what a guard decided, for bridges as well."""
     status.session_id = guard.session_id
     status.guard_state, status.accepted_modes = guard.state, guard.accepted_modes
-    status.fault_code, status.fault_text = guard.fault_code, guard.fault_text or guard.hold_reason
+    status.fault_code, status.fault_text = guard.fault_code, guard.fault_text or guard.waits_for
     status.command_sender_id = guard.sender_id
     status.command_sequence, status.command_utime = guard.last_command.sequence, guard.last_command.utime
     counts = guard.counts
