@@ -82,6 +82,7 @@ def test_efforts_that_jump_between_their_limits_are_found_after_some_reversals(j
     unit = np.eye(N)[joint] * LIMIT
     wave = lambda t: unit * np.sign(np.sin(2 * np.pi * frequency * (t + 1e-4)))  # noqa: E731
     time, found = reversals(OscillationMonitor(SETTINGS, ARM), wave)
+    assert found == joint
     # Each half period is a reversal, and four of them are allowed, which fade. The mean takes a while to settle.
     assert time <= 8 / (2 * frequency) + 0.11
 
