@@ -188,6 +188,14 @@ class Arm:
         """(n,) one number [rad, rad/s, ...] for the joints that turn, another [m, m/s, ...] for those that slide."""
         return np.where(self.prismatic, prismatic, revolute)
 
+    def dry_friction(self) -> NDArray[np.float64]:
+        """(n,) largest dry friction on each joint that the arm's effects state [N m, N]; 0 where they state none."""
+        rows = {f"joint.{name}": row for name, row in zip(self.joint_names, np.eye(self.num_joints), strict=True)}
+        actuators = zip(self.joint_names, self.transmission.matrix, strict=True)
+        rows |= {f"actuator.{name}": row for name, row in actuators} | self.friction_coordinates
+        dry = [abs(e.coefficient) * np.abs(rows[e.coordinate]) for e in self.effects.friction if e.kind != "viscous"]
+        return np.sum(dry, axis=0) if dry else np.zeros(self.num_joints)
+
     def limit_matrix(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """All limits as lower <= A q <= upper: the joint box first, then the coupled limits."""
         rows = [[limit.coefficients.get(j, 0.0) for j in self.joint_names] for limit in self.coupled_limits]

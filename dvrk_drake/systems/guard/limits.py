@@ -79,7 +79,9 @@ class GuardLimits:
         self._wall_effort = np.array([max(self.effort_limits[row != 0] / np.abs(row[row != 0])) for row in self.A])
         self.kp, self.kd = np.array(arm.gains.kp), np.array(arm.gains.kd)
         self.fault_effort = settings.fault_effort * self.effort_limits
-        self._start_gravity = settings.plausibility.start_gravity * self.effort_limits
+        checks = settings.plausibility
+        self.start_gravity = checks.start_gravity * self.effort_limits + arm.dry_friction()
+        self.start_gravity += arm.per_joint(checks.hand_effort, 10 * checks.hand_effort)
         self._look_ahead = self.kd / self.kp
         self._wall_look_ahead = np.array([max(self._look_ahead[row != 0]) for row in self.A])
         softest = 2 * self._wall_effort[:, None] * self.A**2 / (_WALL_GAIN * self.kp)
@@ -105,7 +107,7 @@ class GuardLimits:
         if command.control_mode == lcmt_dvrk_command.EFFORT:
             if self.beyond(q):
                 return lcmt_dvrk_status.REFUSAL_START_OUTSIDE
-            if np.any(np.abs(effort - gravity) > self._start_gravity):
+            if np.any(np.abs(effort - gravity) > self.start_gravity):
                 return lcmt_dvrk_status.REFUSAL_START_GRAVITY
             far = np.abs(np.asarray(command.effort) - effort) > self.start_effort
             far |= np.abs(effort) > self.command_limits + self.start_effort

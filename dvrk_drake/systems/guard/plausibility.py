@@ -19,6 +19,9 @@ Mask = NDArray[np.bool_]
 #: The mass matrix is evaluated again after this time [s]: it changes slowly, and evaluating it costs as much as a tick.
 _MASS_MATRIX_PERIOD = 0.05
 
+#: Within this time after power on an arm that lies on something may get its effort without a motion [s].
+_POWER_ON = 0.25
+
 #: Encoder counts by which measured positions may deviate beyond the tolerances.
 _COUNTS = 3.0
 
@@ -136,15 +139,17 @@ class FrozenPosition:
         self._allowed = settings.frozen_effort * effort_limits
         self._least_time = settings.frozen_time + counts / settings.frozen_speed
 
-    def begin(self, sample: Sample) -> tuple[Vector, Vector]:
-        """Effort at the last change of position, and the time for which it has differed too much, both (n,)."""
-        return sample.net_effort, np.zeros_like(sample.q)
+    def begin(self, sample: Sample) -> tuple[Vector, Vector, float]:
+        """Effort at the last change of position, time for which it has differed too much (n,), and time since now."""
+        return sample.net_effort, np.zeros_like(sample.q), 0.0
 
-    def check(self, sample: Sample, state: tuple[Vector, Vector]) -> tuple[tuple[Vector, Vector], Mask]:
+    def check(self, sample: Sample, state: tuple[Vector, Vector, float]) -> tuple[tuple[Vector, Vector, float], Mask]:
         """See `Check.check`."""
-        effort = np.where(sample.step == 0, state[0], sample.net_effort)
-        time = (np.abs(sample.net_effort - effort) > self._allowed) * (state[1] + sample.dt)
-        return (effort, time), time > self._least_time
+        effort, time, age = state
+        moved = (sample.step != 0) | (age < _POWER_ON)
+        effort = np.where(moved, sample.net_effort, effort)
+        time = (np.abs(sample.net_effort - effort) > self._allowed) * (time + sample.dt)
+        return (effort, time, age + sample.dt), time > self._least_time
 
 
 class Response:

@@ -23,11 +23,11 @@ class PlausibilitySettings:
         frozen_time: for which a position may stay the same under that change [s].
         frozen_speed: at which a joint takes the time that it is given to move by an encoder count [rad/s, m/s].
         response: effort that the motion does not explain, as a fraction of the effort limit, beyond `hand_effort`.
-        hand_effort: of a hand on a wrist [N m; ten times the number in N on a prismatic joint].
+        hand_effort: on a wrist, of a hand or a wrong model [N m; ten times the number in N on a prismatic joint].
         response_time: time constant of the filters of effort and acceleration [s].
         response_memory: time constant with which unexplained effort that lasts is taken as an error of the model [s].
         start_gravity: difference of measured effort and gravity effort at which efforts may start, as a fraction of the
-            effort limit.
+            effort limit, beyond the arm's dry friction and `hand_effort`.
         silent_effort: commanded effort that must show in the measured one, as a fraction of the effort limit.
         silent_time: within which it must [s].
         detection_time: age of the pose that is taken as valid when a fault is found [s].
@@ -42,10 +42,10 @@ class PlausibilitySettings:
     frozen_time: float = field(default=0.01, metadata=within(0.002, 1.0, "s"))
     frozen_speed: float = field(default=0.1, metadata=within(0.001, 10.0, "rad/s"))
     response: float = field(default=1.3, metadata=within(0.2, 5.0))
-    hand_effort: float = field(default=0.05, metadata=within(0.0, 5.0, "N m"))
+    hand_effort: float = field(default=0.06, metadata=within(0.0, 5.0, "N m"))
     response_time: float = field(default=0.03, metadata=within(0.005, 0.5, "s"))
     response_memory: float = field(default=0.2, metadata=within(0.02, 10.0, "s"))
-    start_gravity: float = field(default=0.25, metadata=within(0.02, 2.0))
+    start_gravity: float = field(default=0.1, metadata=within(0.02, 2.0))
     silent_effort: float = field(default=0.3, metadata=within(0.05, 1.0))
     silent_time: float = field(default=0.02, metadata=within(0.002, 1.0, "s"))
     detection_time: float = field(default=0.03, metadata=within(0.005, 0.5, "s"))

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, MS, SESSION, Bench, N, Q, Weightless, modes
+from guard_bench import ARM, LIMIT, MS, SESSION, Bench, Heavy, N, Q, Weightless, modes
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
@@ -149,8 +149,8 @@ def test_a_fraction_of_the_effort_limits_clamps_commands_and_refuses_a_start_tha
     bench.q = Q.copy()
     bench.q[0] = ARM.position_upper[0]
     assert bench.run(Command.EFFORT, 1, effort=list(LIMIT)).effort[0] == -LIMIT[0]
-    bench = Bench(settings=GuardSettings(effort_fraction=0.1))
-    bench.effort = 0.21 * LIMIT
+    bench = Bench(settings=GuardSettings(effort_fraction=0.1), model=Heavy()).at_rest()
+    bench.effort = np.sign(bench.effort) * 0.21 * LIMIT
     bench.tick()
     assert bench.send(Command.EFFORT) == Status.REFUSAL_START_FAR
 

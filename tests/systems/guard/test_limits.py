@@ -330,3 +330,25 @@ def test_no_velocity_where_the_position_is_not_followed():
     flags = np.array([0, 1, 2, 4, 8, 16, 0], np.int8)
     velocity = 0.1 * LIMITS.speed
     np.testing.assert_array_equal(LIMITS.limit_velocity(velocity, Q, flags), np.where(flags == 0, velocity, 0.0))
+
+
+@pytest.mark.parametrize("joint", range(N))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_efforts_start_only_where_the_measured_effort_is_the_gravity_effort(joint, side):
+    """But for 0.1 of the limit, dry friction, and what a hand or a wrong model does to a wrist."""
+    allowed = 0.1 * LIMIT[joint] + ARM.dry_friction()[joint] + 0.06
+    command = Command()
+    command.control_mode = Command.EFFORT
+    for factor, code in ((0.999, Status.REFUSAL_NONE), (1.001, Status.REFUSAL_START_GRAVITY)):
+        measured = side * 0.1 * LIMIT
+        gravity = measured + side * factor * allowed * np.eye(N)[joint]
+        command.effort = list(measured)
+        assert LIMITS.refusal_to_start(command, Q, measured, gravity) == code
+
+
+def test_dry_friction_is_that_of_the_arms_file():
+    friction = ARM.dry_friction()
+    assert friction[0] == pytest.approx(0.061 + 0.034, abs=1e-12)
+    # The elbow's actuator turns with the shoulder as well, and the platform's with the elbow, by 0.6697.
+    assert friction[1] == pytest.approx(0.039 + 0.028 + 0.064 + 0.026, abs=1e-12)
+    assert friction[2] == pytest.approx(0.064 + 0.026 + 0.045 + 0.6697 * (0.019 + 0.013), abs=1e-12)

@@ -129,6 +129,13 @@ def test_a_position_that_stays_the_same_under_a_changing_effort_is_frozen(joint)
             assert MS * ticks == pytest.approx(time, abs=1.5 * MS)
 
 
+def test_an_effort_that_builds_up_after_power_on_is_no_fault_of_an_arm_that_lies_on_something():
+    sensors = Sensors()
+    sensors.move(np.zeros(N), ticks=100)
+    sensors.effort = 0.9 * LIMIT
+    assert sensors.move(np.zeros(N), ticks=1000)[0] == ""
+
+
 def test_a_joint_that_presses_on_something_and_gives_way_by_a_count_is_not_frozen():
     sensors = Sensors()
     start = sensors.q.copy()
