@@ -101,17 +101,18 @@ class VelocityConsistency:
 
     The difference e of the change of position and the integrated velocity fades with the time constant T,
 
-        e' = (1 - dt/T) e + dq - v dt,    |e| <= tolerance + delay s,
+        e' = (1 - dt/T) e + dq - v dt,    |e| <= tolerance + r T + delay s,
 
     where s is the largest recent speed, fading likewise: a velocity that is estimated with a delay deviates while the
-    joint accelerates.
+    joint accelerates. r is the error of a velocity that is estimated from the time between two encoder counts.
     """
 
     text, about_position = "position and velocity disagree", True
 
-    def __init__(self, settings: PlausibilitySettings, tolerance: Vector) -> None:
-        """Check with a tolerance (n,) [rad, m]."""
-        self._tolerance, self._delay, self._memory = tolerance, settings.velocity_delay, settings.velocity_memory
+    def __init__(self, settings: PlausibilitySettings, tolerance: Vector, counts: Vector) -> None:
+        """Check with a tolerance for joints with encoder counts, both (n,) [rad, m]."""
+        self._delay, self._memory = settings.velocity_delay, settings.velocity_memory
+        self._tolerance = tolerance + self._memory * settings.velocity_counts * counts
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector]:
         """Difference e and speed s, both (n,)."""
@@ -239,7 +240,7 @@ class Plausibility:
         self._detection_time = settings.detection_time
         self._checks: tuple[Check, ...] = (
             PositionJump(settings, tolerance, speed_limit),
-            VelocityConsistency(settings, tolerance),
+            VelocityConsistency(settings, tolerance, counts),
             FrozenPosition(settings, arm.effort_limits, counts),
             Response(settings, arm, model),
             SilentEffort(settings, arm.effort_limits),

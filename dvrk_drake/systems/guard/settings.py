@@ -18,6 +18,8 @@ class PlausibilitySettings:
             [rad; a tenth of the number in m on a prismatic joint]; three encoder counts are added.
         jitter: by which the time between two measurements may be wrong [s].
         velocity_delay: largest delay of the velocity estimate [s].
+        velocity_counts: rate of encoder counts by which a velocity may be wrong [1/s]: an estimate from the time
+            between two counts keeps its last value for a while when none comes.
         velocity_memory: time constant with which positions and velocities are compared [s].
         frozen_effort: change of effort under which a position must change, as a fraction of the effort limit.
         frozen_time: for which a position may stay the same under that change [s].
@@ -35,9 +37,10 @@ class PlausibilitySettings:
     """
 
     position_tolerance: float = field(default=0.01, metadata=within(0.001, 0.1, "rad"))
-    jitter: float = field(default=0.02, metadata=within(0.0, 0.05, "s"))
+    jitter: float = field(default=0.03, metadata=within(0.0, 0.1, "s"))
     velocity_delay: float = field(default=0.03, metadata=within(0.001, 0.1, "s"))
-    velocity_memory: float = field(default=0.3, metadata=within(0.05, 2.0, "s"))
+    velocity_counts: float = field(default=150.0, metadata=within(0.0, 2000.0, "1/s"))
+    velocity_memory: float = field(default=0.15, metadata=within(0.05, 2.0, "s"))
     frozen_effort: float = field(default=0.45, metadata=within(0.05, 1.0))
     frozen_time: float = field(default=0.01, metadata=within(0.002, 1.0, "s"))
     frozen_speed: float = field(default=0.1, metadata=within(0.001, 10.0, "rad/s"))

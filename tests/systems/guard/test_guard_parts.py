@@ -263,9 +263,10 @@ SETTINGS = {
 }
 PLAUSIBILITY_SETTINGS = {
     "position_tolerance": (0.001, 0.01, 0.1),
-    "jitter": (0.0, 0.02, 0.05),
+    "jitter": (0.0, 0.03, 0.1),
     "velocity_delay": (0.001, 0.03, 0.1),
-    "velocity_memory": (0.05, 0.3, 2.0),
+    "velocity_counts": (0.0, 150.0, 2000.0),
+    "velocity_memory": (0.05, 0.15, 2.0),
     "frozen_effort": (0.05, 0.45, 1.0),
     "frozen_time": (0.002, 0.01, 1.0),
     "frozen_speed": (0.001, 0.1, 10.0),
