@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 #: No longer time between two steps is made up for in rate limits [s].
 _LONGEST_STEP = 0.01
 
+#: After a longer time without a measurement, the next one is not compared with it [s]: somebody may have moved the arm.
+_LONGEST_GAP = 0.1
+
 #: States in which a position controller leads the arm to a target.
 _REGULATED = (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_POSITION)
 
@@ -54,14 +57,15 @@ class CommandGuard:
     - HOLD: the arm regulates to a latched pose. The first state. Nobody need command.
     - STARTING: as HOLD, while a sender's POSITION or EFFORT commands are watched.
     - POSITION, EFFORT: the last command acts, inside the limits of GuardLimits.
-    - FAULT: as HOLD, or as OFF where the motors were off or the measurement was lost.
+    - FAULT: as HOLD. After a fault of a measurement, efforts hold the joints with a valid position, and the others have
+      the gravity effort of their last valid pose. As OFF where the motors had no power.
 
     ::
 
         HOLD --OFF after a HOLD--> OFF --HOLD--> HOLD       any --HOLD--> HOLD, but from FAULT
         HOLD --POSITION, EFFORT--> STARTING --good for start_time--> POSITION, EFFORT
-        STARTING --refused, expired--> HOLD
-        POSITION, EFFORT --HOLD--> HOLD; --expired--> HOLD until a resume
+        STARTING --refused, expired, bad measurement, stepped too seldom--> HOLD
+        POSITION, EFFORT --HOLD--> HOLD; --expired, bad measurement, stepped too seldom--> HOLD until a resume
         POSITION, EFFORT --the other mode--> STARTING
         any --fault--> FAULT --HOLD with reset_fault, changed from false to true--> HOLD
 
@@ -70,11 +74,16 @@ class CommandGuard:
     two: by the arm's clock, and by the wall clock if there is one. So a command expires also if the arm's clock is late
     or was stopped. Then the arm holds.
 
-    **Resume**: when a command in force expired or `_take_over` was called, the watchdog took
-    over. The guard then refuses POSITION and EFFORT until an operator resumes, in the way in which a fault is reset;
-    `hold_reason` is why. It is no fault: the arm holds, and OFF is allowed. A HOLD command before the silence, and
-    STARTING that ends, need no resume. `GuardSettings.resume_automatically` switches this off; the next sender is then
-    watched as the first was.
+    **Measurements** are checked: numbers, age, and plausibility (`Plausibility`). One that is not finite or too old
+    ends commands; while the arm holds, some in a row are tolerated, and more are a fault.
+
+    **Period**: a guard that is not stepped for `longest_period`, or with a median period above `slow_period`, accepts
+    no POSITION and EFFORT: what it limits would come too late.
+
+    **Resume**: when a command in force ended for one of these reasons, the watchdog took over. The guard then refuses
+    POSITION and EFFORT until an operator resumes, in the way in which a fault is reset; `hold_reason` is why. It is no
+    fault: the arm holds, and OFF is allowed. A HOLD command before the silence, and STARTING that ends, need no resume.
+    `GuardSettings.resume_automatically` switches this off; the next sender is then watched as the first was.
 
     **What is refused** (`lcmt_dvrk_status.REFUSAL_*` has the list): commands that are not finite, expired when they
     come, out of order or sent twice, after a jump of the sender's sequence or clock, in a mode that is not accepted
@@ -90,14 +99,14 @@ class CommandGuard:
 
     **Start guard**: before commands act they must have come without a gap of `expiry` and without a refusal for
     `start_time`, all near the present: efforts near the measured ones, positions near the measured ones, also where the
-    feed-forward velocity leads; for efforts the pose must not be beyond a limit by half the margin, nor the
-    present effort beyond what commands may use. A sender that starts with something else is refused, so a restarted or
-    confused controller moves nothing.
+    feed-forward velocity leads; for efforts the pose must not be beyond a limit by half the margin, the present effort
+    not beyond what commands may use, and near the model's gravity effort. A sender that starts with something else is
+    refused, so a restarted or confused controller moves nothing.
 
-    **Faults** are latched: a pose beyond a limit (by half the margin) while efforts act, a joint
-    that does not follow position commands, a measurement that is not finite or too old, the arm's clock going backwards
-    or standing still, and what a driver reports. The reset must be meant: the flag must change from false to true in a
-    HOLD command, and a cause that lasts faults again.
+    **Faults** are latched: measurements that are not plausible, not finite or too old, a pose beyond a limit (by half
+    the margin) while efforts act, a joint that does not follow or is pushed away, efforts that oscillate, the arm's
+    clock going backwards or standing still, an output that is not finite, and what a driver reports. The reset must be
+    meant: the flag must change from false to true in a HOLD command, and a cause that lasts faults again.
 
     **Without a bump**: HOLD keeps the target that was regulated to, after POSITION only while the arm is near it, and
     else latches the measured pose; POSITION starts from the held pose; EFFORT starts from the measured effort, and the
@@ -320,11 +329,11 @@ class CommandGuard:
             return
         if first:
             self._follower.latch(self._q(), np.zeros(self.num_joints))  # it stands so far
-        if not self._powered:
-            plausibility.restart()
-        commanded = self.output.effort if self.state == lcmt_dvrk_status.STATE_EFFORT else None
-        if measured.dt == 0 and not first:
+        elif measured.dt == 0:
             return  # the same measurement again
+        if not self._powered or not 0 < measured.dt < _LONGEST_GAP:
+            plausibility.forget()
+        commanded = self.output.effort if self.state == lcmt_dvrk_status.STATE_EFFORT else None
         fault = plausibility.check(measured.dt, self._q(), measured.v, measured.effort, commanded)
         if fault:
             self.report_fault(fault, lcmt_dvrk_status.FAULT_IMPLAUSIBLE)
@@ -367,7 +376,10 @@ class CommandGuard:
         """
         if self.state in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_FAULT):
             return
+        nothing_acted = self.state == lcmt_dvrk_status.STATE_STARTING
         self._hold()
+        if nothing_acted:
+            return
         if not self.settings.resume_automatically:
             self.hold_reason = self.hold_reason or reason
 

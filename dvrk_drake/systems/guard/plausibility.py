@@ -251,8 +251,12 @@ class Plausibility:
         self.restart()
 
     def restart(self) -> None:
-        """Begins anew with the next sample."""
+        """Takes all positions as valid, and begins anew with the next sample."""
         self.invalid, self.fault = self._none, ""
+        self.forget()
+
+    def forget(self) -> None:
+        """Does not compare the next sample with the ones before."""
         self._before: tuple[Vector, Vector] | None = None
 
     def check(self, dt: float, q: Vector, v: Vector, effort: Vector, commanded: Vector | None) -> str:

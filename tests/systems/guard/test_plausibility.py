@@ -261,3 +261,50 @@ def test_nothing_is_found_in_the_motions_of_real_arms(shared_data, name, file):
         for row, dt in zip(rows, np.diff(t, prepend=t[0]), strict=True):
             q, v, effort = (np.ascontiguousarray(x[row]) for x in (recording.q, recording.qd, recording.tau))
             assert checks.check(dt, q, v, effort, None) == "", recording.where(row)
+
+
+def test_an_arm_that_was_moved_while_nothing_was_measured_is_where_it_is_found():
+    for gap, fault in ((50, Status.FAULT_IMPLAUSIBLE), (150, Status.FAULT_NONE)):
+        bench = Bench(checks=True)
+        bench.tick(10)
+        bench.utime += 1000 * gap
+        bench.q = Q + 0.05
+        bench.tick()
+        assert bench.guard.fault_code == fault
+
+
+def test_a_reset_takes_the_position_as_valid_again():
+    bench = Bench(model=Heavy(), checks=True).at_rest()
+    bench.q = Q + unit(3, 0.3)
+    assert bench.tick().control_mode == Command.EFFORT
+    bench.run(Command.HOLD, 1)
+    output = bench.run(Command.HOLD, 1, reset_fault=True)
+    assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_NONE)
+    np.testing.assert_array_equal(output.position, bench.q)
+    assert not np.any(bench.tick(100).joint_flags)
+    # Another joint fails later: the first one is among those that are held.
+    bench.q = bench.q + unit(0, 0.3)
+    np.testing.assert_array_equal(bench.tick().joint_flags & Status.FLAG_IMPLAUSIBLE != 0, unit(0).astype(bool))
+
+
+def test_a_second_joint_that_fails_in_a_fault_has_no_feedback_either():
+    bench = Bench(model=Heavy(), checks=True).at_rest()
+    for joint, flags in ((2, [2]), (5, [2, 5])):
+        bench.q = bench.q + unit(joint, 0.3)
+        output = bench.tick()
+        assert np.flatnonzero(output.joint_flags & Status.FLAG_IMPLAUSIBLE).tolist() == flags
+        # With the last valid positions of both.
+        np.testing.assert_allclose(output.effort, Heavy().gravity_effort(Q), rtol=0, atol=1e-12)
+        bench.tick(50)
+
+
+def test_an_arm_without_power_is_not_checked():
+    bench = Bench(checks=True, modes=(Command.OFF,))
+    bench.run(Command.HOLD, 1)
+    bench.run(Command.OFF, 1)
+    for _ in range(10):
+        bench.q = bench.q - 0.1  # it falls, and is caught
+        assert bench.tick().control_mode == Command.OFF
+    assert bench.guard.fault_code == Status.FAULT_NONE
+    bench.run(Command.HOLD, 100)
+    assert bench.guard.fault_code == Status.FAULT_NONE
