@@ -166,7 +166,7 @@ class SimulatedArm:
     def _describe(self) -> str:
         guard = self.guard
         sender = f", sender {guard.sender_id}" if guard.sender_id else ""
-        return describe_state(guard.state, guard.fault_text or guard.waits_for) + sender
+        return describe_state(guard.state, guard.fault_text or guard.hold_reason) + sender
 
 
 def stop_on_signals() -> Callable[[], bool]:

@@ -6,8 +6,10 @@ No postponed annotations here: yaml_load_typed reads the types at run time.
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dvrk_drake.errors import StationError
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ModelError, StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.message_key import MessageKey
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.systems.guard.settings import GuardSettings
@@ -32,7 +34,8 @@ class DvrkDriver:
             relative to the driver's YAML file; empty: messages are not authenticated, and any process on the network
             can command the arm.
         gravity_compensation: the arm adds its own gravity compensation to commanded efforts, as a dVRK does on request.
-        model: file of the identified model with which the guard checks measurements; empty: what the arm's SDF states.
+        model: file of the identified model with which the guard checks measurements, relative to the driver's YAML
+            file; empty: what the arm's SDF states.
         guard: what its command guard allows.
     """
 
@@ -60,9 +63,24 @@ class DvrkDriver:
             raise StationError(fault)
 
     def relative_to(self, folder: Path) -> None:
-        """Resolves a relative `key_file`, which is meant relative to `folder`."""
+        """Resolves relative `key_file` and `model`, which are meant relative to `folder`."""
         if self.key_file:
             self.key_file = str(folder / self.key_file)
+        if self.model:
+            self.model = str(folder / self.model)
+
+    def load_model(self, arm: Arm) -> IdentifiedModel | None:
+        """Returns the model in `model`, or None without one.
+
+        Raises:
+            ModelError: it cannot be read, or is not of `arm`.
+        """
+        if not self.model:
+            return None
+        model = IdentifiedModel.load(self.model)
+        if model.load_arm().name != arm.name:
+            raise ModelError(f"{self.model}: is of {model.load_arm().name}, not of {arm.name}")
+        return model
 
     def load_key(self) -> MessageKey | None:
         """Returns the key in `key_file`, or None without one.

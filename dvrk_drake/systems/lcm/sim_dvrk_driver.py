@@ -58,8 +58,8 @@ class SimDvrkDriver(Diagram):
         Args:
             arm: as it is simulated, mounting included.
             driver: its configuration.
-            model: with which the guard checks measurements, and which the position controller compensates; the
-                driver's if None, or else what the arm's SDF states.
+            model: of the simulated arm, which the position controller compensates; None: what the arm's SDF states. The
+                guard checks measurements with the driver's model, or else with this one.
             start_utime: the arm's clock at time zero of the context [us].
             wall_clock: of the guard [us]; None: commands expire by the context's time only.
             key: must have signed what `Receive` takes; None: not verified.
@@ -69,9 +69,8 @@ class SimDvrkDriver(Diagram):
         """
         super().__init__()
         clock = ArmClock(start_utime, driver.status_period)
-        if model is None:
-            model = IdentifiedModel.load(driver.model) if driver.model else IdentifiedModel.from_arm(arm)
-        guard_model = ControlModel(model, with_gravity=not driver.gravity_compensation)
+        model = model or IdentifiedModel.from_arm(arm)
+        guard_model = ControlModel(driver.load_model(arm) or model, with_gravity=not driver.gravity_compensation)
         guard = CommandGuard(arm, draw_id(), guard_model, driver.guard, driver.accepted_modes(), wall_clock)
         builder = DiagramBuilder()
         self._receiver = builder.AddNamedSystem("command_receiver", DvrkCommandReceiver(arm, guard, clock, key))
