@@ -194,10 +194,12 @@ class SilentEffort:
 
     text, about_position = "the measured effort does not show the commanded one", False
 
-    def __init__(self, settings: PlausibilitySettings, effort_limits: Vector) -> None:
-        """Check for joints with effort limits (n,) [N m, N]."""
-        self._commanded, self._time = settings.silent_effort * effort_limits, settings.silent_time
+    def __init__(self, settings: PlausibilitySettings, arm: Arm) -> None:
+        """Check for the joints of `arm`."""
+        self._commanded, self._time = settings.silent_effort * arm.effort_limits, settings.silent_time
         self._least = 0.1 * self._commanded
+        self._J, self._J_inverse = arm.transmission.matrix, arm.transmission.inverse().matrix
+        self._largest = np.array([arm.effects.saturation.get(name, np.inf) for name in arm.joint_names])
 
     def begin(self, sample: Sample) -> Vector:
         """Time (n,) for which the commanded effort has not shown [s]."""
@@ -208,10 +210,17 @@ class SilentEffort:
         if sample.commanded is None:
             state = 0.0 * state
         else:
-            size = np.abs(sample.commanded)
-            hidden = (size > self._commanded) & (sample.commanded * sample.effort < self._least * size)
+            hidden = self._hidden(sample.commanded, sample.effort)
+            if hidden.any():
+                # Coupled actuators may not have the effort although each joint's is inside its limit.
+                actuators = np.clip(sample.commanded @ self._J_inverse, -self._largest, self._largest)
+                hidden &= self._hidden(actuators @ self._J, sample.effort)
             state = hidden * (state + sample.dt)
         return state, state > self._time
+
+    def _hidden(self, commanded: Vector, effort: Vector) -> Mask:
+        size = np.abs(commanded)
+        return (size > self._commanded) & (commanded * effort < self._least * size)
 
 
 class Plausibility:
@@ -243,7 +252,7 @@ class Plausibility:
             VelocityConsistency(settings, tolerance, counts),
             FrozenPosition(settings, arm.effort_limits, counts),
             Response(settings, arm, model),
-            SilentEffort(settings, arm.effort_limits),
+            SilentEffort(settings, arm),
         )
         self._none = np.zeros(arm.num_joints, bool)
         self.gravity = self.last_valid = np.zeros(arm.num_joints)

@@ -308,3 +308,16 @@ def test_an_arm_without_power_is_not_checked():
     assert bench.guard.fault_code == Status.FAULT_NONE
     bench.run(Command.HOLD, 100)
     assert bench.guard.fault_code == Status.FAULT_NONE
+
+
+def test_an_effort_that_the_coupled_actuators_do_not_have_is_not_missed():
+    """All of the elbow's effort turns the shoulder's actuator as well, which saturates: tau_2 = 1.464 - 1.753."""
+    sensors = Sensors()
+    sensors.commanded = np.array([0.0, 0.35, -1.0, 0.0, 0.0, 0.0, 0.0]) * LIMIT
+    assert sensors.commanded[1] > SETTINGS.silent_effort * LIMIT[1]
+    sensors.effort = np.array([0.0, 1.464 - 1.753, -1.753, 0.0, 0.0, 0.0, 0.0])
+    assert sensors.move(COUNTS / MS, ticks=200)[0] == ""
+    # An effort that reads zero although the actuators have it is found all the same.
+    sensors.commanded = 0.4 * LIMIT * unit(1)
+    sensors.effort = np.zeros(N)
+    assert "does not show" in sensors.move(COUNTS / MS, ticks=200)[0]
