@@ -46,7 +46,7 @@ USES = {
 
 
 def interference(guard):
-    """What the guard reported, or "" while it lets commands act."""
+    """Returns the reason of a fault or a watchdog hold, or ""."""
     return guard.fault_text or guard.hold_reason
 
 

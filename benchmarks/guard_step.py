@@ -1,4 +1,4 @@
-"""What the command guard costs per tick: one command received and one step, while efforts act.
+"""Cost of the command guard per tick: one command received and one step, while efforts act.
 
     python benchmarks/guard_step.py [--other CHECKOUT]
 

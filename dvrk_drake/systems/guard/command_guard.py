@@ -360,27 +360,22 @@ class CommandGuard:
             age, clock = by_wall, "the wall clock"
         if age <= self._expiry:
             return
-        if self.state == lcmt_dvrk_status.STATE_STARTING:
-            self._hold()  # nothing acted
-            return
-        self.counts.expired += 1
+        self.counts.expired += self.state != lcmt_dvrk_status.STATE_STARTING
         self._take_over(
             f"the last command expired: {1e-3 * age:.1f} ms old by {clock}, {1e-3 * self._expiry:g} ms are allowed"
         )
 
     def _take_over(self, reason: str) -> None:
-        """Goes to HOLD until an operator resumes; has no effect in OFF and in FAULT.
+        """Goes to HOLD, until an operator resumes if commands acted; has no effect in OFF and in FAULT.
 
         Args:
             reason: in words; the first one stays until the resume.
         """
         if self.state in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_FAULT):
             return
-        nothing_acted = self.state == lcmt_dvrk_status.STATE_STARTING
+        acted = self.state != lcmt_dvrk_status.STATE_STARTING
         self._hold()
-        if nothing_acted:
-            return
-        if not self.settings.resume_automatically:
+        if acted and not self.settings.resume_automatically:
             self.hold_reason = self.hold_reason or reason
 
     def _refusal_now(self, command: lcmt_dvrk_command, utime: int) -> int:

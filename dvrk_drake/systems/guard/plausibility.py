@@ -27,7 +27,7 @@ _COUNTS = 3.0
 
 
 class ArmModel(Protocol):
-    """What the guard needs of a model of the arm; `dvrk_drake.dynamics.control_model.ControlModel` is one."""
+    """Model of the arm that the guard needs, such as `dvrk_drake.dynamics.control_model.ControlModel`."""
 
     def gravity_effort(self, q: Vector) -> Vector:
         """Returns the effort (n,) [N m, N] that holds the arm at q (n,) [rad, m]."""
@@ -230,7 +230,7 @@ class Plausibility:
         gravity: (n,) the model's gravity effort at the last sample [N m, N].
         invalid: (n,) joints without a valid position since the last `restart`.
         fault: what was implausible in the last sample, in words; "" if nothing was.
-        last_valid: (n,) pose of the last sample, or an earlier one for `invalid` joints [rad, m].
+        last_valid: (n,) positions of the `invalid` joints before their fault [rad, m]; meaningless for the others.
     """
 
     def __init__(self, arm: Arm, model: ArmModel, settings: PlausibilitySettings, speed_limit: Vector) -> None:
