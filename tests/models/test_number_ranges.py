@@ -56,8 +56,8 @@ def numbers_in(kind, path, field):
         yield from numbers_in(arguments[0], (*path, 0), field)
     elif origin is dict:
         yield from numbers_in(arguments[1], (*path, "x"), field)
-    elif origin is np.ndarray:
-        if "float64" in str(arguments[1]):
+    elif "ndarray" in str(origin).lower():  # numpy's class, or from numpy 2.5 on its alias NDArray
+        if "float64" in str(kind):
             yield path, field, np.ndarray
     elif dataclasses.is_dataclass(kind):
         yield from numbers_of(kind, path)
