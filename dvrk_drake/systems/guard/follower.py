@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.systems.guard.command_stream import is_finite
 from dvrk_drake.systems.guard.limits import Flags, GuardLimits, Mask, Vector, clip
 
 
@@ -31,7 +31,7 @@ class GuardOutput:
 
     def is_finite(self) -> bool:
         """Returns whether all numbers are finite."""
-        return math.isfinite((self.position + self.velocity + self.effort).sum())
+        return is_finite([*self.position.tolist(), *self.velocity.tolist(), *self.effort.tolist()])
 
 
 class Follower:

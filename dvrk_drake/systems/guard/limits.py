@@ -31,6 +31,11 @@ def clip(x: Vector, lower: ArrayLike, upper: ArrayLike) -> Vector:
     return np.minimum(np.maximum(x, lower), upper)
 
 
+def is_any(mask: Mask) -> bool:
+    """Returns whether any of (n,) is true; mask.any() takes several times as long for a few joints."""
+    return True in mask.tolist()
+
+
 class GuardLimits:
     """Limits of one arm, for n joints in its order.
 
@@ -92,7 +97,7 @@ class GuardLimits:
 
     def beyond(self, q: Vector) -> str:
         """The worst position limit that the pose q (n,) is beyond by more than half of its margin, in words; or ""."""
-        c = self.A @ q
+        c = self.A.dot(q)
         excess = np.abs(c - self._middle) - self._allowed
         k = int(excess.argmax())
         if not excess[k] > 0:
@@ -125,8 +130,9 @@ class GuardLimits:
         clamped = clip(command, -self.command_limits, self.command_limits)
         step = self._effort_rate * dt
         effort = clip(clamped, last - step, last + step)
-        flags = (clamped != command) * _CLAMPED | (effort != clamped) * _RATE_LIMITED
-        return effort, flags
+        if not is_any(effort != command):
+            return effort, np.zeros(len(effort), np.int8)
+        return effort, (clamped != command) * _CLAMPED | (effort != clamped) * _RATE_LIMITED
 
     def restrain_effort(self, effort: Vector, q: Vector, v: Vector) -> tuple[Vector, Flags]:
         """`effort` with what the walls and the speed limit add at q, v, all (n,); joint flags.
@@ -136,15 +142,15 @@ class GuardLimits:
         limit = self.effort_limits
         flags = np.zeros(len(effort), np.int8)
         added = np.zeros(len(effort))
-        c = self.A @ q + self._wall_look_ahead * (self.A @ v)
-        if (np.abs(c - self._middle) > self._free).any():
+        c = self.A.dot(q) + self._wall_look_ahead * self.A.dot(v)
+        if is_any(np.abs(c - self._middle) > self._free):
             to_upper, to_lower = (self.upper - c) / self.wall_width, (c - self.lower) / self.wall_width
             walls = 2 * self._wall_effort * (clip(1 - to_lower, 0, 1) - clip(1 - to_upper, 0, 1))
             added = walls @ self.A
             for k in np.flatnonzero(walls):
                 flags[self.A[k] != 0] |= self._wall_flags[k]
         too_fast = np.abs(v) > self.speed
-        if too_fast.any():
+        if is_any(too_fast):
             added = added - 4 * limit * np.sign(v) * clip(np.abs(v) / self.speed - 1, 0.0, 0.5)
             flags[too_fast] |= lcmt_dvrk_status.FLAG_SPEED_LIMIT
         return clip(effort + added, -limit, limit), flags

@@ -60,7 +60,10 @@ class Measurement:
         self.bad += 1
         if not 0 <= age <= self.oldest:
             return f"the measurement is {1e-6 * age:.3f} s old; allowed is 0 to {1e-6 * self.oldest:g} s"
-        if not (q.shape == v.shape == effort.shape == (self.num_joints,) and is_finite(q, v, effort)):
+        if not (
+            q.shape == v.shape == effort.shape == (self.num_joints,)
+            and is_finite([*q.tolist(), *v.tolist(), *effort.tolist()])
+        ):
             return f"the measured positions, velocities or efforts are not {self.num_joints} finite numbers each"
         self.dt = 0.0 if self.q is None else 1e-6 * (measured_utime - self._measured_utime)
         self.q, self.v, self.effort, self._measured_utime, self.bad = q, v, effort, measured_utime, 0

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dvrk_drake.systems.guard.limits import Vector, is_any
+
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
-    from dvrk_drake.systems.guard.limits import Vector
     from dvrk_drake.systems.guard.settings import GuardSettings
 
 #: Periods of which the median is taken.
@@ -74,9 +75,10 @@ class OscillationMonitor:
         alternating = scaled - self._mean
         self._mean = self._mean + dt / _MEAN_TIME * alternating
         self._since += dt
-        if np.abs(alternating).max() < 1.0:
+        large = np.abs(alternating) >= 1.0
+        if not is_any(large):
             return None
-        side = np.where(np.abs(alternating) < 1.0, self._side, np.sign(alternating))
+        side = np.where(large, np.sign(alternating), self._side)
         self._reversals = math.exp(-self._since / self._time) * self._reversals + (side * self._side < 0)
         self._since = 0.0
         self._side = side

@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.systems.guard.limits import Mask, Vector, is_any
 from dvrk_drake.systems.guard.settings import PlausibilitySettings
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
-
-Vector = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 #: The mass matrix is evaluated again after this time [s]: it changes slowly, and evaluating it costs as much as a tick.
 _MASS_MATRIX_PERIOD = 0.05
@@ -184,7 +182,7 @@ class Response:
         gain = min(sample.dt / self._time, 1.0)
         effort = effort + gain * (sample.net_effort - effort)
         velocity = velocity + gain * (sample.v - velocity)
-        unexplained = effort - M @ (sample.v - velocity) - lasting
+        unexplained = effort - M.dot(sample.v - velocity) - lasting
         lasting = lasting + min(sample.dt / self._memory, 1.0) * unexplained
         return (effort, velocity, lasting, M, age), np.abs(unexplained) > self._allowed
 
@@ -211,7 +209,7 @@ class SilentEffort:
             state = 0.0 * state
         else:
             hidden = self._hidden(sample.commanded, sample.effort)
-            if hidden.any():
+            if is_any(hidden):
                 # Coupled actuators may not have the effort although each joint's is inside its limit.
                 actuators = np.clip(sample.commanded @ self._J_inverse, -self._largest, self._largest)
                 hidden &= self._hidden(actuators @ self._J, sample.effort)
@@ -291,7 +289,7 @@ class Plausibility:
             sample = Sample(dt, q, v, q - q_before, fastest, effort, effort - self.gravity, commanded)
             results = [check.check(sample, state) for check, state in zip(self._checks, self._states, strict=True)]
             self._states = [state for state, _ in results]
-            if np.logical_or.reduce([joints for _, joints in results]).any():
+            if any(is_any(joints) for _, joints in results):
                 for check, (_, joints) in zip(self._checks, results, strict=True):
                     self._find(check, joints)
             self._pose_age += dt
@@ -305,7 +303,7 @@ class Plausibility:
         self._reject(~self._none)
 
     def _find(self, check: Check, joints: Mask) -> None:
-        if not joints.any():
+        if not is_any(joints):
             return
         if not self.fault:
             self.fault = f"{', '.join(self._names[j] for j in np.flatnonzero(joints))}: {check.text}"

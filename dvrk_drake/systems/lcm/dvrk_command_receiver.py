@@ -139,7 +139,7 @@ class DvrkCommandReceiver(LeafSystem):
         else:
             effort = self._position_control.Eval(context)
             # A position controller whose measurement is lost for a few periods has no effort that could be applied.
-            effort = effort if is_finite(effort) else self.GetGuard(context).gravity_effort
+            effort = effort if is_finite(effort.tolist()) else self.GetGuard(context).gravity_effort
             output.SetFromVector(np.clip(effort, -self._effort_limits, self._effort_limits))
 
     def _calc_guard(self, context: Context, output: AbstractValue) -> None:

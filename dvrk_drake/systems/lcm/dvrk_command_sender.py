@@ -81,7 +81,7 @@ class DvrkCommandSender(LeafSystem):
         asked = {lcmt_dvrk_command.EFFORT: effort, lcmt_dvrk_command.POSITION: desired}
         mode = self._mode(context)
         command.reset_fault = self._reset.HasValue(context) and bool(self._reset.Eval(context)[0])
-        if command.reset_fault or (mode in asked and not is_finite(asked[mode])):
+        if command.reset_fault or (mode in asked and not is_finite(asked[mode].tolist())):
             mode = lcmt_dvrk_command.HOLD
         command.control_mode = mode
         zero = np.zeros(n)

@@ -88,7 +88,7 @@ def test_a_measurement_is_a_copy():
 
 @pytest.mark.parametrize(("number", "finite"), [(0.99e6, True), (1e6, False), (-1e6, False), (np.nan, False)])
 def test_numbers_below_a_million_are_finite(number, finite):
-    assert is_finite([0.0, number], [1.0]) == is_finite([1.0], [0.0, number]) == finite
+    assert is_finite([0.0, number, 1.0]) == is_finite([number, 0.0]) == finite
 
 
 # Streams of commands
