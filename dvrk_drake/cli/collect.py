@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from dvrk_drake.cli.lcm import add_control, ready_controller
-from dvrk_drake.cli.support import check_output, seconds, seed
+from dvrk_drake.cli.support import check_output, interrupt_ends_process, seconds, seed
 from dvrk_drake.errors import CollectionError
 
 if TYPE_CHECKING:
@@ -76,8 +76,10 @@ def _teach(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.teacher import EnterKey, Teacher
 
     load_poses_if_any(options.poses, load_arm(options.arm))  # refused before the arm is asked
-    controller, link, _ = ready_controller(options, "gravity")
-    line, stopped = LiveLine(sys.stderr), stop_on_signals()
+    with interrupt_ends_process():
+        controller, link, _ = ready_controller(options, "gravity")
+        stopped = stop_on_signals()
+    line = LiveLine(sys.stderr)
     teacher = Teacher(
         controller, options.poses, at_rest=options.at_rest, told=EnterKey(sys.stdin), report=_reporter(line)
     )
@@ -115,8 +117,10 @@ def _visit(options: argparse.Namespace) -> None:
     if num_done == len(poses):
         print(f"{options.output}: has all {len(poses)} poses already")
         return
-    controller, link, _ = ready_controller(options, "hold")
-    line, stopped = LiveLine(sys.stderr), stop_on_signals()
+    with interrupt_ends_process():
+        controller, link, _ = ready_controller(options, "hold")
+        stopped = stop_on_signals()
+    line = LiveLine(sys.stderr)
     collector = Collector(poses, controller, output, settings, stopped=stopped, report=_reporter(line))
     print(f"{len(poses) - num_done} poses of {arm.name} to visit; Ctrl-C stops, the same command goes on", flush=True)
     try:

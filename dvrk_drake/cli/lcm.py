@@ -7,7 +7,7 @@ import sys
 from contextlib import closing, nullcontext
 from typing import TYPE_CHECKING
 
-from dvrk_drake.cli.support import add_gravity, add_key, load_key, mounted, quiet_drake
+from dvrk_drake.cli.support import add_gravity, add_key, interrupt_ends_process, load_key, mounted, quiet_drake
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -54,8 +54,9 @@ def _arm(options: argparse.Namespace) -> None:
     driver.key_file = options.key or driver.key_file
     pose = start_pose(arm, options.pose)
     url = open_lcm(options.lcm_url or driver.lcm_url).get_lcm_url()
-    simulated = SimulatedArm(arm, driver, url, pose)
-    stopped = stop_on_signals()
+    with interrupt_ends_process():
+        simulated = SimulatedArm(arm, driver, url, pose)
+        stopped = stop_on_signals()
     with live_view(options.arm, url) if options.meshcat else nullcontext():
         if options.realtime:
             for warning in make_realtime():
@@ -112,10 +113,11 @@ def _run(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.live_status import LiveStatus
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
-    compensator, gains = _friction_compensator(options), _gains(options)
-    controller, link, period = ready_controller(options, options.mode, compensator, gains)
+    with interrupt_ends_process():
+        compensator, gains = _friction_compensator(options), _gains(options)
+        controller, link, period = ready_controller(options, options.mode, compensator, gains)
+        stopped = stop_on_signals()
     arm = controller.arm
-    stopped = stop_on_signals()
     print(
         f"{options.mode} of {arm.name} at {1 / period:.0f} Hz as sender {controller.sender_id}; "
         "Ctrl-C leaves it to its own hold",

@@ -40,12 +40,27 @@ def import_interruptibly() -> None:
     if threading.current_thread() is not threading.main_thread() or sys.modules.keys() >= set(modules):
         return
 
-    before = signal.signal(signal.SIGINT, leave)
-    try:
+    with interrupt_ends_process():
         for module in modules:
             importlib.import_module(module)
+
+
+@contextmanager
+def interrupt_ends_process() -> Iterator[None]:
+    """Lets Ctrl-C end the process at once while the block runs, in which nothing is half-written.
+
+    As an exception it may be lost: numba's compiler and extension modules call Python where no exception is passed on.
+    A handler that the block installs stays, so that there is no time in between. In a thread this does nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, leave)
+    try:
+        yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        if signal.getsignal(signal.SIGINT) is leave:
+            signal.signal(signal.SIGINT, before)
 
 
 def quiet_drake() -> None:

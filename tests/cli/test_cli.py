@@ -266,6 +266,40 @@ def test_interrupt_at_any_import_is_one_line(module):
     assert process.returncode == 130
 
 
+LOST_INTERRUPT = """
+import os, signal, sys
+from dvrk_drake.cli import main
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.processes import arm_controller, control, simulated_arm
+
+def compiles(*arguments):
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        signal.sigtimedwait([], 0)  # lets Python call the handler
+    except KeyboardInterrupt:
+        pass
+    sys.exit("the interrupt was lost")
+
+control.first_status = lambda link: (lcmt_dvrk_status(), 1e-3)
+arm_controller.ArmController = simulated_arm.SimulatedArm = compiles
+sys.argv = {words!r}
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("verb", ["arm", "run", "collect", "teach"])
+def test_an_interrupt_is_not_lost_where_numba_compiles(verb, tmp_path):
+    poses, out = str(tmp_path / "poses.yaml"), str(tmp_path / "out.csv")
+    words = [verb]
+    if verb in ("collect", "teach"):
+        assert main(["collect", "--arm", "mtml", "--poses", poses, "--random", "1"]) == 0
+        words = ["collect", "--poses", poses, *(["--output", out] if verb == "collect" else ["--teach"])]
+    code = LOST_INTERRUPT.format(words=["dvrk-drake", *words, "--arm", "mtml", "--lcm-url", "memq://"])
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert process.stderr.splitlines()[-1] == "dvrk-drake: interrupted"
+    assert process.returncode == 130
+
+
 def test_an_interrupt_of_the_restart_is_not_lost():
     block = "import signal; signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})\n"
     kill = "import os; os.kill(os.getpid(), signal.SIGINT)\n"
