@@ -205,6 +205,10 @@ def _wrong(schema: Any, value: Any, key: str) -> str:
             allowed += f", e.g. [{value}]"
     elif schema is float and isinstance(value, float):
         allowed = "a finite number"
+    if isinstance(value, bool) and schema in (str, list[str]):
+        word, words, meaning = ("on", "on and yes", "true") if value else ("off", "off and no", "false")
+        example = f'"{word}"' if schema is str else f'["{word}"]'
+        allowed += f"; quote a word, e.g. {example}: YAML reads {words} without quotes as {meaning}"
     return f"{key} is {_quoted(value)}; allowed: {allowed}"
 
 
