@@ -39,7 +39,7 @@ class lcmt_dvrk_status(object):
     FAULT_POSITION_LIMIT = 2
     """ pushed beyond a position limit while effort commands acted """
     FAULT_MEASUREMENT = 3
-    """ measured positions, velocities or efforts were not finite, or too old """
+    """ measured positions, velocities or efforts were not finite, or too old; or the first pose was far beyond a limit """
     FAULT_CLOCK = 4
     """ the arm's own clock went backwards or stood still """
     FAULT_DRIVER = 5

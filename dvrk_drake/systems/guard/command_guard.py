@@ -75,7 +75,8 @@ class CommandGuard:
     or was stopped. Then the arm holds.
 
     **Measurements** are checked: numbers, age, and plausibility (`Plausibility`). One that is not finite or too old
-    ends commands; while the arm holds, some in a row are tolerated, and more are a fault.
+    ends commands; while the arm holds, some in a row are tolerated, and more are a fault. The first one must have a
+    pose that is not far beyond a position limit, else it is a fault as well.
 
     **Period**: a guard that is not stepped for `longest_period`, or with a median period above `slow_period`, accepts
     no POSITION and EFFORT: what it limits would come too late.
@@ -319,7 +320,10 @@ class CommandGuard:
         """Takes a measurement and checks it; what is wrong with it ends in HOLD or FAULT."""
         measured, plausibility = self._measured, self._plausibility
         first = measured.q is None
-        if problem := measured.take(measured_utime, q, v, effort):
+        problem = measured.take(measured_utime, q, v, effort)
+        if first and not problem and (problem := self.limits.implausible_pose(self._q())):
+            measured.q = None  # the next measurement is the first one again
+        if problem:
             if first or measured.bad > self.settings.plausibility.bad_samples:
                 # An arm that was never measured has no pose that it could be held at.
                 self.report_fault(problem, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=not first)

@@ -71,6 +71,7 @@ class GuardLimits:
         self.effort_limits = np.array(arm.effort_limits)
         self.command_limits = settings.effort_fraction * self.effort_limits
         self.A, self.lower, self.upper = arm.limit_matrix()
+        self._prismatic = arm.prismatic
         self.names = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
         width = self.upper - self.lower
         self.margin = np.minimum(settings.margin, settings.margin_fraction * width)
@@ -103,6 +104,23 @@ class GuardLimits:
         if not excess[k] > 0:
             return ""
         return f"{self.names[k]} = {c[k]:.4g} is beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}"
+
+    def implausible_pose(self, q: Vector) -> str:
+        """The first position limit that the pose q (n,) is beyond by more than half of the limit's range, or "".
+
+        An arm may rest a little beyond a limit, whose place is calibrated. Half of the range is far beyond any
+        mechanical stop.
+        """
+        c = self.A @ q
+        far = np.flatnonzero(np.abs(c - self._middle) > self.upper - self.lower)
+        if not far.size:
+            return ""
+        k = int(far[0])
+        unit = "mm" if k < len(self._prismatic) and self._prismatic[k] else "degrees"
+        return (
+            f"{self.names[k]} = {c[k]:.4g} is far beyond {self.lower[k]:.4g}..{self.upper[k]:.4g} in the first "
+            f"measurement; {unit} or wrong zero?"
+        )
 
     def refusal_to_start(self, command: lcmt_dvrk_command, q: Vector, effort: Vector, gravity: Vector) -> int:
         """REFUSAL_START_* of a command that would begin to act at the measured q and effort (n,), or REFUSAL_NONE.

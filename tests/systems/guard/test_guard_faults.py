@@ -6,6 +6,7 @@ from guard_bench import ARM, SESSION, WITH_OFF, Bench, Heavy, N, Q, Weightless, 
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
 
@@ -127,6 +128,51 @@ def test_a_fault_while_off_stays_off():
     assert bench.tick().control_mode == Command.OFF
     bench.run(Command.HOLD, 1)
     assert bench.run(Command.HOLD, 1, reset_fault=True).control_mode == Command.HOLD
+
+
+def test_a_first_pose_far_beyond_the_limits_is_a_fault_until_it_is_plausible():
+    degrees = Q.copy()
+    degrees[0] = 40.0
+    bench = Bench(q=degrees, modes=WITH_OFF)
+    guard = bench.guard
+    assert (guard.state, guard.fault_code) == (Status.STATE_FAULT, Status.FAULT_MEASUREMENT)
+    assert guard.fault_text == (
+        "outer_yaw = 40 is far beyond -0.6981..1.134 in the first measurement; degrees or wrong zero?"
+    )
+    assert bench.output.control_mode == Command.OFF  # it was never held anywhere
+    bench.q = Q
+    assert bench.tick().control_mode == Command.OFF
+    assert guard.state == Status.STATE_FAULT
+    bench.run(Command.HOLD, 1)
+    bench.run(Command.HOLD, 1, reset_fault=True)
+    assert guard.state == Status.STATE_HOLD
+    np.testing.assert_array_equal(bench.tick().position, Q)
+    bench.started()
+
+
+def test_a_first_pose_far_beyond_the_limits_faults_again_after_a_reset():
+    bench = Bench(q=np.degrees(Q))
+    for asks in (False, True):
+        bench.send(Command.HOLD, reset_fault=asks, position=list(Q))
+        bench.tick()
+    assert (bench.guard.state, bench.output.control_mode) == (Status.STATE_FAULT, Command.OFF)
+
+
+def test_a_first_pose_a_little_beyond_a_limit_is_held():
+    q = Q.copy()
+    q[0] = ARM.position_upper[0] + 0.4 * (ARM.position_upper[0] - ARM.position_lower[0])
+    bench = Bench(q=q)
+    assert bench.guard.state == Status.STATE_HOLD
+    np.testing.assert_array_equal(bench.output.position, q)
+
+
+def test_a_prismatic_joint_in_millimetres_is_named_as_such():
+    arm = load_arm("psm")
+    guard = CommandGuard(arm, SESSION, Weightless())
+    q = np.zeros(7)
+    q[2] = 120.0
+    guard.step(0, 0, q, 0 * q, 0 * q)
+    assert guard.fault_text == "insertion = 120 is far beyond 0..0.24 in the first measurement; mm or wrong zero?"
 
 
 def test_nobody_turns_the_motors_off_in_a_fault_but_whoever_resets_it_first():

@@ -91,6 +91,24 @@ def test_the_worst_limit_is_named():
     assert LIMITS.beyond(q).startswith("wrist_pitch = ")
 
 
+@pytest.mark.parametrize("row", range(N + 1))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_first_pose_is_implausible_from_half_of_the_range_beyond_a_limit(row, side):
+    joint = int(np.flatnonzero(A[row])[0])
+    middle, width = (LOWER + UPPER) / 2, UPPER - LOWER
+
+    def at(share):
+        pose = Q.copy()
+        pose[joint] += middle[row] + side * (0.5 + share) * width[row] - A[row] @ Q
+        if row in (1, 2):  # the other one keeps the sum of shoulder and elbow inside
+            pose[3 - row] = np.clip(middle[N] - pose[row], LOWER[3 - row], UPPER[3 - row])
+        return LIMITS.implausible_pose(pose)
+
+    assert at(-0.5) == at(0.0) == at(0.499) == ""
+    assert at(0.501).startswith(f"{LIMITS.names[row]} = ")
+    assert at(0.501).endswith(" in the first measurement; degrees or wrong zero?")
+
+
 # The start
 
 
