@@ -147,8 +147,8 @@ def test_driver_file(tmp_path):
         ("gard: {}", 'key "gard" is unknown; did you mean "guard"\\? allowed in .*: lcm_url, '),
         (
             "control_modes: [off]",
-            r"control_modes\[0\] is False; allowed: a text; quote a word, e\.g\. \"off\": YAML reads off and no without "
-            "quotes as false",
+            r"control_modes\[0\] is False; allowed: a text; quote a word, e\.g\. \"off\": YAML reads off and no "
+            "without quotes as false",
         ),
         ("control_modes: off", r"control_modes is False; .* quote a word, e\.g\. \[\"off\"\]: YAML reads off"),
         ("lcm_url: yes", r"lcm_url is True; .*\"on\": YAML reads on and yes without quotes as true"),

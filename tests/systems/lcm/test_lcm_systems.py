@@ -9,11 +9,14 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.lcm import LcmSubscriberSystem
 
+from dvrk_drake.dynamics.control_model import ControlModel
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import StatusFilter
 from dvrk_drake.models.message_key import create_key_file
+from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
 from dvrk_drake.systems.lcm.serializer import TolerantSerializer
@@ -147,6 +150,30 @@ def test_off_lets_the_arm_fall_if_its_driver_accepts_it():
     assert arm.statuses[-1].guard_state == Status.STATE_OFF
     assert not np.any(arm.statuses[-1].effort_measured)
     assert arm.drift() > 0.01
+
+
+def test_after_off_efforts_are_refused_only_while_the_arm_is_braked():
+    lcm = DrakeLcm("memq://")
+    driver = DvrkDriver(control_modes=["effort", "off"], guard=GuardSettings(start_time=0.05))
+    arm = SimulatedArm(lcm, driver=driver)
+    sender = Sending(lcm)
+    for mode, milliseconds in ((Command.HOLD, 50), (Command.OFF, 50), (Command.HOLD, 5)):
+        sender.fix("control_mode", [float(mode)])
+        run(lcm, milliseconds, arm, sender)
+    model = ControlModel(IdentifiedModel.from_arm(arm.arm))
+    sender.fix("control_mode", [float(Command.EFFORT)])
+    shares = []
+    while (status := arm.statuses[-1]).guard_state != Status.STATE_EFFORT and len(arm.statuses) < 1000:
+        gravity = model.gravity_effort(np.array(status.position))
+        sender.fix("effort", gravity)
+        shares.append(np.max(np.abs(status.effort_measured - gravity) / arm.arm.effort_limits))
+        run(lcm, 1, arm, sender)
+    assert (status.guard_state, status.refusal_code) == (Status.STATE_EFFORT, Status.REFUSAL_START_FAR)
+    # A command is judged in the period after the status that it answers.
+    refused = np.diff([status.num_refused for status in arm.statuses[-len(shares) :]]) > 0
+    shares = np.array(shares[:-1])
+    assert refused.sum() > 10
+    assert shares[refused].min() > 0.09 and shares[~refused].max() < 0.11
 
 
 def test_the_sender_asks_for_a_hold_unless_it_is_given_finite_numbers():
