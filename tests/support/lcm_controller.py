@@ -14,7 +14,7 @@ import numpy as np
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.processes.pace import make_realtime
+from dvrk_drake.processes.pace import Pace, make_realtime
 from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
 
 
@@ -57,6 +57,19 @@ def main(arguments: list[str]) -> None:
     )
     while True:
         controller.lcm.handle()
+
+
+def tick(arguments: list) -> None:
+    """Computes for 0.4 ms every millisecond, like a simulated arm, and counts; argument: a shared number."""
+    (ticks,) = arguments
+    make_realtime()
+    pace = Pace(1e-3)
+    while True:
+        pace.wait()
+        end = time.thread_time() + 4e-4
+        while time.thread_time() < end:
+            pass
+        ticks.value += 1
 
 
 def flood(arguments: list) -> None:

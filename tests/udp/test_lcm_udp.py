@@ -16,7 +16,7 @@ import lcm_controller
 import numpy as np
 import pytest
 from arm_observer import NETWORK_URL, Observer, check_clock, holds, takes_efforts
-from arm_processes import PATIENT_DRIVER, POSES, CommandLine, Forked, start_arm, start_controller, start_run
+from arm_processes import FORKSERVER, PATIENT_DRIVER, POSES, CommandLine, Forked, start_arm, start_controller, start_run
 from own_network import inside, outside, run_inside, watchdog
 from patience import PATIENCE, wait_until
 
@@ -531,7 +531,9 @@ def test_of_two_controllers_the_first_stays_in_command(arm):
 def test_with_a_key_a_flood_of_foreign_commands_neither_slows_nor_moves_the_arm(tmp_path):
     """Good commands of a stranger, as fast as a process can publish them.
 
-    Other work of a busy computer slows the arm as well, so one undisturbed attempt of five is enough.
+    The rate is compared with that of a peer, a process with the same period, scheduling and computing time that reads
+    no messages: where the machine stands still, both do. Without real-time scheduling a flood takes computing time from
+    all processes, above all from those that read it, so the rate is judged with real-time scheduling only.
     """
     key = tmp_path / "a.key"
     create_key_file(key)
@@ -539,38 +541,29 @@ def test_with_a_key_a_flood_of_foreign_commands_neither_slows_nor_moves_the_arm(
     observer = Observer("mtml", OTHER_URL)
     arm = start_arm("mtml", *PATIENT, *options)
     observer.until(lambda status: True, "first status", process=arm)
-    run, flood = start_run("mtml", "--mode", "hold", "--realtime", *map(str, options)), None
-
-    def rate():
-        """Milliseconds of the arm's clock in one by the wall clock."""
-        first = len(observer.heard)
-        observer.during(2.0)
-        utimes = [status.utime for status in observer.heard[first:]]
-        times = observer.times[first : first + len(utimes)]
-        return 1e-6 * (utimes[-1] - utimes[0]) / (times[-1] - times[0])
-
+    run = start_run("mtml", "--mode", "hold", "--realtime", *map(str, options))
+    ticks, others = FORKSERVER.Value("q"), []
     try:
         first = observer.until(takes_efforts, "run", process=run)
-        for _ in range(5):
-            observer.until(takes_efforts, "run", process=run)
-            alone, ignored = rate(), observer.last.num_ignored
-            flood = Forked(lcm_controller.flood, OTHER_URL, observer.last.encode())
-            begun = observer.until(
-                lambda status, ignored=ignored: status.num_ignored > ignored + 100, "flood", process=flood
-            )
-            beside, heard = rate(), observer.heard[begun:]
-            flood.end()
-            acting = np.mean([takes_efforts(status) for status in heard])
-            print(f"rate beside a flood to that without: {beside / alone:.3f}; efforts act in {acting:.3f} of the time")
-            if beside > 0.9 * alone and acting == 1.0:
-                break
-        else:
-            pytest.fail(run.said() + arm.said())
+        others.append(Forked(lcm_controller.tick, ticks))
+        wait_until(lambda: ticks.value > 100, "the peer", others[0])
+        ignored = observer.last.num_ignored
+        others.append(Forked(lcm_controller.flood, OTHER_URL, observer.last.encode()))
+        begun = observer.until(lambda status: status.num_ignored > ignored + 100, "flood", process=others[1])
+        of_arm, of_peer = observer.last.utime, ticks.value
+        observer.during(2.0)
+        of_arm, of_peer = (observer.last.utime - of_arm) // 1000, ticks.value - of_peer
+        heard = observer.heard[begun:]
     finally:
-        if flood is not None:
-            flood.end()
+        for process in others:
+            process.end()
         said = run.end(signal.SIGINT)
         said += arm.end(signal.SIGINT)
+    realtime = "no real-time scheduling" not in said
+    acting = np.mean([takes_efforts(status) for status in heard])
+    print(f"{of_arm} periods of the arm, {of_peer} of the peer; efforts act in {acting:.3f} of the time; {realtime=}")
+    assert of_arm > 0.9 * of_peer or not realtime, said
+    assert acting == 1.0, said
     assert heard[-1].ignored_code == Status.REFUSAL_NOT_AUTHENTIC, said
     assert {status.command_sender_id for status in observer.heard[first:]} <= {0, heard[0].command_sender_id}
     assert drift(*observer.heard[first:]) < 1e-3
