@@ -95,8 +95,8 @@ class CommandGuard:
     command. Without a key, a sender is only as good as its sender_id, which anybody on the network can copy.
 
     **OFF** drops an arm without brakes, so it must be in `modes`, and no single message does it: the arm must hold, and
-    the sender's last command must have been HOLD. In a fault it is refused: somebody is confused then, and the arm is
-    held. An emergency is what the stop button is for, not a message.
+    the sender's last command must have been HOLD. A fault refuses it: the cause is unknown, so the arm stays held until
+    an operator resets the fault. In an emergency, press the stop button.
 
     **Start guard**: before commands act they must have come without a gap of `expiry` and without a refusal for
     `start_time`, all near the present: efforts near the measured ones, positions near the measured ones, also where the
