@@ -19,7 +19,7 @@ from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem, r
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.phase_folds import FOLDS, period_of
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import read_recording
+from dvrk_drake.recordings.recording import read_recording
 
 
 def main() -> None:

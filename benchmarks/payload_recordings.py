@@ -26,7 +26,7 @@ from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.recording import Recording, read_recording
+from dvrk_drake.recordings.recording import Recording, read_recording
 
 #: File, link, mass [kg], place in the link's frame [m]; docs/payload.md says how the places are read.
 WEIGHTS = [

@@ -15,8 +15,8 @@ from pydrake.multibody.tree import RigidBody
 
 from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParameter, reduce_to_base
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.gravity_regressor import named_lengths
 from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES, change_of_frame, parameter_axis
-from dvrk_drake.dynamics.symbolic_gravity import named_lengths
 from dvrk_drake.dynamics.symbolic_plant import labelled_bodies
 from dvrk_drake.models.plant import make_arm_plant
 

@@ -21,8 +21,8 @@ from dvrk_drake.dynamics.dynamic_section import (
     ActuatorEffectEstimate,
     DynamicSection,
 )
+from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
-from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES

@@ -9,7 +9,7 @@ import pytest
 
 from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
+from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.models.arm import load_arm
 
 

@@ -8,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePose
 from teleoperation_loop import MTM, PSM, angle
 
-from dvrk_drake.analysis.demo.teleoperation import (
+from dvrk_drake.experiments.demo.teleoperation import (
     SCALE,
     START_FOLLOWER,
     START_MASTER,

@@ -19,7 +19,7 @@ from dvrk_drake.dynamics.effect_shapes import effect_shapes
 from dvrk_drake.dynamics.physical_consistency import LinkScale
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.models.recording import REST_SPEED, Recording
+from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: Prior standard deviations. Of links' parameters, and of the effects that the arm's file states: as shares of their
 #: size. Of simple friction, and of offsets, springs and cables of unknown size: as shares of the RMS effort.

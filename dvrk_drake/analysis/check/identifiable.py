@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 from dvrk_drake.analysis.check.channel_check import check_channels
+from dvrk_drake.analysis.check.findings import Finding, RecordingReport
 from dvrk_drake.analysis.check.recording_check import check_recording
-from dvrk_drake.analysis.check.report import Finding, RecordingReport
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.poses import find_poses
 from dvrk_drake.analysis.static.static_identification import usable_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 
 def check_for_identification(recording: Recording, arm: Arm) -> RecordingReport:

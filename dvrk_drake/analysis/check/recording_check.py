@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
 from dvrk_drake.analysis.check.motion_check import check_motion
 from dvrk_drake.analysis.check.pose_check import check_poses
-from dvrk_drake.analysis.check.report import Finding, JointSignals, RecordingReport, Severity
 from dvrk_drake.analysis.signals.rests import LEAST_ROWS, LONGEST_PERIOD
 from dvrk_drake.analysis.static.doubts import check_effort_unit
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import REST_SPEED, Recording
+from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: A joint that moves less has never moved [rad], [m].
 LEAST_RANGE = 0.02, 0.002

@@ -29,7 +29,7 @@ from dvrk_drake.dynamics.dynamic_section import (
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics, Provenance
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import REST_SPEED, Recording
+from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: An effect whose effort is below this share of the actuators' is left out of the model.
 LEAST_EFFECT = 1e-4

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
+from dvrk_drake.dynamics.gravity_regressor import GRAVITY, SymbolicGravity, derive_gravity
 from dvrk_drake.dynamics.identified_model import BaseParameterEstimate
-from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, SymbolicGravity, derive_gravity
 from dvrk_drake.models.arm import Arm
 
 

@@ -13,7 +13,7 @@ from dvrk_drake.analysis.signals.phase_folds import period_of
 from dvrk_drake.analysis.signals.repetition import repeatability_floor
 from dvrk_drake.analysis.verdict import judge, rule_text, worst
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Width of the smoothed sign of the friction that an error is searched for, as a share of the RMS speed.
 _FRICTION_WIDTH = 0.1

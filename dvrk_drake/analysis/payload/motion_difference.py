@@ -16,7 +16,7 @@ from dvrk_drake.analysis.signals.phase_folds import period_of
 from dvrk_drake.analysis.signals.repetition import SAME_MOTION
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: A motion that does not repeat may have begun so much sooner or later than the other [s].
 LONGEST_SHIFT = 5.0

@@ -20,7 +20,7 @@ from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Of the intervals that are reported.
 CONFIDENCE = 0.95

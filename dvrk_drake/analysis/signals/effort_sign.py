@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Efforts that correlate with the model's by less than this have the other sign: one of unknown sign is near 0.
 OPPOSITE = -0.3

@@ -12,7 +12,7 @@ from dvrk_drake.analysis.signals.slow_parts import slow_parts
 from dvrk_drake.analysis.static.static_identification import LEAST_POSES
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: What must be said where slow parts are used.
 SLOW_PARTS_NOTE = (

@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from dvrk_drake.analysis.static.static_identification import average_repeated_poses
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Cut-off of the zero-phase low-pass for speeds [Hz], and its order.
 CUT_OFF, ORDER = 10.0, 4

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.signals.rests import LEAST_ROWS, LONGEST_PERIOD, is_motion, smooth_velocity, stationary_runs
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Slow: below this share of the joint's top speed, and of its top acceleration.
 SLOW_SPEED, SLOW_ACCELERATION = 0.1, 0.2

@@ -11,7 +11,7 @@ from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.cli import main
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import holding_torques
-from dvrk_drake.models.recording import Recording, read_recording, write_recording
+from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
 
 ARM = load_arm("mtmr")
 

@@ -12,7 +12,7 @@ from dvrk_drake.analysis.signals.phase_folds import FOLDS, GAP, period_of, phase
 from dvrk_drake.dynamics.dynamic_section import SignalSettings
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 ARM = load_arm("mtml")
 N = ARM.num_joints
