@@ -5,7 +5,7 @@ import ast
 import pytest
 from repository import ROOT
 
-#: What each package may import beside itself and `COMMON`; the picture is in CONTRIBUTING.md.
+#: What each package may import beside itself and `COMMON`; the picture is in docs/packages.md.
 ALLOWED = {
     "models": set(),
     "recordings": {"models"},

@@ -20,7 +20,7 @@ from dvrk_drake.errors import ArmError, ScenarioError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES, Gains
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
-from dvrk_drake.models.plant import Closure
+from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.hand import Grip

@@ -16,7 +16,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
 from dvrk_drake.experiments.scenario import Scenario
-from dvrk_drake.models.plant import Closure
+from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop

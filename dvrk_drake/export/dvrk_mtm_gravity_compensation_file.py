@@ -42,7 +42,7 @@ _PARAMETERS = within(-1e4, 1e4, "N m")
 
 @dataclass(frozen=True, eq=False)
 class GravityCompensationFile:
-    """What the file holds; `dynamics.gravity_compensation` has the controller's formula.
+    """What the file holds; `export.dvrk_mtm_gravity_compensation` has the controller's formula.
 
     Attributes:
         positive, negative: (40,) parameters for positive and negative joint velocity.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
-from dvrk_drake.models.nearby_pose import beside
+from dvrk_drake.models.coupled_limits import beside
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.leg import Leg

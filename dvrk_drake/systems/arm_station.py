@@ -16,7 +16,8 @@ from pydrake.systems.primitives import MatrixGain
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
-from dvrk_drake.models.plant import Closure, add_arm, set_arm_positions, tree_selector
+from dvrk_drake.models.loop_closure import Closure
+from dvrk_drake.models.plant import add_arm, set_arm_positions, tree_selector
 from dvrk_drake.systems.arm_effects.drive_step import DriveStep
 from dvrk_drake.systems.arm_effects.plant_effects import PlantEffects
 from dvrk_drake.systems.arm_effects.real_drive import RealDrive, add_real_drive

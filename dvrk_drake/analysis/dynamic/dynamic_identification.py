@@ -9,9 +9,9 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.choice import choose_effects, left_out_errors
 from dvrk_drake.analysis.dynamic.columns import drive_effects, dynamic_columns, optional_effects
 from dvrk_drake.analysis.dynamic.covariance import parameter_covariance
+from dvrk_drake.analysis.dynamic.effect_choice import choose_effects, left_out_errors
 from dvrk_drake.analysis.dynamic.estimates import DynamicEstimates
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.dynamic.statics import base_parameter_estimates

@@ -15,7 +15,8 @@ from pydrake.systems.framework import Context
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
-from dvrk_drake.models.plant import Closure, add_arm, set_joint_damping
+from dvrk_drake.models.loop_closure import Closure
+from dvrk_drake.models.plant import add_arm, set_joint_damping
 from dvrk_drake.systems.arm_station import ArmStation
 
 

@@ -1,1 +1,1 @@
-"""The experiments of the paper that the project starts from, redone beside its published numbers; a module a figure."""
+"""The paper's experiments redone; `reports.reproduction` sets them beside the published numbers."""

@@ -17,7 +17,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.nearby_pose import beside
+from dvrk_drake.models.coupled_limits import beside
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator

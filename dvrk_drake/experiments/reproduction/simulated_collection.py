@@ -12,7 +12,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.reproduction.true_arms import KnownTruth
 from dvrk_drake.experiments.static_pose_collection import collect_static_poses
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.nearby_pose import beside
+from dvrk_drake.models.coupled_limits import beside
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.dynamic.effect_selection import EffectSelection
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, squared_errors
 from dvrk_drake.analysis.dynamic.problem import ConsistentProgram, DynamicProblem
-from dvrk_drake.analysis.dynamic.selection import EffectSelection
 
 #: Times that a lean base and the parameters of the links are found in turn; a third changes no error by 0.01 %.
 TURNS = 2
