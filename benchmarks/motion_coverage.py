@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dvrk_drake.analysis.dynamic.covariance import parameter_covariance
 from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem, residuals
 from dvrk_drake.analysis.dynamic.effect_choice import effort_weights
+from dvrk_drake.analysis.dynamic.parameter_uncertainty import parameter_covariance
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
-from dvrk_drake.analysis.signals.phase_folds import period_of
+from dvrk_drake.analysis.signals.repetition import period_of
 from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters
 from dvrk_drake.models.arm import Arm, load_arm
 

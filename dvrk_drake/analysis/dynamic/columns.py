@@ -18,8 +18,8 @@ from dvrk_drake.dynamics.actuator_effects import (
     slides,
     spring_over,
 )
+from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.effect_shapes import effect_shapes
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 

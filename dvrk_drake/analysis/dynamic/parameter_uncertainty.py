@@ -7,7 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import matmul_toeplitz
+from scipy.signal import correlate
 
+from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
 from dvrk_drake.errors import IdentificationError
 
 #: Above this size of their correlation the data tell the sum or difference of two parameters, hardly each of them.
@@ -92,3 +95,123 @@ def information_matrix(Y: NDArray[np.float64], residual_variance: ArrayLike) -> 
     weighted = Y / np.sqrt(np.asarray(residual_variance, float))[:, None]
     rows = weighted.reshape(-1, Y.shape[-1])
     return rows.T @ rows
+
+
+#: Errors of an effort further apart than this have nothing to do with each other, but for whole periods [s].
+MEMORY = 1.0
+#: Rows are taken this many times as often as the cut-off of the low-pass needs.
+_OVERSAMPLING = 2.0
+#: Two passes that overlap by less than this share of the motion do not tell what repeats.
+_LEAST_OVERLAP = 0.2
+
+
+def parameter_covariance(
+    problem: DynamicProblem,
+    fit: ConsistentFit,
+    residuals: NDArray[np.float64],
+    rate: float,
+    cut_off: float,
+    period: float | None,
+) -> NDArray[np.float64]:
+    """(p + e, p + e) covariance of `fit.x`, given the effects; inequalities are not counted as knowledge.
+
+    With A = (X'WX + P)^-1, the inverse of the second derivative of the cost,
+
+        covariance = A (sum_i w_i^2 X_i' Omega_i X_i + P) A,
+
+    P being what the priors know and Omega_i the covariance of actuator i's error over time, as the residuals show it:
+    errors that last (friction that is not modelled quite right) count as few measurements, and those that come again
+    in every period of the motion count once, whatever the number of periods. Residuals of a fit are smaller than the
+    errors where it could bend to them, those of phases that it has not seen are larger by as much: with H the hat
+    matrix, (1 - H) e and e / (1 - H). The products of one with the other are neither (MacKinnon and White, "Some
+    heteroskedasticity-consistent covariance matrix estimators", 1985: HC2).
+
+    Args:
+        problem, fit: as solved.
+        residuals: (r, n) what the fit leaves of the efforts.
+        rate: of the rows [Hz].
+        cut_off: of the low-pass that they are behind [Hz].
+        period: after which the motion repeats [s], or None.
+    """
+    step = max(1, int(rate / (2 * cut_off * _OVERSAMPLING)))
+    rows = slice(None, None, step)
+    A = _inverse(fit.information + fit.prior_precision)
+    middle = fit.prior_precision.copy()
+    unseen = _unseen_residuals(problem, fit, residuals)
+    for i, weight in enumerate(fit.weights):
+        covariance = error_covariance(residuals[rows, i], unseen[rows, i], rate / step, period)
+        X = problem.chosen_columns(i, fit.chosen)[rows]
+        moved = np.flatnonzero(np.any(X, axis=0))
+        X = X[:, moved]
+        middle[np.ix_(moved, moved)] += (weight * step) ** 2 * (X.T @ matmul_toeplitz(covariance, X))
+    return np.asarray(A @ middle @ A, dtype=np.float64)
+
+
+def _unseen_residuals(
+    problem: DynamicProblem, fit: ConsistentFit, residuals: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(r, n) what is left of each fold by the fit to the others: one step of Newton's, exact but for inequalities."""
+    unseen = residuals.copy()
+    free = np.flatnonzero(fit.x > fit.lower)
+    columns = [problem.chosen_columns(i, fit.chosen)[:, free] for i in range(residuals.shape[1])]
+    known = (fit.information + fit.prior_precision)[np.ix_(free, free)]
+    for fold in range(int(problem.fold.max()) + 1):
+        rows = problem.fold == fold
+        X, e = [x[rows] for x in columns], residuals[rows].T
+        own = sum(weight * x.T @ x for weight, x in zip(fit.weights, X, strict=True))
+        slope = sum(weight * x.T @ left for weight, x, left in zip(fit.weights, X, e, strict=True))
+        step = _inverse(known - own) @ slope
+        unseen[rows] += np.column_stack([x @ step for x in X])
+    return unseen
+
+
+def error_covariance(
+    seen: NDArray[np.float64], unseen: NDArray[np.float64], rate: float, period: float | None
+) -> NDArray[np.float64]:
+    """(r,) covariance of an actuator's error with itself, by how many rows later.
+
+    `seen` and `unseen` (r,) are its residuals when the fit knew these rows and when it did not.
+
+    Up to `MEMORY` it is the error's own, tapered (Parzen's window); whole periods later that of the part of it that
+    repeats, which is what the first repetition shows.
+    """
+    count = len(seen)
+    both = correlate(seen, unseen, method="fft")
+    lags = (both + both[::-1])[count - 1 :] / 2 / np.arange(count, 0, -1)
+    reach = min(round(MEMORY * rate), count - 1)
+    window = _parzen(np.arange(-reach, reach + 1) / reach)
+    near = np.concatenate([lags[reach:0:-1], lags[: reach + 1]]) * window
+    covariance = np.zeros(count + reach)
+    covariance[: reach + 1] = near[reach:]
+    shift = 0 if period is None else round(period * rate)
+    if reach < shift and (count - shift - reach) > _LEAST_OVERLAP * count:
+        again = lags[shift - reach : shift + reach + 1] * window
+        for start in range(shift, count + reach, shift):
+            until = min(start + reach + 1, len(covariance))
+            covariance[start - reach : until] += again[: until - start + reach]
+    return _nearest_covariance(covariance[:count])
+
+
+def independent_measurements(covariance: NDArray[np.float64]) -> float:
+    """How many independent values tell as much of a variance as r with this covariance (r,)."""
+    count = len(covariance)
+    pairs = 2 * np.arange(count, 0, -1)
+    pairs[0] = count
+    return float(count**2 * covariance[0] ** 2 / max(np.sum(pairs * covariance**2), 1e-300))
+
+
+def _parzen(u: NDArray[np.float64]) -> NDArray[np.float64]:
+    u = np.abs(u)
+    return np.asarray(np.where(u < 0.5, 1 - 6 * u**2 * (1 - u), 2 * (1 - u) ** 3))
+
+
+def _nearest_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Estimates of covariances can have negative spectra, which no error has."""
+    circulant = np.concatenate([covariance, covariance[-1:0:-1]])
+    spectrum = np.maximum(np.fft.rfft(circulant).real, 0.0)
+    return np.asarray(np.fft.irfft(spectrum, len(circulant))[: len(covariance)], dtype=np.float64)
+
+
+def _inverse(H: NDArray[np.float64]) -> NDArray[np.float64]:
+    scale = 1 / np.sqrt(np.diag(H))
+    return np.asarray(np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale), dtype=np.float64)

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.signals.low_pass import low_pass
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
-from dvrk_drake.analysis.signals.phase_folds import period_of
-from dvrk_drake.analysis.signals.repetition import repeatability_floor
+from dvrk_drake.analysis.signals.repetition import period_of, repeatability_floor
 from dvrk_drake.analysis.verdict import judge, rule_text, worst
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.recordings.recording import Recording

@@ -8,10 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from dvrk_drake.analysis.signals.drive_efforts import FRICTION_PARTS, FrictionPart, drive_efforts
-from dvrk_drake.analysis.signals.effort_sign import refuse_opposite_efforts
+from dvrk_drake.analysis.signals.drive_efforts import (
+    FRICTION_PARTS,
+    FrictionPart,
+    drive_efforts,
+    refuse_opposite_efforts,
+)
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
-from dvrk_drake.analysis.signals.phase_folds import period_of, phase_folds
+from dvrk_drake.analysis.signals.repetition import period_of, phase_folds
 from dvrk_drake.dynamics.actuator_effects import effect_coordinates
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection

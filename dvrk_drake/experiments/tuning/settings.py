@@ -86,3 +86,23 @@ def middle_pose(arm: Arm) -> NDArray[np.float64]:
 def rounded_gains(joints: Iterable[tuple[float, float, float]]) -> Gains:
     """Of (kp, kd, ki) of each joint, to three digits: what is compared is what a file has."""
     return Gains(*([float(f"{value:.3g}") for value in column] for column in zip(*joints, strict=True)))
+
+
+#: The paper's simulation (Rutfield, Zia, Boos, Santoso, Sujumnong, WPI 2015), from the controller node that the team
+#: gave along with it: gains of the joints of an MTM.
+_PUBLISHED_JOINTS = (
+    *("outer_yaw", "shoulder_pitch", "elbow_pitch"),
+    *("wrist_platform", "wrist_pitch", "wrist_yaw", "wrist_roll"),
+)
+_PUBLISHED_KP = (0.5, 0.8, 0.85, 3.7, 0.5, 0.02, 0.006)
+_PUBLISHED_KV = (1.95, 0.95, 1.75, 0.2, 0.1, 0.8, 0.08)
+_PUBLISHED_KI = (1e-5, 5e-5, 1e-4, 4e-4, 1e-6, 1e-7, 1e-8)
+#: The controller ran at 100 Hz and summed errors sample by sample: 1 of its Ki is 100 N m/(rad s).
+_PUBLISHED_RATE = 100.0
+
+
+def published_gains(arm: Arm) -> Gains | None:
+    """Of an arm with the joints of an MTM, per second; None of another one, for which none were published."""
+    if arm.joint_names != _PUBLISHED_JOINTS:
+        return None
+    return Gains(list(_PUBLISHED_KP), list(_PUBLISHED_KV), [_PUBLISHED_RATE * ki for ki in _PUBLISHED_KI])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dvrk_drake.experiments.study.executors import local_executor
-from dvrk_drake.experiments.tuning.bench import Condition, Response
+from dvrk_drake.experiments.tuning.bench import Condition, JointOnBench, Response, bench_of
 from dvrk_drake.experiments.tuning.comparison import (
     CONDITIONS,
     POSES,
@@ -18,11 +18,9 @@ from dvrk_drake.experiments.tuning.comparison import (
     measure_step,
     run_step,
 )
-from dvrk_drake.experiments.tuning.joint_on_bench import JointOnBench, bench_of
 from dvrk_drake.experiments.tuning.model_based import ArmDesign, design_arm
 from dvrk_drake.experiments.tuning.procedure import JointProcedure, tune_joint
-from dvrk_drake.experiments.tuning.published import published_gains
-from dvrk_drake.experiments.tuning.settings import rounded_gains, tuning_poses
+from dvrk_drake.experiments.tuning.settings import published_gains, rounded_gains, tuning_poses
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
 

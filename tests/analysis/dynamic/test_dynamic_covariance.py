@@ -7,7 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.dynamic.covariance import error_covariance, independent_measurements, parameter_covariance
+from dvrk_drake.analysis.dynamic.parameter_uncertainty import (
+    error_covariance,
+    independent_measurements,
+    parameter_covariance,
+)
 from dvrk_drake.analysis.signals.low_pass import low_pass
 
 RATE, CUT_OFF, PERIOD, SECONDS = 100.0, 5.0, 8.0, 32.0

@@ -9,7 +9,7 @@ from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 from rich.console import Console
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.dynamic.statics import base_parameter_map
+from dvrk_drake.analysis.dynamic.estimates import base_parameter_map
 from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters

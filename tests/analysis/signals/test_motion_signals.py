@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dvrk_drake.analysis.signals.drive_efforts import refuse_opposite_efforts
 from dvrk_drake.analysis.signals.effort_lag import CUT_OFF, effort_lag
-from dvrk_drake.analysis.signals.effort_sign import refuse_opposite_efforts
 from dvrk_drake.analysis.signals.motion_signals import MotionSignals, motion_signals
 from dvrk_drake.analysis.signals.true_time import increasing_times, repeated_rows, true_time
 from dvrk_drake.analysis.signals.velocity_agreement import velocity_agreement
