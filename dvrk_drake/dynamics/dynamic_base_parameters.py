@@ -46,11 +46,6 @@ class DynamicBaseParameters:
         """(b, p) with beta = combination phi."""
         return np.asarray(np.linalg.solve(self.to_links.T, self.base.combination.T).T, dtype=np.float64)
 
-    @cached_property
-    def lift(self) -> NDArray[np.float64]:
-        """(p, b) with Y_base = Y lift; phi = lift beta has the base parameters beta and moves like every other such."""
-        return self.to_links[:, self.base.columns]
-
 
 def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True) -> DynamicBaseParameters:
     """Reduces the regressor at random states, chosen so that gravity, velocity and acceleration weigh about the same.

@@ -52,10 +52,6 @@ class DynamicColumns:
     shapes: tuple[NDArray[np.float64], ...]
     rows: NDArray[np.float64]
 
-    def of_actuator(self, i: int) -> NDArray[np.float64]:
-        """(r, p + e) all columns of one actuator."""
-        return np.hstack([self.rigid[:, i], self.shapes[i] * self.rows[:, i]])
-
 
 def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
     """What every drive has, and what the arm's file says that its drives have (`motion.known_effects`).

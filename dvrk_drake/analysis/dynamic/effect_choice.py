@@ -64,13 +64,6 @@ def choose_effects(problem: DynamicProblem, progress: Callable[[float], object] 
     return EffectChoice(replace(problem, tilt=x[-tilts:]) if tilts else problem, selection, start, found, x)
 
 
-def effort_weights(problem: DynamicProblem, chosen: NDArray[np.int_]) -> NDArray[np.float64]:
-    """(n,) one over the variance that each actuator's effort keeps with these effects."""
-    selection = problem.selection()
-    selection.fit(chosen)
-    return selection.weights
-
-
 def left_out_errors(
     choice: EffectChoice, phi: NDArray[np.float64], progress: Callable[[float], object] = lambda _: None
 ) -> NDArray[np.float64]:

@@ -6,17 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.linalg import matmul_toeplitz
 from scipy.signal import correlate
 
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
-from dvrk_drake.errors import IdentificationError
 
 #: Above this size of their correlation the data tell the sum or difference of two parameters, hardly each of them.
 STRONG_CORRELATION = 0.95
-#: Smallest eigenvalue of an information matrix scaled to a unit diagonal that can be told from rounding.
-_SMALLEST_EIGENVALUE = 1e-13
 
 
 @dataclass(frozen=True)
@@ -58,43 +55,6 @@ class ParameterUncertainty:
         size = np.abs(np.triu(self.correlation, 1))
         pairs = sorted(np.argwhere(size > limit).tolist(), key=lambda pair: -size[tuple(pair)])
         return [StrongCorrelation(self.names[i], self.names[k], float(self.correlation[i, k])) for i, k in pairs]
-
-
-def parameter_uncertainty(names: Sequence[str], information: ArrayLike) -> ParameterUncertainty:
-    """Standard errors and correlations from an information matrix.
-
-    Args:
-        names: (b,) of the parameters.
-        information: (b, b) Y' W Y with the inverse variances W of the rows' noise (plus what a prior knows): the
-            covariance of the estimate is its inverse. Rows whose noise is not independent count less than one each.
-
-    Raises:
-        IdentificationError: the data do not determine the parameters; names those that they leave open.
-    """
-    N = np.asarray(information, float)
-    if N.shape != (len(names),) * 2 or not np.all(np.isfinite(N)):
-        raise IdentificationError(f"information matrix {N.shape} must be finite and ({len(names)}, {len(names)})")
-    # Scaled to a unit diagonal: parameters range over decades (kg m^2 at the shoulder, g mm^2 at the handle).
-    diagonal = np.diag(N)
-    if not np.all(diagonal > 0):
-        unmoved = [name for name, size in zip(names, diagonal, strict=True) if not size > 0]
-        raise IdentificationError(f"the data say nothing of {', '.join(unmoved)}")
-    scale = 1 / np.sqrt(diagonal)
-    eigenvalues, vectors = np.linalg.eigh(N * np.outer(scale, scale))
-    if eigenvalues[0] < _SMALLEST_EIGENVALUE:
-        largest = np.argsort(-np.abs(vectors[:, 0]))[:3]
-        open_ones = ", ".join(names[i] for i in sorted(largest) if abs(vectors[i, 0]) > 0.1)
-        raise IdentificationError(f"the data do not tell a combination of {open_ones}: move more, or give a prior")
-    scaled_covariance = (vectors / eigenvalues) @ vectors.T
-    spread = np.sqrt(np.diag(scaled_covariance))
-    return ParameterUncertainty(tuple(names), scale * spread, scaled_covariance / np.outer(spread, spread))
-
-
-def information_matrix(Y: NDArray[np.float64], residual_variance: ArrayLike) -> NDArray[np.float64]:
-    """(b, b) Y' W Y of a regressor Y (m, n, b) whose joints' residuals have the variances (n,) [N^2 m^2; N^2]."""
-    weighted = Y / np.sqrt(np.asarray(residual_variance, float))[:, None]
-    rows = weighted.reshape(-1, Y.shape[-1])
-    return rows.T @ rows
 
 
 #: Errors of an effort further apart than this have nothing to do with each other, but for whole periods [s].
@@ -190,14 +150,6 @@ def error_covariance(
             until = min(start + reach + 1, len(covariance))
             covariance[start - reach : until] += again[: until - start + reach]
     return _nearest_covariance(covariance[:count])
-
-
-def independent_measurements(covariance: NDArray[np.float64]) -> float:
-    """How many independent values tell as much of a variance as r with this covariance (r,)."""
-    count = len(covariance)
-    pairs = 2 * np.arange(count, 0, -1)
-    pairs[0] = count
-    return float(count**2 * covariance[0] ** 2 / max(np.sum(pairs * covariance**2), 1e-300))
 
 
 def _parzen(u: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Joints under PID control as a linear sampled system: poles, margins, and the gains that place them."""
+"""Joints under PID control as a linear sampled system: stability, margins, and the gains that place them."""
 
 from __future__ import annotations
 
@@ -98,13 +98,6 @@ class SampledLoop:
         effort = integral - np.asarray(gains.kp) * q - np.asarray(gains.kd) * v
         A, B = self._plant
         return np.concatenate([A @ plant + B @ effort, measured, queue[2 * n :], integral])
-
-    def poles(self, gains: Gains) -> NDArray[np.complex128]:
-        """Of the closed loop, in s [rad/s]: log(z) / period, the slowest to decay first; of a delay -infinity."""
-        z = np.linalg.eigvals(self.closed_loop(gains)).astype(complex)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            s = np.log(z) / self._sampling.period
-        return s[np.argsort(-s.real)]
 
     def is_stable(self, gains: Gains) -> bool:
         """Whether every motion dies away."""
