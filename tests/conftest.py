@@ -24,7 +24,7 @@ ONE_PYTHON = (
     *("export/test_dvrk_mtm_gravity_compensation", "export/test_dvrk_psm_gravity_compensation"),
     "dynamics/test_nearest_links",
     "systems/guard/",
-    *("analysis/check/", "analysis/dynamic/", "analysis/payload/", "analysis/recalibration/", "analysis/signals/"),
+    *("analysis/check/", "analysis/dynamic/", "analysis/payload/", "analysis/test_recalibration", "analysis/signals/"),
     "analysis/static/",
     *("experiments/test_reproduction", "experiments/study/", "experiments/test_transparency"),
     "experiments/test_tuning",

@@ -29,8 +29,7 @@ def _check(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.atomic_file import atomic_write
     from dvrk_drake.recordings.recording import read_recording
-    from dvrk_drake.reports.recording_check_figures import plot_report
-    from dvrk_drake.reports.recording_check_tables import print_report
+    from dvrk_drake.reports.recording_check import plot_report, print_report
     from dvrk_drake.reports.terminal_tables import make_console
 
     arm = load_arm(options.arm)

@@ -75,7 +75,7 @@ def _export(options: argparse.Namespace) -> None:
 def _sdf_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.export.sdf import changed_links, write_sdf
-    from dvrk_drake.reports.export_tables import print_changed_links
+    from dvrk_drake.reports.export import print_changed_links
     from dvrk_drake.reports.terminal_tables import make_console
 
     arm, bodies = model.load_arm(), model_bodies(model)
@@ -118,7 +118,7 @@ def _gc_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -
         largest_differences,
     )
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-    from dvrk_drake.reports.export_tables import print_compensation
+    from dvrk_drake.reports.export import print_compensation
     from dvrk_drake.reports.terminal_tables import make_console
 
     if options.friction and options.coulomb is not None:
@@ -143,7 +143,7 @@ def _gc_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -
 
 def _kinematic_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
     from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation
-    from dvrk_drake.reports.export_tables import print_kinematic_compensation
+    from dvrk_drake.reports.export import print_kinematic_compensation
     from dvrk_drake.reports.terminal_tables import make_console
 
     given = {} if options.gc_tolerance is None else {"tolerance": options.gc_tolerance}
@@ -160,8 +160,7 @@ def _compare(options: argparse.Namespace) -> None:
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
     from dvrk_drake.models.atomic_file import atomic_write
-    from dvrk_drake.reports.dvrk_gravity_compensation_figure import plot_compensation
-    from dvrk_drake.reports.export_tables import print_comparison
+    from dvrk_drake.reports.export import plot_compensation, print_comparison
     from dvrk_drake.reports.terminal_tables import make_console
 
     for path in (options.plot, options.json):

@@ -39,7 +39,7 @@ def _payload(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.atomic_file import atomic_write
     from dvrk_drake.recordings.recording import read_recording
-    from dvrk_drake.reports.payload_tables import describe_better_links, print_links, print_payload
+    from dvrk_drake.reports.payload import describe_better_links, print_links, print_payload
     from dvrk_drake.reports.terminal_tables import make_console
 
     model = None if options.model is None else IdentifiedModel.load(options.model)

@@ -53,7 +53,7 @@ def _transparency(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.recordings.recording import read_recording
     from dvrk_drake.reports.terminal_tables import make_console
-    from dvrk_drake.reports.transparency_report import plot_transparency, print_transparency, write_transparency
+    from dvrk_drake.reports.transparency import plot_transparency, print_transparency, write_transparency
 
     quiet_drake()
     arm = load_arm(options.arm)

@@ -28,8 +28,7 @@ def _tune(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.gains_file import save_gains
     from dvrk_drake.reports.terminal_tables import make_console
-    from dvrk_drake.reports.tuning_figures import plot_steps
-    from dvrk_drake.reports.tuning_tables import print_tuning
+    from dvrk_drake.reports.tuning import plot_steps, print_tuning
 
     quiet_drake()
     arm = load_arm(options.arm)

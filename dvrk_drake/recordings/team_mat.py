@@ -20,7 +20,7 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.csv_rows import listed, read_bytes
 from dvrk_drake.recordings.recording import Recording
 
-_NUM_JOINTS = 7
+_MTM_JOINTS = 7
 _MATLAB_REAL = {"double", "single", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _MATLAB_73 = (b"\x00\x02IM", b"\x02\x00MI")
@@ -56,7 +56,7 @@ def read_team_mat(path: str | Path, *, variable: str | None = None, skip_invalid
     content = read_bytes(path)
     name, array = _team_array(path, content, variable)
     count = array.shape[2]
-    joints = array[:_NUM_JOINTS]
+    joints = array[:_MTM_JOINTS]
     invalid = ~np.all(np.isfinite(joints), axis=(0, 1)) | ~np.any(joints, axis=(0, 1))
     if np.any(invalid) and not skip_invalid:
         raise RecordingError(_first_invalid_pose(path, joints, invalid))

@@ -39,7 +39,7 @@ from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_sele
 from dvrk_drake.recordings.recording import Recording, read_recording
 from dvrk_drake.reports.reproduction import run
 from dvrk_drake.reports.reproduction.dh_table import reproduce_table_1
-from dvrk_drake.reports.reproduction.drift_figures import reproduce_figure_5
+from dvrk_drake.reports.reproduction.drift import reproduce_figure_5
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, share, write_page
 from dvrk_drake.reports.reproduction.run import NAMES, reproduce
 from dvrk_drake.reports.reproduction.transparency import reproduce_transparency

@@ -37,8 +37,7 @@ from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, DriveEffect
 from dvrk_drake.models.gains_file import load_gains, save_gains
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.reports.tuning_figures import plot_steps
-from dvrk_drake.reports.tuning_tables import print_tuning
+from dvrk_drake.reports.tuning import plot_steps, print_tuning
 
 #: The lags of the sampling make a loop of second order only far below 1 / (9 ms).
 FAR_BELOW = 15.0

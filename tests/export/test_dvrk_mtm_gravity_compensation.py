@@ -23,7 +23,7 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.reports.dvrk_gravity_compensation_figure import plot_compensation
+from dvrk_drake.reports.export import plot_compensation
 
 pytestmark = pytest.mark.slow
 

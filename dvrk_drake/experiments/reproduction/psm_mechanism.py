@@ -11,7 +11,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 
 #: Poses at which the mechanism is measured.
-POSES = 200
+PSM_POSES = 200
 
 
 def mechanism_errors(arm: Arm) -> tuple[float, float]:
@@ -20,7 +20,7 @@ def mechanism_errors(arm: Arm) -> tuple[float, float]:
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     remote, angle = 0.0, np.pi
-    for q in arm.sample_poses(POSES, np.random.default_rng(0)):
+    for q in arm.sample_poses(PSM_POSES, np.random.default_rng(0)):
         set_arm_positions(plant, context, arm, q)
         point, shaft = _axis(plant, context, "roll")
         remote = max(remote, float(np.linalg.norm(np.cross(point, shaft))))

@@ -10,7 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from dvrk_drake.experiments.reproduction.drift_experiment import BAND, Drifts
 from dvrk_drake.experiments.reproduction.laboratory import Laboratory
-from dvrk_drake.experiments.reproduction.psm_mechanism import POSES, mechanism_errors
+from dvrk_drake.experiments.reproduction.psm_mechanism import PSM_POSES, mechanism_errors
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.reports.figures import MODEL_COLOUR, save_figure
@@ -72,7 +72,7 @@ def _facts() -> ResultTable:
         (
             "remote centre of motion",
             "none exactly: the front four-bar has bars .530/.535, ends .0370/.0407 m",
-            f"kept to {remote:.0e} m over {POSES} random poses",
+            f"kept to {remote:.0e} m over {PSM_POSES} random poses",
         ),
         ("wrist yaw axis", "equals the wrist pitch axis", f"{np.degrees(angle):.1f} degrees from the wrist pitch axis"),
         ("yaw", "locked by its limits", f"{arm.position_lower[yaw]:+.3f}..{arm.position_upper[yaw]:+.3f} rad"),

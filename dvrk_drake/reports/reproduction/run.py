@@ -10,7 +10,7 @@ from dvrk_drake.experiments.reproduction.laboratory import Extent, Laboratory
 from dvrk_drake.experiments.reproduction.recordings import PaperRecordings
 from dvrk_drake.experiments.study.executors import local_executor
 from dvrk_drake.reports.reproduction.dh_table import reproduce_table_1
-from dvrk_drake.reports.reproduction.drift_figures import reproduce_figure_5, reproduce_figure_6
+from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, reproduce_figure_6
 from dvrk_drake.reports.reproduction.page import Section, write_page
 from dvrk_drake.reports.reproduction.psm import reproduce_psm
 from dvrk_drake.reports.reproduction.step_response import reproduce_figure_7

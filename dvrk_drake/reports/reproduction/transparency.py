@@ -9,7 +9,7 @@ from dvrk_drake.experiments.reproduction.laboratory import Laboratory
 from dvrk_drake.experiments.reproduction.transparency import Lead, led
 from dvrk_drake.experiments.transparency import Felt
 from dvrk_drake.reports.reproduction.page import ResultTable, Section
-from dvrk_drake.reports.transparency_report import plot_transparency
+from dvrk_drake.reports.transparency import plot_transparency
 
 
 def reproduce_transparency(laboratory: Laboratory) -> Section:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.dynamic.validation import validate_motion
-from dvrk_drake.analysis.recalibration.recalibration import recalibrate
+from dvrk_drake.analysis.recalibration import recalibrate
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm

@@ -19,7 +19,7 @@ from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
-from dvrk_drake.reports.payload_tables import describe_better_links, print_payload
+from dvrk_drake.reports.payload import describe_better_links, print_payload
 from dvrk_drake.reports.terminal_tables import make_console
 
 pytestmark = pytest.mark.slow

@@ -20,7 +20,7 @@ from dvrk_drake.experiments.study.summary import Quantiles, Share, summarise
 from dvrk_drake.experiments.study.table import StudyTable
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.reports.study_report import plot_study, print_study
+from dvrk_drake.reports.study import plot_study, print_study
 
 MTM = load_arm("mtml")
 

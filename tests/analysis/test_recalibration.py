@@ -8,7 +8,7 @@ from loaded_arm import friction, other_day
 from motions import fourier_motion, recorded, true_dynamics
 
 from dvrk_drake.analysis.dynamic.validation import validate_motion
-from dvrk_drake.analysis.recalibration.recalibration import predict_other_phases, recalibrate
+from dvrk_drake.analysis.recalibration import predict_other_phases, recalibrate
 from dvrk_drake.analysis.signals.drive_efforts import FRICTION_PARTS
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_model import DynamicModel

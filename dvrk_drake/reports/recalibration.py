@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from rich.console import Console
 
-from dvrk_drake.analysis.recalibration.recalibration import FOLDS, Recalibration
+from dvrk_drake.analysis.recalibration import FOLDS, Recalibration
 from dvrk_drake.reports.terminal_tables import make_table
 
 
