@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvrk_drake.analysis.check.identifiable import check_with_channels
+from dvrk_drake.analysis.check.recording_check import check_with_channels
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.dynamics.identified_model import IdentifiedModel

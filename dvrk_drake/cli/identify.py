@@ -99,8 +99,8 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _identify(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.check.identifiable import check_with_channels
-    from dvrk_drake.analysis.signals.poses import find_poses
+    from dvrk_drake.analysis.check.recording_check import check_with_channels
+    from dvrk_drake.analysis.signals.static_segments import find_poses
     from dvrk_drake.analysis.static.static_identification import identify_static
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.recordings.recording import read_recording
@@ -152,7 +152,7 @@ def _identify(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.dynamic.validation import DynamicValidation, validate_motion
-    from dvrk_drake.analysis.signals.poses import find_poses
+    from dvrk_drake.analysis.signals.static_segments import find_poses
     from dvrk_drake.analysis.static.validation import validate
     from dvrk_drake.analysis.verdict import unfit
     from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary
@@ -244,7 +244,7 @@ def _predict(options: argparse.Namespace) -> None:
     import numpy as np
 
     from dvrk_drake.analysis.dynamic.validation import predict_motion
-    from dvrk_drake.analysis.signals.poses import find_poses
+    from dvrk_drake.analysis.signals.static_segments import find_poses
     from dvrk_drake.analysis.static.validation import predict
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.recordings.recording import read_recording, write_csv

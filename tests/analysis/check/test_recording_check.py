@@ -11,7 +11,7 @@ from synthetic_motion import EFFORT_NOISE, PERIOD, RATE, clean_motion
 
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.signals.low_pass import low_pass
-from dvrk_drake.analysis.signals.poses import find_poses
+from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.cli import main
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from rests import RATE, motion_with_rests
 
-from dvrk_drake.analysis.signals.poses import find_poses
-from dvrk_drake.analysis.signals.rests import SAME_REST, rest_poses
-from dvrk_drake.analysis.signals.slow_parts import slow_parts
+from dvrk_drake.analysis.signals.static_segments import SAME_REST, find_poses, rest_poses, slow_parts
 from dvrk_drake.analysis.static.static_identification import LEAST_POSES, identify_static
 from dvrk_drake.analysis.static.validation import validate
 from dvrk_drake.cli import main
