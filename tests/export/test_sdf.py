@@ -18,7 +18,7 @@ from dvrk_drake.dynamics.inertial_parameters import (
     link_inertias,
     parameters_from_pseudo_inertia,
 )
-from dvrk_drake.dynamics.nearest_links import nearest_links
+from dvrk_drake.dynamics.model_links import nearest_links
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.export.sdf import changed_links, sdf_difference, write_sdf
 from dvrk_drake.export.urdf import to_urdf, write_urdf
