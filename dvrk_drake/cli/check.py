@@ -27,7 +27,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 def _check(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.check.recording_check import check_for_identification
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.files import atomic_write
     from dvrk_drake.recordings.recording import read_recording
     from dvrk_drake.reports.recording_check import plot_report, print_report
     from dvrk_drake.reports.terminal_tables import make_console

@@ -54,7 +54,7 @@ def _demo(options: argparse.Namespace) -> None:
 
 def _teleop(options: argparse.Namespace) -> None:
     from dvrk_drake.experiments.demo.teleoperation import play_teleoperation, run_live_teleoperation, start_scene
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.terminal_tables import make_console, print_teleoperation
 
     quiet_drake()

@@ -99,7 +99,7 @@ def show_motion_validation(
     options: argparse.Namespace, validation: DynamicValidation, model: IdentifiedModel, source: str, plots: Path | None
 ) -> None:
     """Writes the JSON of a dynamic model compared with a motion, prints verdicts and errors, writes the plots."""
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.dynamic_identification import print_dynamic_validation
     from dvrk_drake.reports.terminal_tables import make_console
 

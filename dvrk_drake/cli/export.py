@@ -159,7 +159,7 @@ def _kinematic_writer(model: IdentifiedModel, path: str, options: argparse.Names
 def _compare(options: argparse.Namespace) -> None:
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.export import plot_compensation, print_comparison
     from dvrk_drake.reports.terminal_tables import make_console
 
@@ -202,7 +202,7 @@ def _load_model(name: str) -> IdentifiedModel:
 
 def _is_arm_file(name: str) -> bool:
     """An arm's YAML names its mechanism; a model's has no such field."""
-    from dvrk_drake.models.input_file import read_text_input
+    from dvrk_drake.models.files import read_text_input
 
     try:
         return any(line.startswith("mechanism:") for line in read_text_input(name, DvrkDrakeError).splitlines())

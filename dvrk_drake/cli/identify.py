@@ -217,7 +217,7 @@ def _show_validation(
     plots: Path | None,
 ) -> None:
     """Writes the JSON of a model compared with poses, prints verdicts and errors, writes the plots."""
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.figures import plot_validation
     from dvrk_drake.reports.terminal_tables import make_console, print_doubts, print_validation
 

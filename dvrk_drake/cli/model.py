@@ -43,7 +43,7 @@ def _model(options: argparse.Namespace) -> None:
     from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
     from dvrk_drake.export import gravity_sources
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.terminal_tables import make_console, print_symbolic_model
 
     if options.output is not None:

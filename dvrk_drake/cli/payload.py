@@ -37,7 +37,7 @@ def _payload(options: argparse.Namespace) -> None:
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.errors import ModelError
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.files import atomic_write
     from dvrk_drake.recordings.recording import read_recording
     from dvrk_drake.reports.payload import describe_better_links, print_links, print_payload
     from dvrk_drake.reports.terminal_tables import make_console

@@ -179,7 +179,7 @@ def print_notes(path: str, notes: Sequence[str]) -> None:
 
 def write_tables(path: str, print_to: Callable[[Console], object]) -> None:
     """Writes what `print_to` prints into a text file."""
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.terminal_tables import TABLE_WIDTH
 
     with atomic_write(path) as stream:

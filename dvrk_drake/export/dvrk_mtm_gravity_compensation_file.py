@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import known_arms
-from dvrk_drake.models.atomic_file import atomic_write
-from dvrk_drake.models.input_file import read_json_input
+from dvrk_drake.models.files import atomic_write, read_json_input
 from dvrk_drake.models.schema_fault import number_fault, within
 
 VERSION = "2.0"

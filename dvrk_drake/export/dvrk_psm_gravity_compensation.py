@@ -22,7 +22,7 @@ from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.errors import ModelError
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import check_tolerance, round_up
-from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.plant import make_arm_plant
 
 ARM_JOINTS = ("yaw", "pitch", "insertion")

@@ -8,8 +8,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from dvrk_drake.errors import ArmError, DvrkDrakeError
-from dvrk_drake.models.atomic_file import atomic_write
-from dvrk_drake.models.input_file import LARGEST_BINARY, open_input, read_json_input
+from dvrk_drake.models.files import LARGEST_BINARY, atomic_write, open_input, read_json_input
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
 
 _FILE_URL = "file://"

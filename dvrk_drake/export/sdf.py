@@ -15,7 +15,7 @@ from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.errors import ModelError
 from dvrk_drake.export.mesh_copies import copy_meshes, redirect_meshes
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.sdf_model import DRAKE, compose_sdf
 
 #: Relative change below which a link keeps its text: what converting an inertia back and forth rounds off.

@@ -14,7 +14,7 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.export.mesh_copies import copy_meshes, redirect_meshes
 from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.sdf_model import DRAKE, SdfFacts, read_sdf_facts
 
 #: URDF wants a speed limit of every joint; this one stands where the SDF states none [rad/s, m/s].

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.input_file import LARGEST_TEXT, read_input
+from dvrk_drake.models.files import LARGEST_TEXT, read_input
 from dvrk_drake.models.schema_fault import Range
 
 MODELS_FOLDER = Path(__file__).parent

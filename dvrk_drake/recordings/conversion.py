@@ -20,15 +20,16 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.csv_rows import read_bytes
 from dvrk_drake.recordings.lcm_log_reader import is_lcm_log
-from dvrk_drake.recordings.recording import Coordinates, Recording, column_names, read_recording, write_recording
-from dvrk_drake.recordings.team_mat import looks_like_matlab, read_team_mat
-from dvrk_drake.recordings.wpi_csv import (
+from dvrk_drake.recordings.public_formats import (
+    looks_like_matlab,
     made_times,
+    read_team_mat,
     read_wpi_csv,
     refuse_rate,
     time_notes,
     wpi_in_joint_coordinates,
 )
+from dvrk_drake.recordings.recording import Coordinates, Recording, column_names, read_recording, write_recording
 
 Format = Literal["csv", "team-mat", "wpi-csv", "lcm-log"]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.input_file import open_input, read_input
+from dvrk_drake.models.files import open_input, read_input
 
 #: A CSV is read in blocks of this size, and its lines have at most so many characters.
 _BLOCK, _LONGEST_LINE = 1 << 20, 1 << 20

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.input_file import open_input
+from dvrk_drake.models.files import open_input
 
 _MAGIC = bytes.fromhex("EDA1DA01")
 _HEADER = struct.Struct(">4sqqII")

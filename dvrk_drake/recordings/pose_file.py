@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.recordings.recording import SAME_POSE, Recording

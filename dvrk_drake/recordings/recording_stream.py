@@ -16,8 +16,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import status_channel
 from dvrk_drake.recordings.growing_file import GrowingFile
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, event_bytes
+from dvrk_drake.recordings.lcm_status_log import StatusStream, measurements
 from dvrk_drake.recordings.recording import column_names
-from dvrk_drake.recordings.status_stream import StatusStream, measurements
 
 #: Columns of a CSV behind those of a Recording, to find a row again elsewhere.
 _ORIGIN = ("utime", "sequence", "guard_state")

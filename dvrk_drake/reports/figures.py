@@ -17,7 +17,7 @@ from dvrk_drake.analysis.static.static_identification import StaticIdentificatio
 from dvrk_drake.analysis.static.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.recording import Recording
 
 MODEL_COLOUR, ZERO_COLOUR, MEASURED_COLOUR = "#1f6f8b", "#c9c9c9", "#d1495b"

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from dvrk_drake.experiments.transparency import TAKES_HOLD, Felt
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.reports.figures import save_figure
 from dvrk_drake.reports.terminal_tables import make_table
 

@@ -18,8 +18,8 @@ from dvrk_drake.experiments.scenario_file import load_scenario
 from dvrk_drake.experiments.study.study_file import load_study
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.files import LARGEST_TEXT
 from dvrk_drake.models.gains_file import load_gains
-from dvrk_drake.models.input_file import LARGEST_TEXT
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 from dvrk_drake.models.typed_yaml import parse_yaml
 from dvrk_drake.processes.simulated_arm import load_driver

@@ -12,7 +12,7 @@ from recordings import random_recording, write_text
 from unprivileged import public_folder, run_unprivileged
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.recording import read_recording, write_csv, write_recording
 
 

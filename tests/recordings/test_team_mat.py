@@ -11,7 +11,7 @@ import scipy.io
 from public_files import assert_refused, team_array, write_mat
 
 from dvrk_drake.recordings.conversion import convert, detect_format
-from dvrk_drake.recordings.team_mat import read_team_mat
+from dvrk_drake.recordings.public_formats import read_team_mat
 
 
 @pytest.mark.parametrize("compressed", [False, True])

@@ -7,7 +7,7 @@ import pytest
 from public_files import NUMBERS, assert_refused, wpi_rows, write_text, write_wpi
 
 from dvrk_drake.recordings.conversion import convert
-from dvrk_drake.recordings.wpi_csv import read_wpi_csv
+from dvrk_drake.recordings.public_formats import read_wpi_csv
 
 
 def test_wpi_csv_columns_time_and_coordinates(tmp_path):

@@ -21,7 +21,7 @@ from dvrk_drake.errors import ArmError
 from dvrk_drake.experiments.demo.true_arm import TrueArm, make_true_arm
 from dvrk_drake.experiments.static_pose_collection import collect_static_poses
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation

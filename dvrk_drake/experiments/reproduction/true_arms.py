@@ -16,8 +16,8 @@ from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM
 from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.recording import Recording
 
 #: How much heavier or lighter than drawn a link is, where nothing better is known.

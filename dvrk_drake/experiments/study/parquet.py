@@ -8,7 +8,7 @@ from pathlib import Path
 from dvrk_drake.errors import StudyError
 from dvrk_drake.experiments.study.study_file import Study
 from dvrk_drake.experiments.study.table import Row, StudyTable
-from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.files import atomic_write
 
 try:
     import pyarrow

@@ -12,7 +12,7 @@ from typing import IO
 
 from dvrk_drake.errors import StudyError
 from dvrk_drake.experiments.study.study_file import Case, Study
-from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.csv_rows import read_bytes
 from dvrk_drake.recordings.growing_file import GrowingFile
 from dvrk_drake.recordings.recording import column_names
