@@ -73,8 +73,7 @@ def _view(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.control import ArmLink
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.live_view import show_status
-    from dvrk_drake.systems.arm_view import ArmView, start_meshcat
-    from dvrk_drake.systems.camera import framing
+    from dvrk_drake.systems.arm_view import ArmView, framing, start_meshcat
 
     quiet_drake()
     if options.lcm_url is not None and not options.live:

@@ -37,8 +37,7 @@ def _simulate(options: argparse.Namespace) -> None:
     from dvrk_drake.experiments.simulation import simulate
     from dvrk_drake.recordings.recording import write_recording
     from dvrk_drake.reports.terminal_tables import make_console, print_simulation
-    from dvrk_drake.systems.arm_view import start_meshcat
-    from dvrk_drake.systems.camera import framing
+    from dvrk_drake.systems.arm_view import framing, start_meshcat
 
     quiet_drake()
     scenario = load_scenario(options.scenario, options.set)

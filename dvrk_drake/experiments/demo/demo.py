@@ -25,8 +25,7 @@ from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.arm_view import start_meshcat
-from dvrk_drake.systems.camera import framing
+from dvrk_drake.systems.arm_view import framing, start_meshcat
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
