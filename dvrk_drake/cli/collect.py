@@ -12,7 +12,7 @@ from dvrk_drake.cli.support import check_output, interrupt_ends_process, seconds
 from dvrk_drake.errors import CollectionError
 
 if TYPE_CHECKING:
-    from dvrk_drake.processes.live_line import LiveLine
+    from dvrk_drake.processes.live_status import LiveLine
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -70,7 +70,7 @@ def _add_random_poses(options: argparse.Namespace) -> None:
 def _teach(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.control import control
-    from dvrk_drake.processes.live_line import LiveLine
+    from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.processes.teacher import EnterKey, Teacher
     from dvrk_drake.recordings.pose_file import load_poses_if_any
@@ -103,7 +103,7 @@ def _visit(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.collector import CollectionSettings, Collector
     from dvrk_drake.processes.control import control
-    from dvrk_drake.processes.live_line import LiveLine
+    from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.recordings.collection_file import CollectionFile
     from dvrk_drake.recordings.pose_file import load_poses

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from dvrk_drake.experiments.tuning.comparison import DURATION, REST, Comparison
 from dvrk_drake.experiments.tuning.model_based import ArmDesign, friction
 from dvrk_drake.experiments.tuning.procedure import JointProcedure
 from dvrk_drake.experiments.tuning.settings import band, step_size
-from dvrk_drake.experiments.tuning.tuning import OWN, PUBLISHED, Tuning
+from dvrk_drake.experiments.tuning.tuning import DURATION, OWN, PUBLISHED, REST, Comparison, Tuning
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.figures import save_figure
 from dvrk_drake.reports.terminal_tables import make_table

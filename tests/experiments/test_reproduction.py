@@ -13,7 +13,6 @@ from dvrk_drake.cli import reproduce as verb
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.experiments.reproduction import published
-from dvrk_drake.experiments.reproduction.dh_table import published_row, recomputed_table
 from dvrk_drake.experiments.reproduction.drift_experiment import (
     BAND,
     SAMPLE_PERIOD,
@@ -23,8 +22,8 @@ from dvrk_drake.experiments.reproduction.drift_experiment import (
     release_all,
 )
 from dvrk_drake.experiments.reproduction.laboratory import Extent, Identified, Laboratory
-from dvrk_drake.experiments.reproduction.paper_parameters import paper_model, paper_torque, with_zeroed
-from dvrk_drake.experiments.reproduction.psm_mechanism import mechanism_errors
+from dvrk_drake.experiments.reproduction.mechanisms import mechanism_errors, published_row, recomputed_table
+from dvrk_drake.experiments.reproduction.published import paper_model, paper_torque, with_zeroed
 from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM, PaperRecordings
 from dvrk_drake.experiments.reproduction.step_response import (
     PERIOD,

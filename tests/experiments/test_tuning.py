@@ -15,7 +15,6 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.experiments.scenario_file import load_scenario
 from dvrk_drake.experiments.study.executors import local_executor
 from dvrk_drake.experiments.tuning.bench import Bench, JointOnBench, Response
-from dvrk_drake.experiments.tuning.comparison import CONDITIONS, DURATION, REST, Comparison, StepMeasures, measure_step
 from dvrk_drake.experiments.tuning.model_based import (
     GAIN_MARGIN,
     PHASE_MARGIN,
@@ -26,11 +25,18 @@ from dvrk_drake.experiments.tuning.model_based import (
     mass_matrices,
     sampling_of,
 )
-from dvrk_drake.experiments.tuning.oscillation import judge_oscillation
-from dvrk_drake.experiments.tuning.procedure import RELEASE, find_ultimate_gain, tune_joint
+from dvrk_drake.experiments.tuning.procedure import RELEASE, find_ultimate_gain, judge_oscillation, tune_joint
 from dvrk_drake.experiments.tuning.sampled_loop import SampledLoop, Sampling, place
 from dvrk_drake.experiments.tuning.settings import band, published_gains, step_size
-from dvrk_drake.experiments.tuning.tuning import tune_arm
+from dvrk_drake.experiments.tuning.tuning import (
+    CONDITIONS,
+    DURATION,
+    REST,
+    Comparison,
+    StepMeasures,
+    measure_step,
+    tune_arm,
+)
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.arm_schema import Gains

@@ -1,12 +1,15 @@
-"""The simulated arms that are released: true ones, that no controller is told of."""
+"""Simulated arms that no controller has a model of, and poses collected on them."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
@@ -14,11 +17,14 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM
+from dvrk_drake.experiments.static_pose_collection import collect_static_poses
 from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.coupled_limits import beside
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.systems.arm_station import ArmStation
 
 #: How much heavier or lighter than drawn a link is, where nothing better is known.
 SPREAD = 0.2
@@ -106,3 +112,50 @@ def _with_links(arm: Arm, links: list[LinkInertia] | tuple[LinkInertia, ...], pa
     with atomic_write(path) as stream:
         stream.write(to_text(with_inertias(arm, links), f"{arm.name}, inertial parameters of {origin}."))
     return dataclasses.replace(arm, sdf=(str(path.resolve()),))
+
+
+#: From how far on either side a pose is approached, so that dry friction cancels [rad], [m].
+APPROACH = 0.2, 0.02
+#: Free at both ends of each range, as a share of it; and how far a handle is turned that turns more than twice [rad].
+MARGIN, REACH = 0.05, 1.6
+#: Poses that are collected in one go.
+_CHUNK = 10
+
+
+def collect(
+    truth: KnownTruth,
+    name: str,
+    count: int,
+    seed: int,
+    executor: Executor,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Recording:
+    """`count` poses of a true arm with all its effects, each approached from both sides and averaged.
+
+    The controller that leads it knows what the SDF says. Chunks of poses run at once on the executor's workers, each
+    from a start of its own, with noise of its own; the result does not depend on the workers.
+    """
+    arm = load_arm(name)
+    poses = arm.sample_poses(count, np.random.default_rng(seed), margin=MARGIN)
+    wide = (arm.position_upper - arm.position_lower > 4 * np.pi) & ~arm.prismatic
+    poses[:, wide] = np.clip(poses[:, wide], -REACH, REACH)
+    chunks = np.array_split(poses, -(-count // _CHUNK))
+    futures = [executor.submit(_collect_chunk, name, truth.arm, c, seed + i) for i, c in enumerate(chunks)]
+    for done, _ in enumerate(as_completed(futures), 1):
+        progress(done / len(futures))
+    rows = np.concatenate([future.result() for future in futures])
+    q, tau = np.split(rows, 2, axis=1)
+    return Recording(q=q, tau=tau, source=f"{count} poses of the simulated {arm.name}")
+
+
+def _collect_chunk(name: str, true_arm: Arm, poses: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+    """(m, 2n) means of q and tau over both sides."""
+    arm = load_arm(name)
+    offset = arm.per_joint(*APPROACH)
+    visited = np.concatenate([[beside(arm, q, -offset), q, beside(arm, q, offset), q] for q in poses])
+    station = ArmStation(arm, plant_arm=true_arm, effects=true_arm.effects, seed=seed)
+    generator = np.random.default_rng(seed)
+    nominal = IdentifiedModel.from_arm(arm)
+    recording = collect_static_poses(station, nominal, visited, effort_noise=0.0, generator=generator)
+    rows = np.hstack([recording.q, recording.measured_effort()])
+    return (rows[1::4] + rows[3::4]) / 2

@@ -12,9 +12,8 @@ from dvrk_drake.errors import StudyError
 from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.experiments.simulation import simulate
 from dvrk_drake.experiments.study.measures import Measure
-from dvrk_drake.experiments.study.parquet import ParquetStudyTable
 from dvrk_drake.experiments.study.study_file import Case, Study
-from dvrk_drake.experiments.study.table import Row, StudyTable
+from dvrk_drake.experiments.study.table import ParquetStudyTable, Row, StudyTable
 
 #: Called with the number of rows that are there, and the number of all cases.
 Progress = Callable[[int, int], None]

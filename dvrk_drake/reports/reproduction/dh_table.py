@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dvrk_drake.experiments.reproduction.dh_table import POSES, published_row, recomputed_table
+from dvrk_drake.experiments.reproduction.mechanisms import POSES, published_row, recomputed_table
 from dvrk_drake.experiments.reproduction.published import TABLE_1
 from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM
 from dvrk_drake.models.arm import load_arm

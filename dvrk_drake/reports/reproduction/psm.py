@@ -10,7 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from dvrk_drake.experiments.reproduction.drift_experiment import BAND, Drifts
 from dvrk_drake.experiments.reproduction.laboratory import Laboratory
-from dvrk_drake.experiments.reproduction.psm_mechanism import PSM_POSES, mechanism_errors
+from dvrk_drake.experiments.reproduction.mechanisms import PSM_POSES, mechanism_errors
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.reports.figures import MODEL_COLOUR, save_figure

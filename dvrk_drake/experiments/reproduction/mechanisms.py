@@ -1,4 +1,4 @@
-"""Table I: the DH parameters of the MTM as the simulated plant has them."""
+"""Mechanisms of the simulated arms: DH parameters of the MTM, remote centre and wrist axes of the PSM."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context
 
 from dvrk_drake.experiments.reproduction.published import LENGTHS, TableRow
 from dvrk_drake.models.arm import Arm
@@ -60,3 +61,30 @@ def published_row(row: TableRow) -> NDArray[np.float64]:
     """(5,) sign, offset [rad], d [m], alpha [rad], a [m] of a row of Table I, with the arm's real lengths."""
     d, a = ((-1) ** symbol.startswith("-") * LENGTHS[symbol.lstrip("-")] + 0.0 for symbol in (row.d, row.a))
     return np.array([row.sign, row.offset, d, row.alpha, a])
+
+
+#: Poses at which the mechanism is measured.
+PSM_POSES = 200
+
+
+def mechanism_errors(arm: Arm) -> tuple[float, float]:
+    """Furthest that the shaft's axis ever passes from the remote centre [m], and the least angle between the axes of
+    wrist pitch and wrist yaw [rad], over random poses."""
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    remote, angle = 0.0, np.pi
+    for q in arm.sample_poses(PSM_POSES, np.random.default_rng(0)):
+        set_arm_positions(plant, context, arm, q)
+        point, shaft = _axis(plant, context, "roll")
+        remote = max(remote, float(np.linalg.norm(np.cross(point, shaft))))
+        _, pitch = _axis(plant, context, "wrist_pitch")
+        _, yaw = _axis(plant, context, "wrist_yaw")
+        angle = min(angle, float(np.arccos(min(1.0, abs(float(pitch @ yaw))))))
+    return remote, angle
+
+
+def _axis(plant: MultibodyPlant, context: Context, joint: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A point of a hinge's axis and its direction in the world, whose origin is the remote centre."""
+    hinge = plant.GetJointByName(joint)
+    X_WJ = hinge.frame_on_parent().CalcPoseInWorld(context)
+    return X_WJ.translation(), X_WJ.rotation() @ hinge.revolute_axis()
