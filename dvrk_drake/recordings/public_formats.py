@@ -1,4 +1,8 @@
-"""Public recordings of real arms: motions as CSVs of 21 columns, static poses as MATLAB arrays of 8 x 2 x N."""
+"""Public recordings of real arms: motions as CSVs of 21 columns, static poses as MATLAB arrays of 8 x 2 x N.
+
+Of the WPI AIM lab, https://github.com/WPI-AIM/dvrk_dynamics_identification and
+https://github.com/WPI-AIM/dvrk_gravity_comp; `docs/public_recordings.md` says how to obtain them.
+"""
 
 from __future__ import annotations
 

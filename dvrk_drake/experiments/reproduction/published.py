@@ -1,5 +1,7 @@
 """What the paper publishes, and what its team's own files say: the numbers that ours stand beside.
 
+`paper_model` makes a model of the paper's twelve parameters, which our controller runs.
+
 Source: Rutfield, Zia, Boos, Santoso, Sujumnong, "Gravity Compensation Control of da Vinci Robot", WPI 2015, and the
 team's repository WPI-AIM/dvrk_gravity_comp. Drifts are read off the team's plots.
 """
