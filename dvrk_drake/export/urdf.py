@@ -11,8 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.errors import ModelError
-from dvrk_drake.export.mesh_copies import copy_meshes, redirect_meshes
-from dvrk_drake.export.sdf import to_text, with_inertias
+from dvrk_drake.export.sdf import copy_meshes, redirect_meshes, to_text, with_inertias
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.sdf_model import DRAKE, SdfFacts, read_sdf_facts
