@@ -29,12 +29,12 @@ from rich.table import Table
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
-from dvrk_drake.analysis.recalibration.recalibration import predict_other_phases
+from dvrk_drake.analysis.recalibration import predict_other_phases
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.recording import Recording, read_recording
+from dvrk_drake.recordings.recording import Recording, read_recording
 
 #: Percent: fitted to the motion, and on another motion.
 PUBLISHED = {

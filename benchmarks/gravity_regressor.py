@@ -18,8 +18,8 @@ import pinocchio
 from pydrake.multibody.plant import MultibodyPlant
 from timing import measured_times
 
+from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.static_model import compile_static_model
-from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import make_arm_plant
 

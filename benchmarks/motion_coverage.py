@@ -16,11 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dvrk_drake.analysis.dynamic.choice import effort_weights
-from dvrk_drake.analysis.dynamic.covariance import parameter_covariance
 from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem, residuals
+from dvrk_drake.analysis.dynamic.parameter_uncertainty import parameter_covariance
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
-from dvrk_drake.analysis.signals.phase_folds import period_of
+from dvrk_drake.analysis.signals.repetition import period_of
 from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters
 from dvrk_drake.models.arm import Arm, load_arm
 
@@ -67,7 +66,9 @@ def errors(arm: Arm, seed: int, noise: float, spread: float) -> tuple[np.ndarray
     period = period_of(grid)
     problem = motion_problem(grid, recording.in_actuator_coordinates(arm).measured_effort(), period, truth.effects)
     chosen = np.arange(len(truth.effects))
-    fit = problem.consistent(chosen, effort_weights(problem, chosen))
+    selection = problem.selection()
+    selection.fit(chosen)
+    fit = problem.consistent(chosen, selection.weights)
     left = residuals(problem, chosen, fit)
     cut_off = grid.settings.effort_cut_off
     covariance = parameter_covariance(problem, fit, left, grid.rate, cut_off, period)

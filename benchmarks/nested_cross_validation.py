@@ -14,12 +14,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from dvrk_drake.analysis.dynamic.choice import TOGETHER, choose_effects
 from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem, residuals
+from dvrk_drake.analysis.dynamic.effect_choice import TOGETHER, choose_effects
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
-from dvrk_drake.analysis.signals.phase_folds import FOLDS, period_of
+from dvrk_drake.analysis.signals.repetition import FOLDS, period_of
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import read_recording
+from dvrk_drake.recordings.recording import read_recording
 
 
 def main() -> None:

@@ -20,13 +20,13 @@ from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.payload.payload import Payload, estimate_payload
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
-from dvrk_drake.analysis.recalibration.recalibration import predict_other_phases, recalibrate
+from dvrk_drake.analysis.recalibration import predict_other_phases, recalibrate
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.recording import Recording, read_recording
+from dvrk_drake.recordings.recording import Recording, read_recording
 
 #: File, link, mass [kg], place in the link's frame [m]; docs/payload.md says how the places are read.
 WEIGHTS = [

@@ -21,7 +21,7 @@ from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.analysis.static.validation import validate
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import Recording, read_recording
+from dvrk_drake.recordings.recording import Recording, read_recording
 
 
 def main() -> int:

@@ -11,8 +11,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from dvrk_drake.analysis.study.executors import run_study_locally
-from dvrk_drake.analysis.study.study_file import load_study
+from dvrk_drake.experiments.study.executors import run_study_locally
+from dvrk_drake.experiments.study.study_file import load_study
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "release_study.yaml"
 

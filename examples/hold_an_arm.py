@@ -9,8 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.arm_view import start_meshcat
-from dvrk_drake.systems.camera import framing
+from dvrk_drake.systems.arm_view import framing, start_meshcat
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 arm = load_arm("mtml")

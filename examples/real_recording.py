@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import read_recording
+from dvrk_drake.recordings.recording import read_recording
 
 if len(sys.argv) not in (2, 3):
     sys.exit("usage: python real_recording.py FILE.csv [MODEL.yaml]")

@@ -7,7 +7,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from dvrk_drake.analysis.demo.teleoperation import START_FOLLOWER, START_MASTER, start_scene
+from dvrk_drake.experiments.demo.teleoperation import START_FOLLOWER, START_MASTER, start_scene
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 

@@ -18,12 +18,16 @@ TESTS = Path(__file__).resolve().parent
 #: Folders and files of which CI runs one Python only: what they test uses nothing of Drake that differs between its
 #: versions. A name stands for all that begin with it.
 ONE_PYTHON = (
-    *("models/test_collection_file", "models/test_lcm_log", "models/test_pose_file", "models/test_recording"),
-    *("dynamics/test_gravity_compensation", "dynamics/test_kinematic_compensation", "dynamics/test_nearest_links"),
+    *("recordings/test_collection_file", "recordings/test_lcm_log", "recordings/test_pose_file"),
+    *("recordings/test_recording", "recordings/test_conversion", "recordings/test_public_recordings_document"),
+    *("recordings/test_team_mat", "recordings/test_wpi_csv"),
+    *("export/test_dvrk_mtm_gravity_compensation", "export/test_dvrk_psm_gravity_compensation"),
+    "dynamics/test_nearest_links",
     "systems/guard/",
-    *("analysis/check/", "analysis/convert/", "analysis/dynamic/", "analysis/payload/", "analysis/recalibration/"),
-    *("analysis/reproduction/", "analysis/signals/", "analysis/static/", "analysis/study/", "analysis/transparency/"),
-    "analysis/tuning/",
+    *("analysis/check/", "analysis/dynamic/", "analysis/payload/", "analysis/test_recalibration", "analysis/signals/"),
+    "analysis/static/",
+    *("experiments/test_reproduction", "experiments/study/", "experiments/test_transparency"),
+    "experiments/test_tuning",
     *("processes/test_collector", "processes/test_leg", "processes/test_live_line", "processes/test_teacher"),
     "cli/test_collect",
 )

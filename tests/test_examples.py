@@ -14,7 +14,7 @@ from repository import ROOT
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording, write_recording
 
 EXAMPLES = ROOT / "examples"
 SHOWS_A_PAGE = ["hold_an_arm.py", "teleoperation.py"]

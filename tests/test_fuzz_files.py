@@ -25,25 +25,25 @@ from motions import true_dynamics
 from public_files import team_array, wpi_rows
 from status_logs import log_bytes, statuses
 
-from dvrk_drake.analysis.convert.convert import convert
-from dvrk_drake.analysis.reproduction.recordings import PaperRecordings
-from dvrk_drake.analysis.simulation.scenario_file import load_scenario
-from dvrk_drake.analysis.study.study_file import load_study
-from dvrk_drake.analysis.study.table import Row, StudyTable
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
-from dvrk_drake.dynamics.gravity_compensation import CompensationOptions, compensation_from_model
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.kinematic_compensation import kinematic_compensation
 from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.experiments.reproduction.recordings import PaperRecordings
+from dvrk_drake.experiments.scenario_file import load_scenario
+from dvrk_drake.experiments.study.study_file import load_study
+from dvrk_drake.experiments.study.table import Row, StudyTable
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.collection_file import CollectionFile
 from dvrk_drake.models.gains_file import load_gains
-from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
-from dvrk_drake.models.pose_file import load_poses, save_poses
-from dvrk_drake.models.recording import Recording, read_recording, write_recording
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
 from dvrk_drake.processes.simulated_arm import load_driver
+from dvrk_drake.recordings.collection_file import CollectionFile
+from dvrk_drake.recordings.conversion import convert
+from dvrk_drake.recordings.pose_file import load_poses, save_poses
+from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
 
 #: How many times as many examples as CI runs; more than 1 draws new ones each time.
 MORE = int(os.environ.get("DVRK_DRAKE_FUZZ", "1"))
@@ -274,9 +274,9 @@ def test_a_damaged_file_is_read_or_refused(name, valid):
 #: What a command does for long, or with an arm that is not there, once it has read its files.
 WORK = (
     "dvrk_drake.processes.lcm_network.open_lcm",
-    "dvrk_drake.analysis.tuning.tuning.tune_arm",
-    "dvrk_drake.analysis.study.executors.run_study_locally",
-    "dvrk_drake.analysis.transparency.transparency.feel",
+    "dvrk_drake.experiments.tuning.tuning.tune_arm",
+    "dvrk_drake.experiments.study.executors.run_study_locally",
+    "dvrk_drake.experiments.transparency.feel",
     "dvrk_drake.analysis.dynamic.dynamic_identification.identify_dynamic",
     "dvrk_drake.analysis.payload.payload.estimate_payload",
 )
@@ -327,7 +327,7 @@ def short_work():
     with pytest.MonkeyPatch.context() as patch:
         for name in WORK:
             patch.setattr(name, cut)
-        simulation = importlib.import_module("dvrk_drake.analysis.simulation.simulation")
+        simulation = importlib.import_module("dvrk_drake.experiments.simulation")
         simulate = simulation.simulate
 
         def briefly(scenario, *rest):

@@ -9,8 +9,7 @@ from pathlib import Path
 from pydrake.geometry import Meshcat, Role
 
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.systems.arm_view import ArmView, start_meshcat
-from dvrk_drake.systems.camera import ZOOM, framing
+from dvrk_drake.systems.arm_view import ZOOM, ArmView, framing, start_meshcat
 
 CHROMIUM_FLAGS = (
     "--headless",

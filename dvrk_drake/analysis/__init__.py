@@ -1,1 +1,1 @@
-"""What is learnt offline from recordings."""
+"""Recordings to models: signals, check, identification, validation, payload, recalibration."""

@@ -25,13 +25,12 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.check.identifiable import check_for_identification
-    from dvrk_drake.analysis.check.plots import plot_report
-    from dvrk_drake.analysis.check.tables import print_report
-    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.analysis.check.recording_check import check_for_identification
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.atomic_file import atomic_write
-    from dvrk_drake.models.recording import read_recording
+    from dvrk_drake.models.files import atomic_write
+    from dvrk_drake.recordings.recording import read_recording
+    from dvrk_drake.reports.recording_check import plot_report, print_report
+    from dvrk_drake.reports.terminal_tables import make_console
 
     arm = load_arm(options.arm)
     if options.json is not None:

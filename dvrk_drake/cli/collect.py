@@ -12,7 +12,7 @@ from dvrk_drake.cli.support import check_output, interrupt_ends_process, seconds
 from dvrk_drake.errors import CollectionError
 
 if TYPE_CHECKING:
-    from dvrk_drake.processes.live_line import LiveLine
+    from dvrk_drake.processes.live_status import LiveLine
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -54,7 +54,7 @@ def _add_random_poses(options: argparse.Namespace) -> None:
     import numpy as np
 
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.pose_file import load_poses_if_any, save_poses
+    from dvrk_drake.recordings.pose_file import load_poses_if_any, save_poses
 
     if options.random < 1:
         raise CollectionError(f"--random must be 1 pose or more; got {options.random}")
@@ -69,11 +69,11 @@ def _add_random_poses(options: argparse.Namespace) -> None:
 
 def _teach(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.pose_file import load_poses_if_any
     from dvrk_drake.processes.control import control
-    from dvrk_drake.processes.live_line import LiveLine
+    from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.processes.teacher import EnterKey, Teacher
+    from dvrk_drake.recordings.pose_file import load_poses_if_any
 
     load_poses_if_any(options.poses, load_arm(options.arm))  # refused before the arm is asked
     with interrupt_ends_process():
@@ -101,12 +101,12 @@ def _teach(options: argparse.Namespace) -> None:
 
 def _visit(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.collection_file import CollectionFile
-    from dvrk_drake.models.pose_file import load_poses
     from dvrk_drake.processes.collector import CollectionSettings, Collector
     from dvrk_drake.processes.control import control
-    from dvrk_drake.processes.live_line import LiveLine
+    from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
+    from dvrk_drake.recordings.collection_file import CollectionFile
+    from dvrk_drake.recordings.pose_file import load_poses
 
     settings = CollectionSettings(options.traverse_time, options.both_sides)
     arm = load_arm(options.arm)

@@ -34,25 +34,28 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.demo.demo import run_demo
-    from dvrk_drake.analysis.tables import make_console, print_demo
+    from dvrk_drake.experiments.demo.demo import run_demo
+    from dvrk_drake.reports.demo import plot_demo
+    from dvrk_drake.reports.terminal_tables import make_console, print_demo
 
     quiet_drake()
     output = made_folder(options.output)
     with ProgressBar("") as (progress, task):
-        result = run_demo(
-            output,
-            options.arm,
-            options.seed,
-            lambda what, share: progress.update(task, description=what, completed=100 * share),
-        )
-    print_demo(make_console(), result, options.output)
+
+        def show(what: str, share: float) -> None:
+            progress.update(task, description=what, completed=100 * share)
+
+        result = run_demo(output, options.arm, options.seed, show)
+        show("drawing", 0.0)
+        plot_demo(output, result)
+        show("drawing", 1.0)
+    print_demo(make_console(), result, output)
 
 
 def _teleop(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.demo.teleoperation import play_teleoperation, run_live_teleoperation, start_scene
-    from dvrk_drake.analysis.tables import make_console, print_teleoperation
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.experiments.demo.teleoperation import play_teleoperation, run_live_teleoperation, start_scene
+    from dvrk_drake.models.files import atomic_write
+    from dvrk_drake.reports.terminal_tables import make_console, print_teleoperation
 
     quiet_drake()
     if options.html is None:

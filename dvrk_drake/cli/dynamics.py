@@ -14,11 +14,11 @@ from dvrk_drake.errors import RecordingError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from dvrk_drake.analysis.check.report import RecordingReport
+    from dvrk_drake.analysis.check.findings import RecordingReport
     from dvrk_drake.analysis.dynamic.validation import DynamicValidation
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm import Arm
-    from dvrk_drake.models.recording import Recording
+    from dvrk_drake.recordings.recording import Recording
 
 
 def refuse_unusable(
@@ -70,9 +70,9 @@ def _warn_unexplained(console: Console, errors: dict[str, float]) -> None:
 def identify_motion(options: argparse.Namespace, recording: Recording, arm: Arm, plots: Path | None) -> None:
     """Identifies the dynamics, prints them in short, writes the model, all tables and the plots."""
     from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-    from dvrk_drake.analysis.dynamic.tables import print_dynamics
     from dvrk_drake.analysis.dynamic.validation import validate_motion
-    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.reports.dynamic_identification import print_dynamics
+    from dvrk_drake.reports.terminal_tables import make_console
 
     console = make_console()
     with ProgressBar("identifying") as (progress, task):
@@ -88,7 +88,7 @@ def identify_motion(options: argparse.Namespace, recording: Recording, arm: Arm,
         write_tables(options.tables, lambda file: print_dynamics(file, result, full=True))
         console.print(f"all parameters: {options.tables}")
     if plots is not None:
-        from dvrk_drake.analysis.dynamic.plots import plot_motion
+        from dvrk_drake.reports.dynamic_identification import plot_motion
 
         title = f"{arm.name}, fitted to {Path(recording.source).name}"
         plot_motion(plots, arm, validate_motion(result.model, recording), title)
@@ -99,9 +99,9 @@ def show_motion_validation(
     options: argparse.Namespace, validation: DynamicValidation, model: IdentifiedModel, source: str, plots: Path | None
 ) -> None:
     """Writes the JSON of a dynamic model compared with a motion, prints verdicts and errors, writes the plots."""
-    from dvrk_drake.analysis.dynamic.tables import print_dynamic_validation
-    from dvrk_drake.analysis.tables import make_console
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.files import atomic_write
+    from dvrk_drake.reports.dynamic_identification import print_dynamic_validation
+    from dvrk_drake.reports.terminal_tables import make_console
 
     console = make_console()
     if options.json is not None:
@@ -113,7 +113,7 @@ def show_motion_validation(
     errors = {a.name: a.relative_error for a in bad if a.relative_error is not None}
     _warn_unexplained(console, errors)
     if plots is not None:
-        from dvrk_drake.analysis.dynamic.plots import plot_motion
+        from dvrk_drake.reports.dynamic_identification import plot_motion
 
         arm = model.load_arm()
         plot_motion(plots, arm, validation, f"{arm.name}, {Path(source).name}")

@@ -73,10 +73,10 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _sdf_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
-    from dvrk_drake.analysis.export.tables import print_changed_links
-    from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.dynamics.model_links import model_bodies
-    from dvrk_drake.dynamics.sdf_export import changed_links, write_sdf
+    from dvrk_drake.export.sdf import changed_links, write_sdf
+    from dvrk_drake.reports.export import print_changed_links
+    from dvrk_drake.reports.terminal_tables import make_console
 
     arm, bodies = model.load_arm(), model_bodies(model)
 
@@ -91,7 +91,7 @@ def _sdf_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) 
 
 def _urdf_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
     from dvrk_drake.dynamics.model_links import model_bodies
-    from dvrk_drake.dynamics.urdf_export import write_urdf
+    from dvrk_drake.export.urdf import write_urdf
 
     bodies = model_bodies(model)
 
@@ -104,22 +104,22 @@ def _urdf_writer(model: IdentifiedModel, path: str, options: argparse.Namespace)
 
 def _print_difference(model: IdentifiedModel) -> None:
     from dvrk_drake.dynamics.model_links import model_bodies
-    from dvrk_drake.dynamics.sdf_export import sdf_difference
+    from dvrk_drake.export.sdf import sdf_difference
 
     bodies = model_bodies(model)
     sys.stdout.write(sdf_difference(model.load_arm(), bodies.links, bodies.rotors))
 
 
 def _gc_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
-    from dvrk_drake.analysis.export.tables import print_compensation
-    from dvrk_drake.analysis.tables import make_console
-    from dvrk_drake.dynamics.gravity_compensation import (
+    from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
         CompensationOptions,
         compensation_from_model,
         dry_friction,
         largest_differences,
     )
-    from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
+    from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+    from dvrk_drake.reports.export import print_compensation
+    from dvrk_drake.reports.terminal_tables import make_console
 
     if options.friction and options.coulomb is not None:
         raise DvrkDrakeError("--friction and --coulomb both say how large friction is; give one")
@@ -142,9 +142,9 @@ def _gc_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -
 
 
 def _kinematic_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
-    from dvrk_drake.analysis.export.tables import print_kinematic_compensation
-    from dvrk_drake.analysis.tables import make_console
-    from dvrk_drake.dynamics.kinematic_compensation import kinematic_compensation
+    from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation
+    from dvrk_drake.reports.export import print_kinematic_compensation
+    from dvrk_drake.reports.terminal_tables import make_console
 
     given = {} if options.gc_tolerance is None else {"tolerance": options.gc_tolerance}
     file = kinematic_compensation(model, **given)
@@ -157,12 +157,11 @@ def _kinematic_writer(model: IdentifiedModel, path: str, options: argparse.Names
 
 
 def _compare(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.export.compensation_comparison import compare_compensation
-    from dvrk_drake.analysis.export.plot import plot_compensation
-    from dvrk_drake.analysis.export.tables import print_comparison
-    from dvrk_drake.analysis.tables import make_console
-    from dvrk_drake.models.atomic_file import atomic_write
-    from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
+    from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
+    from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+    from dvrk_drake.models.files import atomic_write
+    from dvrk_drake.reports.export import plot_compensation, print_comparison
+    from dvrk_drake.reports.terminal_tables import make_console
 
     for path in (options.plot, options.json):
         if path is not None:
@@ -203,7 +202,7 @@ def _load_model(name: str) -> IdentifiedModel:
 
 def _is_arm_file(name: str) -> bool:
     """An arm's YAML names its mechanism; a model's has no such field."""
-    from dvrk_drake.models.input_file import read_text_input
+    from dvrk_drake.models.files import read_text_input
 
     try:
         return any(line.startswith("mechanism:") for line in read_text_input(name, DvrkDrakeError).splitlines())

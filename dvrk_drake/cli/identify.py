@@ -25,7 +25,7 @@ from dvrk_drake.cli.support import (
 if TYPE_CHECKING:
     from dvrk_drake.analysis.static.validation import Validation
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.models.recording import Recording
+    from dvrk_drake.recordings.recording import Recording
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -99,13 +99,13 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _identify(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.check.identifiable import check_with_channels
-    from dvrk_drake.analysis.plots import plot_identification
-    from dvrk_drake.analysis.signals.poses import find_poses
+    from dvrk_drake.analysis.check.recording_check import check_with_channels
+    from dvrk_drake.analysis.signals.static_segments import find_poses
     from dvrk_drake.analysis.static.static_identification import identify_static
-    from dvrk_drake.analysis.tables import make_console, print_doubts, print_model
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.recording import read_recording
+    from dvrk_drake.recordings.recording import read_recording
+    from dvrk_drake.reports.figures import plot_identification
+    from dvrk_drake.reports.terminal_tables import make_console, print_doubts, print_model
 
     check_output(options.output, options.recording, overwrite=options.overwrite)
     if options.tables is not None:
@@ -152,13 +152,13 @@ def _identify(options: argparse.Namespace) -> None:
 
 def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.dynamic.validation import DynamicValidation, validate_motion
-    from dvrk_drake.analysis.signals.poses import find_poses
+    from dvrk_drake.analysis.signals.static_segments import find_poses
     from dvrk_drake.analysis.static.validation import validate
-    from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.analysis.verdict import unfit
     from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary
     from dvrk_drake.errors import ModelError
-    from dvrk_drake.models.recording import read_recording
+    from dvrk_drake.recordings.recording import read_recording
+    from dvrk_drake.reports.terminal_tables import make_console
 
     if options.json is not None:
         check_output(options.json, options.recording, options.model, overwrite=options.overwrite)
@@ -217,9 +217,9 @@ def _show_validation(
     plots: Path | None,
 ) -> None:
     """Writes the JSON of a model compared with poses, prints verdicts and errors, writes the plots."""
-    from dvrk_drake.analysis.plots import plot_validation
-    from dvrk_drake.analysis.tables import make_console, print_doubts, print_validation
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.files import atomic_write
+    from dvrk_drake.reports.figures import plot_validation
+    from dvrk_drake.reports.terminal_tables import make_console, print_doubts, print_validation
 
     console, arm = make_console(), model.load_arm()
     if options.json is not None:
@@ -244,11 +244,11 @@ def _predict(options: argparse.Namespace) -> None:
     import numpy as np
 
     from dvrk_drake.analysis.dynamic.validation import predict_motion
-    from dvrk_drake.analysis.signals.poses import find_poses
+    from dvrk_drake.analysis.signals.static_segments import find_poses
     from dvrk_drake.analysis.static.validation import predict
-    from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.models.recording import read_recording, write_csv
+    from dvrk_drake.recordings.recording import read_recording, write_csv
+    from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(options.output, options.recording, options.model, overwrite=options.overwrite)
     model = IdentifiedModel.load(options.model)
@@ -269,9 +269,9 @@ def _predict(options: argparse.Namespace) -> None:
 
 
 def _convert(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.convert.convert import convert
-    from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.models.arm import load_arm
+    from dvrk_drake.recordings.conversion import convert
+    from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(options.output, options.input, overwrite=options.overwrite)
     console = make_console()

@@ -109,8 +109,7 @@ def _key(options: argparse.Namespace) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.control import control
-    from dvrk_drake.processes.live_line import LiveLine
-    from dvrk_drake.processes.live_status import LiveStatus
+    from dvrk_drake.processes.live_status import LiveLine, LiveStatus
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
     with interrupt_ends_process():

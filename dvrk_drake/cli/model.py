@@ -39,12 +39,12 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _model(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.tables import make_console, print_symbolic_model
-    from dvrk_drake.dynamics import export
-    from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
+    from dvrk_drake.dynamics.gravity_regressor import derive_gravity
     from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
+    from dvrk_drake.export import gravity_sources
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.atomic_file import atomic_write
+    from dvrk_drake.models.files import atomic_write
+    from dvrk_drake.reports.terminal_tables import make_console, print_symbolic_model
 
     if options.output is not None:
         if options.format is None:
@@ -53,9 +53,9 @@ def _model(options: argparse.Namespace) -> None:
     arm = mounted(load_arm(options.arm), options.gravity)
     gravity = derive_gravity(arm, options.frames, options.serial)
     writers = {
-        "latex": lambda gravity: export.to_latex(gravity, SymbolicPlant(arm, options.frames).frame_poses()),
-        "python": export.to_python,
-        "c": export.to_c,
+        "latex": lambda gravity: gravity_sources.to_latex(gravity, SymbolicPlant(arm, options.frames).frame_poses()),
+        "python": gravity_sources.to_python,
+        "c": gravity_sources.to_c,
     }
     if options.format is None:
         print_symbolic_model(make_console(), gravity)
@@ -73,8 +73,7 @@ def _view(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.control import ArmLink
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.live_view import show_status
-    from dvrk_drake.systems.arm_view import ArmView, start_meshcat
-    from dvrk_drake.systems.camera import framing
+    from dvrk_drake.systems.arm_view import ArmView, framing, start_meshcat
 
     quiet_drake()
     if options.lcm_url is not None and not options.live:

@@ -33,14 +33,14 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 def _payload(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
     from dvrk_drake.analysis.payload.payload import check_links, estimate_payload
-    from dvrk_drake.analysis.payload.tables import describe_better_links, print_links, print_payload
-    from dvrk_drake.analysis.tables import make_console
     from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.errors import ModelError
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.atomic_file import atomic_write
-    from dvrk_drake.models.recording import read_recording
+    from dvrk_drake.models.files import atomic_write
+    from dvrk_drake.recordings.recording import read_recording
+    from dvrk_drake.reports.payload import describe_better_links, print_links, print_payload
+    from dvrk_drake.reports.terminal_tables import make_console
 
     model = None if options.model is None else IdentifiedModel.load(options.model)
     if model is not None and options.gravity is not None:

@@ -25,11 +25,11 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 def _record(options: argparse.Namespace) -> None:
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.recording_stream import check_stream_output
     from dvrk_drake.processes.lcm_network import open_lcm
-    from dvrk_drake.processes.live_line import LiveLine
+    from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.recorder import Recorder
     from dvrk_drake.processes.simulated_arm import stop_on_signals
+    from dvrk_drake.recordings.recording_stream import check_stream_output
 
     arm = load_arm(options.arm)
     check_stream_output(options.output)

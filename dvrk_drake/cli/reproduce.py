@@ -27,8 +27,8 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _reproduce(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.reproduction.recordings import PaperRecordings
-    from dvrk_drake.analysis.reproduction.run import reproduce
+    from dvrk_drake.experiments.reproduction.recordings import PaperRecordings
+    from dvrk_drake.reports.reproduction.run import reproduce
 
     quiet_drake()
     recordings = PaperRecordings.find(options.data)

@@ -10,8 +10,8 @@ from dvrk_drake.cli.support import ProgressBar, add_overwrite, check_output, mad
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from dvrk_drake.analysis.simulation.scenario import Scenario
-    from dvrk_drake.analysis.simulation.simulation import Simulation
+    from dvrk_drake.experiments.scenario import Scenario
+    from dvrk_drake.experiments.simulation import Simulation
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -33,12 +33,11 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.simulation.scenario_file import load_scenario
-    from dvrk_drake.analysis.simulation.simulation import simulate
-    from dvrk_drake.analysis.tables import make_console, print_simulation
-    from dvrk_drake.models.recording import write_recording
-    from dvrk_drake.systems.arm_view import start_meshcat
-    from dvrk_drake.systems.camera import framing
+    from dvrk_drake.experiments.scenario_file import load_scenario
+    from dvrk_drake.experiments.simulation import simulate
+    from dvrk_drake.recordings.recording import write_recording
+    from dvrk_drake.reports.terminal_tables import make_console, print_simulation
+    from dvrk_drake.systems.arm_view import framing, start_meshcat
 
     quiet_drake()
     scenario = load_scenario(options.scenario, options.set)
@@ -63,7 +62,7 @@ def _simulate(options: argparse.Namespace) -> None:
 
 
 def _plot(path: Path, simulation: Simulation, scenario: Scenario) -> None:
-    from dvrk_drake.analysis.plots import plot_positions
+    from dvrk_drake.reports.figures import plot_positions
 
     curves = {"simulated": simulation.recording.q}
     if simulation.desired is not None:

@@ -41,11 +41,11 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _study(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.study.executors import dask_executor, run_study_locally
-    from dvrk_drake.analysis.study.report import plot_study, print_study
-    from dvrk_drake.analysis.study.study import run_study
-    from dvrk_drake.analysis.study.study_file import load_study
-    from dvrk_drake.analysis.tables import make_console
+    from dvrk_drake.experiments.study.executors import dask_executor, run_study_locally
+    from dvrk_drake.experiments.study.study import run_study
+    from dvrk_drake.experiments.study.study_file import load_study
+    from dvrk_drake.reports.study import plot_study, print_study
+    from dvrk_drake.reports.terminal_tables import make_console
 
     quiet_drake()
     study = load_study(options.study, options.set)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from dvrk_drake.cli.support import ProgressBar, made_folder, quiet_drake
 
 if TYPE_CHECKING:
-    from dvrk_drake.analysis.transparency.transparency import Compensation
+    from dvrk_drake.experiments.transparency import Compensation
     from dvrk_drake.models.arm import Arm
 
 
@@ -48,12 +48,12 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _transparency(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.tables import make_console
-    from dvrk_drake.analysis.transparency.report import plot_transparency, print_transparency, write_transparency
-    from dvrk_drake.analysis.transparency.transparency import feel, rambling_path, recorded_path
     from dvrk_drake.errors import ScenarioError
+    from dvrk_drake.experiments.transparency import feel, rambling_path, recorded_path
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.recording import read_recording
+    from dvrk_drake.recordings.recording import read_recording
+    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.transparency import plot_transparency, print_transparency, write_transparency
 
     quiet_drake()
     arm = load_arm(options.arm)
@@ -93,10 +93,10 @@ def _compensations(options: argparse.Namespace, arm: Arm) -> list[Compensation]:
         ModelError: a model that is not of this arm.
         ControllerError: a friction ratio that is not allowed.
     """
-    from dvrk_drake.analysis.transparency.transparency import Compensation
     from dvrk_drake.dynamics.friction_compensation import check_ratios
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.errors import ModelError
+    from dvrk_drake.experiments.transparency import Compensation
 
     check_ratios(options.friction_ratio)
     models = {}

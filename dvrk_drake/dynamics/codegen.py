@@ -1,4 +1,4 @@
-"""Symbolic expressions as fast functions and as source to read or to use elsewhere (numba, Python, C, LaTeX)."""
+"""Symbolic expressions as Python source and as functions compiled with numba."""
 
 from __future__ import annotations
 
@@ -52,28 +52,12 @@ def python_source(
     lines = [f"def {name}({', '.join(n for n, _ in arguments)}, out):"]
     if docstring:
         lines.append(f'    """{docstring}"""')
-    lines += _unpacking(arguments, terms, "    {symbol} = {array}[{index}]")
+    lines += unpacking(arguments, terms, "    {symbol} = {array}[{index}]")
     lines += [f"    {symbol} = {sympy.pycode(e)}" for symbol, e in terms.assignments]
     if len(terms.entries) < math.prod(terms.shape):
         lines.append("    out[:] = 0.0")
     lines += [f"    out[{', '.join(map(str, index))}] = {sympy.pycode(e)}" for index, e in terms.entries]
     return "\n".join(lines) + "\n"
-
-
-def c_source(
-    name: str, arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms, comment: str = ""
-) -> str:
-    """A C99 function `void name(..., double *out)`; out is row-major. Arguments as in `python_source`."""
-    parameters = [f"double {n}" if _is_scalar(n, s) else f"const double {n}[{len(s)}]" for n, s in arguments]
-    size = math.prod(terms.shape)
-    lines = [f"/* {comment} */"] if comment else []
-    lines += ["#include <math.h>", "", f"void {name}({', '.join(parameters)}, double out[{size}]) {{"]
-    lines += _unpacking(arguments, terms, "  const double {symbol} = {array}[{index}];")
-    lines += [f"  const double {symbol} = {sympy.ccode(e)};" for symbol, e in terms.assignments]
-    lines.append(f"  for (int i = 0; i < {size}; ++i) out[i] = 0.0;")
-    for index, e in terms.entries:
-        lines.append(f"  out[{np.ravel_multi_index(index, terms.shape)}] = {sympy.ccode(e)};")
-    return "\n".join([*lines, "}", ""])
 
 
 def compile_function(
@@ -82,7 +66,7 @@ def compile_function(
     """The function of `python_source`, compiled with numba for float64; vectors and `out` must be C-contiguous."""
     namespace: dict[str, Any] = {"math": math}
     exec(python_source(name, arguments, terms), namespace)
-    kinds = [numba.float64 if _is_scalar(n, s) else numba.float64[::1] for n, s in arguments]
+    kinds = [numba.float64 if is_scalar(n, s) else numba.float64[::1] for n, s in arguments]
     out = (numba.float64[::1], numba.float64[:, ::1])[len(terms.shape) - 1]
     return numba.njit(numba.void(*kinds, out), fastmath=False)(namespace[name])
 
@@ -113,16 +97,18 @@ def compile_batch(function: Callable[..., None], num_arguments: int, shape: tupl
     return evaluate
 
 
-def _is_scalar(name: str, symbols: Sequence[sympy.Symbol]) -> bool:
+def is_scalar(name: str, symbols: Sequence[sympy.Symbol]) -> bool:
+    """Whether an argument is a number: one symbol, of the same name."""
     return len(symbols) == 1 and symbols[0].name == name
 
 
-def _unpacking(arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms, form: str) -> list[str]:
+def unpacking(arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms, form: str) -> list[str]:
+    """A line for each symbol that `terms` use of an array argument; `form` has {symbol}, {array} and {index}."""
     used = set().union(*(e.free_symbols for _, e in [*terms.assignments, *terms.entries]), set())
     return [
         form.format(symbol=symbol, array=name, index=index)
         for name, symbols in arguments
-        if not _is_scalar(name, symbols)
+        if not is_scalar(name, symbols)
         for index, symbol in enumerate(symbols)
         if symbol in used
     ]

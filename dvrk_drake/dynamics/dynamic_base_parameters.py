@@ -15,8 +15,8 @@ from pydrake.multibody.tree import RigidBody
 
 from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParameter, reduce_to_base
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.gravity_regressor import named_lengths
 from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES, change_of_frame, parameter_axis
-from dvrk_drake.dynamics.symbolic_gravity import named_lengths
 from dvrk_drake.dynamics.symbolic_plant import labelled_bodies
 from dvrk_drake.models.plant import make_arm_plant
 
@@ -45,11 +45,6 @@ class DynamicBaseParameters:
     def combination(self) -> NDArray[np.float64]:
         """(b, p) with beta = combination phi."""
         return np.asarray(np.linalg.solve(self.to_links.T, self.base.combination.T).T, dtype=np.float64)
-
-    @cached_property
-    def lift(self) -> NDArray[np.float64]:
-        """(p, b) with Y_base = Y lift; phi = lift beta has the base parameters beta and moves like every other such."""
-        return self.to_links[:, self.base.columns]
 
 
 def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True) -> DynamicBaseParameters:

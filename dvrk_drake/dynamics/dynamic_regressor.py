@@ -9,10 +9,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES, LinkInertia, link_inertias
+from dvrk_drake.dynamics.inertial_parameters import (
+    PARAMETER_NAMES,
+    LinkInertia,
+    RotorInertia,
+    link_inertias,
+    rotor_inertias,
+)
 from dvrk_drake.dynamics.kinematic_tree import KinematicTree
 from dvrk_drake.dynamics.regressor_kernel import fill_regressor
-from dvrk_drake.dynamics.rotor_inertia import RotorInertia, rotor_inertias
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant

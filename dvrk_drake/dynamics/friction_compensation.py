@@ -115,11 +115,6 @@ class Friction:
         """(k,) whether it is hysteresis so wide that a released arm goes back by more than `HOLDING_TRAVEL`."""
         return np.array([e.kind == "presliding" and e.scale > HOLDING_TRAVEL for e in self.effects], bool)
 
-    @property
-    def of_joints(self) -> NDArray[np.float64]:
-        """(n,) friction that holds each joint at rest if it alone moves [N m, N]."""
-        return np.abs(self.rows[self.holds]).T @ self.coefficients[self.holds]
-
 
 def check_ratios(ratio: float, hysteresis_ratio: float = 0.0) -> None:
     """Whether these shares may be asked for.

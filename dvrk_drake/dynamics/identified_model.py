@@ -21,13 +21,13 @@ from dvrk_drake.dynamics.dynamic_section import (
     ActuatorEffectEstimate,
     DynamicSection,
 )
+from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
-from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
-from dvrk_drake.models.atomic_file import atomic_write
 from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import missing_key, schema_fault, within
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.dynamics import codegen
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates, joint_row
-from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, SymbolicGravity, derive_gravity
+from dvrk_drake.dynamics.gravity_regressor import GRAVITY, SymbolicGravity, derive_gravity
 from dvrk_drake.models.arm import Arm
 
 

@@ -1,1 +1,1 @@
-"""What an arm is, and what a recording of one is."""
+"""Description of an arm: SDF, YAML schemas, plant, limits, loop closures, and the layout of its LCM messages."""

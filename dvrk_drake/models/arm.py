@@ -15,13 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_schema import (
-    ANGLE_WIDTHS,
-    ANGLES,
     COUPLINGS,
     EFFORTS,
     GRAVITIES,
-    TRAVEL_WIDTHS,
-    TRAVELS,
     ArmDescription,
     BoundingShapes,
     CoupledLimit,
@@ -31,6 +27,7 @@ from dvrk_drake.models.arm_schema import (
     Mechanism,
     MotionSettings,
 )
+from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_limit_fault, limits_fault
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, within
@@ -138,46 +135,18 @@ class Arm:
         yield _count_fault("", {name: getattr(self, name) for name in arrays}, self.joint_names)
         for i, name in enumerate(self.joint_names):
             limits = float(self.position_lower[i]), float(self.position_upper[i])
-            yield _limits_fault(f"position_limits.{name}", *limits, slides=bool(self.prismatic[i]))
+            yield limits_fault(f"position_limits.{name}", *limits, slides=bool(self.prismatic[i]))
             yield EFFORTS.fault(f"effort limit of joint {name}", float(self.effort_limits[i]))
         yield self.gains_fault(self.gains)
         for limit in self.coupled_limits:
-            yield self._coupled_limit_fault(limit)
+            yield coupled_limit_fault(self, limit)
         for name, row in self.friction_coordinates.items():
             if not np.any(row):
                 yield f"friction_coordinates.{name} has no coefficient other than 0"
         yield number_fault(self)
         _checked_gravity(self.gravity)
-        if len(self.coupled_limits) > 1 and not self._can_meet_coupled_limits():
+        if len(self.coupled_limits) > 1 and not can_meet_coupled_limits(self):
             yield "coupled_limits: no pose inside position_limits meets them all"
-
-    def _coupled_limit_fault(self, limit: CoupledLimit) -> str:
-        key = f"coupled_limits.{limit.name}"
-        row = np.array([limit.coefficients.get(name, 0.0) for name in self.joint_names])
-        coupled = row != 0
-        if not np.any(coupled):
-            return f"{key}: coefficients are all 0; allowed: a joint with another coefficient at least"
-        slides = bool(np.all(self.prismatic[coupled]))
-        if fault := number_fault(limit):
-            return f"{key}.{fault}"
-        if fault := _limits_fault(key, limit.lower, limit.upper, slides):
-            return fault
-        ends = np.sort(row * [self.position_lower, self.position_upper], axis=0).sum(axis=1)
-        if ends[1] < limit.lower or ends[0] > limit.upper:
-            return (
-                f"{key}: no pose inside position_limits meets {limit.lower:g}..{limit.upper:g}; "
-                f"allowed: limits that overlap {ends[0]:.4g}..{ends[1]:.4g}"
-            )
-        return ""
-
-    def _can_meet_coupled_limits(self) -> bool:
-        from scipy.optimize import linprog  # slow to import, and few arms have two coupled limits
-
-        A, lower, upper = self.limit_matrix()
-        n = self.num_joints
-        bounds = np.column_stack([lower[:n], upper[:n]])
-        inequalities = np.vstack([A[n:], -A[n:]]), np.concatenate([upper[n:], -lower[n:]])
-        return bool(linprog(np.zeros(n), *inequalities, bounds=bounds).success)
 
     @property
     def num_joints(self) -> int:
@@ -253,15 +222,6 @@ def _mounted(arm: Arm, gravity: tuple[float, ...]) -> Arm:
     if np.allclose(arm.gravity, gravity, rtol=0, atol=1e-12):
         return arm
     return dataclasses.replace(arm, gravity=np.array(gravity))
-
-
-def _limits_fault(key: str, lower: float, upper: float, slides: bool) -> str:
-    positions, widths = (TRAVELS, TRAVEL_WIDTHS) if slides else (ANGLES, ANGLE_WIDTHS)
-    if fault := positions.fault(f"{key}[0]", lower) or positions.fault(f"{key}[1]", upper):
-        return fault
-    if not lower < upper:
-        return f"{key} is [{lower:g}, {upper:g}]; allowed: [lower, upper] with lower < upper"
-    return widths.fault(f"{key}: upper - lower", upper - lower)
 
 
 def _count_fault(key: str, values: Mapping[str, Sequence[float] | NDArray], joints: Sequence[str]) -> str:

@@ -37,7 +37,7 @@ class DriveEffect:
 
 @dataclass
 class FrictionEffect(DriveEffect):
-    """One effect of friction, see `dvrk_drake.systems.real_arm.dry_friction.add_friction`.
+    """One effect of friction, see `dvrk_drake.systems.arm_effects.dry_friction.add_friction`.
 
     Attributes:
         fall_speed: of "presliding": the speed at which it holds 1/e of what it holds at rest, Stribeck's effect

@@ -9,7 +9,7 @@ from pydrake.common.yaml import yaml_dump
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import Gains
-from dvrk_drake.models.atomic_file import atomic_write
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 

@@ -9,7 +9,7 @@ import stat
 from pathlib import Path
 
 from dvrk_drake.errors import KeyFileError
-from dvrk_drake.models.input_file import open_input
+from dvrk_drake.models.files import open_input
 
 #: Shortest and longest key, length of a new one [bytes]; BLAKE2b has no longer keys.
 _SHORTEST, _LONGEST, _NEW = 16, 64, 32

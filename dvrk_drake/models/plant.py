@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,11 +15,8 @@ from pydrake.systems.framework import Context
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_schema import LoopClosure
-from dvrk_drake.models.sdf_model import DRAKE, MODELS_FOLDER, compose_sdf
-
-#: How the loops of a linkage are held: "mimic" couples the joints of a tree, "ball" pins the cut loops.
-Closure = Literal["mimic", "ball"]
+from dvrk_drake.models.loop_closure import Closure, pin_loop, remove_loop_mimics
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 
 
 def add_arm(
@@ -47,7 +44,7 @@ def add_arm(
     parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))
     model = compose_sdf(arm.sdf, arm.mirrored_links)
     if closure == "ball":
-        _remove_loop_mimics(model, arm)
+        remove_loop_mimics(model, arm)
     if not collision_shapes:
         for link in model.iter("link"):
             for shape in link.findall("collision"):
@@ -56,7 +53,7 @@ def add_arm(
         (instance,) = parser.AddModelsFromString(ElementTree.tostring(model, encoding="unicode"), "sdf")
         if closure == "ball":
             for loop in arm.loop_closures:
-                _pin(plant, instance, loop)
+                pin_loop(plant, instance, loop)
         plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link", instance))
         plant.mutable_gravity_field().set_gravity_vector(arm.gravity)
         for name, lower, upper in zip(arm.joint_names, arm.position_lower, arm.position_upper, strict=True):
@@ -138,48 +135,3 @@ def holding_torques(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]
         set_arm_positions(plant, context, arm, q)
         tau[row] = holding_torque(plant, context, arm)
     return tau
-
-
-def _pin(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClosure) -> None:
-    """Pins frame_a of the closing bar to frame_b, and holds the bar's length once more as an equation of its own.
-
-    SAP gives each constraint the compliance 5e-10 s^2 / m at 1 ms, m being the mass that the tree without constraints
-    shows at the pin. The pin's three equations share one, and a light bar that is free to swing makes it soft in all
-    directions, also along the bar, where the linkage's load goes. The length alone shows the linkage behind it and
-    is stiff: the PSM's remote centre gives by 1e-8 m under its weight, instead of 2e-6 m.
-    """
-    A, B = (plant.GetFrameByName(name, instance) for name in (loop.frame_a, loop.frame_b))
-    p_AP, p_BQ = (frame.GetFixedPoseInBodyFrame().translation() for frame in (A, B))
-    plant.AddBallConstraint(A.body(), p_AP, B.body(), p_BQ)
-    joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
-    hinge = next((joint for joint in joints if joint.child_body() is A.body()), None)
-    if hinge is None:
-        raise ArmError(f"{A.body().name()}, which carries the frame {loop.frame_a} of a loop, hangs on no joint")
-    p_CH = hinge.frame_on_parent().GetFixedPoseInBodyFrame().translation()
-    p_AH = hinge.frame_on_child().GetFixedPoseInBodyFrame().translation()
-    plant.AddDistanceConstraint(hinge.parent_body(), p_CH, B.body(), p_BQ, float(np.linalg.norm(p_AP - p_AH)))
-
-
-def _remove_loop_mimics(root: ElementTree.Element, arm: Arm) -> None:
-    """Only those on a loop: a rotor or counterweight that follows another joint closes none, its mimic is its cable."""
-    loop_joints = _loop_joints(root, arm)
-    for joint in root.iter("joint"):
-        for mimic in joint.findall(f"{DRAKE}mimic"):
-            if joint.get("name") in loop_joints:
-                joint.remove(mimic)
-
-
-def _loop_joints(root: ElementTree.Element, arm: Arm) -> set[str]:
-    """Dependent joints on the way from the base to a loop's cut."""
-    parent_joint = {joint.findtext("child"): joint for joint in root.iter("joint")}
-    frame_link = {frame.get("name"): frame.get("attached_to") for frame in root.iter("frame")}
-    names = set()
-    for loop in arm.loop_closures:
-        for frame in (loop.frame_a, loop.frame_b):
-            if frame not in frame_link:
-                raise ArmError(f"{', '.join(arm.sdf)}: has no <frame> {frame}, which loop_closures names")
-            link = frame_link[frame]
-            while link in parent_joint:
-                names.add(parent_joint[link].get("name", ""))
-                link = parent_joint[link].findtext("parent")
-    return names - set(arm.joint_names)

@@ -9,7 +9,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import yaml
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.models.input_file import read_text_input
+from dvrk_drake.models.files import read_text_input
 from dvrk_drake.models.schema_fault import schema_fault
 
 Schema = TypeVar("Schema")

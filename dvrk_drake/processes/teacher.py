@@ -13,9 +13,9 @@ import numpy as np
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.pose_file import load_poses_if_any, same_pose, save_poses
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.processes.rest_detector import RestDetector
+from dvrk_drake.processes.leg import RestDetector
+from dvrk_drake.recordings.pose_file import load_poses_if_any, same_pose, save_poses
 
 #: For --at-rest: a hand that rests keeps all joints within this [rad], [m] for so long [s].
 _REST, _REST_TIME = (0.01, 0.001), 1.0

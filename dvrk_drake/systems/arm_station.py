@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,15 +17,41 @@ from pydrake.systems.primitives import MatrixGain
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
-from dvrk_drake.models.plant import Closure, add_arm, set_arm_positions, tree_selector
+from dvrk_drake.models.loop_closure import Closure
+from dvrk_drake.models.plant import add_arm, set_arm_positions, tree_selector
+from dvrk_drake.systems.arm_effects.drive_step import DriveStep
+from dvrk_drake.systems.arm_effects.plant_effects import PlantEffects
+from dvrk_drake.systems.arm_effects.real_drive import RealDrive, add_real_drive
 from dvrk_drake.systems.ideal_drive import DrivePorts, add_ideal_drive
 from dvrk_drake.systems.lcm.arm_connection import connect_arm
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.plant_joints import PlantJoints
-from dvrk_drake.systems.real_arm.drive_step import DriveStep
-from dvrk_drake.systems.real_arm.plant_effects import PlantEffects
-from dvrk_drake.systems.real_arm.real_drive import RealDrive, add_real_drive
-from dvrk_drake.systems.station_ports import station_ports
+
+
+@dataclass(frozen=True)
+class StationPorts:
+    """Name -> size of the ports that a station of one arm has, in simulation and on hardware alike."""
+
+    inputs: dict[str, int]
+    outputs: dict[str, int]
+
+
+def station_ports(arm: Arm) -> StationPorts:
+    """The ports of `arm`'s station, named like the fields of the iiwa's driver in Drake.
+
+    Prefixed with the arm's lower-case name; n numbers in the arm's order of joints [rad, rad/s, N m; m, m/s,
+    N].
+    """
+    n, name = arm.num_joints, arm.name.lower()
+    return StationPorts(
+        inputs={f"{name}.effort_commanded": n},
+        outputs={
+            f"{name}.position_measured": n,
+            f"{name}.velocity_estimated": n,
+            f"{name}.state_estimated": 2 * n,
+            f"{name}.effort_measured": n,
+        },
+    )
 
 
 class ArmStation(Diagram):

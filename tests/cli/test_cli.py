@@ -12,8 +12,8 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import Recording, read_recording, write_recording
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
+from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ from sticky_arm import PERIOD, StickyArm, near_poses
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.pose_file import load_poses, save_poses
-from dvrk_drake.models.recording import read_recording
 from dvrk_drake.processes.arm_controller import ArmController
+from dvrk_drake.recordings.pose_file import load_poses, save_poses
+from dvrk_drake.recordings.recording import read_recording
 
 
 @pytest.fixture

@@ -10,11 +10,11 @@ from dvrk_drake.errors import DvrkDrakeError
 STUDY = "scenario: psm\nset: [duration=1]\nmeasures: [{kind: drift, time: 1}]\n"
 #: Verb with its options, and the function that does its work.
 VERBS = {
-    "simulate": (["psm", "--output", "o.csv", "--plots", "new/p"], "simulation.simulation.simulate"),
-    "transparency": (["--arm", "mtml", "--output", "new/p"], "transparency.transparency.feel"),
-    "study": (["study.yaml", "--output", "o.csv", "--plots", "new/p"], "study.executors.run_study_locally"),
-    "tune": (["--arm", "mtml", "--output", "o.yaml", "--plots", "new/p"], "tuning.tuning.tune_arm"),
-    "reproduce": (["fig7", "--output", "new/p"], "reproduction.run.reproduce"),
+    "simulate": (["psm", "--output", "o.csv", "--plots", "new/p"], "experiments.simulation.simulate"),
+    "transparency": (["--arm", "mtml", "--output", "new/p"], "experiments.transparency.feel"),
+    "study": (["study.yaml", "--output", "o.csv", "--plots", "new/p"], "experiments.study.executors.run_study_locally"),
+    "tune": (["--arm", "mtml", "--output", "o.yaml", "--plots", "new/p"], "experiments.tuning.tuning.tune_arm"),
+    "reproduce": (["fig7", "--output", "new/p"], "reports.reproduction.run.reproduce"),
 }
 
 
@@ -26,7 +26,7 @@ def interrupted(monkeypatch, tmp_path):
     def run(verb, error, before=lambda: None):
         (tmp_path / "study.yaml").write_text(STUDY)
         arguments, path = VERBS[verb]
-        module, _, function = f"dvrk_drake.analysis.{path}".rpartition(".")
+        module, _, function = f"dvrk_drake.{path}".rpartition(".")
 
         def work(*_, **__):
             before()

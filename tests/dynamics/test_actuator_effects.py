@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_coordinates, slides
+from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.effect_shapes import effect_shapes
 from dvrk_drake.models.arm import load_arm
 
 T = np.arange(0, 4, 1e-3)

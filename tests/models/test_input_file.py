@@ -11,23 +11,23 @@ import pytest
 import yaml
 from recordings import HEADER, ROW, random_recording
 
-from dvrk_drake.analysis.convert.convert import convert
-from dvrk_drake.analysis.simulation.scenario_file import load_scenario
-from dvrk_drake.analysis.study.study_file import load_study
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError, RecordingError
-from dvrk_drake.models import csv_rows, recording
+from dvrk_drake.experiments.scenario_file import load_scenario
+from dvrk_drake.experiments.study.study_file import load_study
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.collection_file import CollectionFile
+from dvrk_drake.models.files import LARGEST_TEXT
 from dvrk_drake.models.gains_file import load_gains
-from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
-from dvrk_drake.models.input_file import LARGEST_TEXT
-from dvrk_drake.models.pose_file import load_poses
-from dvrk_drake.models.recording import read_recording, write_recording
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 from dvrk_drake.models.typed_yaml import parse_yaml
 from dvrk_drake.processes.simulated_arm import load_driver
+from dvrk_drake.recordings import csv_rows, recording
+from dvrk_drake.recordings.collection_file import CollectionFile
+from dvrk_drake.recordings.conversion import convert
+from dvrk_drake.recordings.pose_file import load_poses
+from dvrk_drake.recordings.recording import read_recording, write_recording
 
 ARM = load_arm("mtml")
 #: What each reader's file is called -> the reader.

@@ -6,20 +6,23 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.export.compensation_comparison import compare_compensation
-from dvrk_drake.analysis.reproduction.recordings import PAPER_ARM
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.analysis.static.validation import validate
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.gravity_compensation import CompensationOptions, compensation_from_model, controller_torque
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, ModelError
+from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
+    CompensationOptions,
+    compensation_from_model,
+    controller_torque,
+)
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.gravity_compensation_file import GravityCompensationFile
-from dvrk_drake.models.mirrored_links import mirror_links
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
-from dvrk_drake.models.recording import read_recording
-from dvrk_drake.models.sdf_model import MODELS_FOLDER
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, mirror_links
+from dvrk_drake.recordings.recording import read_recording
 
 #: Mirrored in the plane x = 0, an arm has these joint angles in place of its own, and these torques.
 MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])

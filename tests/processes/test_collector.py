@@ -9,9 +9,9 @@ from sticky_arm import PERIOD, Disk, GuardedArm, lead, make_collector, make_quic
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import read_recording
 from dvrk_drake.processes.collector import CollectionSettings
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
+from dvrk_drake.recordings.recording import read_recording
 
 FRICTION = 0.08 * load_arm("mtml").effort_limits
 

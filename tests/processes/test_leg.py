@@ -7,9 +7,8 @@ import pytest
 from sticky_arm import random_poses
 
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.nearby_pose import beside
-from dvrk_drake.processes.leg import Leg
-from dvrk_drake.processes.rest_detector import RestDetector
+from dvrk_drake.models.coupled_limits import beside
+from dvrk_drake.processes.leg import Leg, RestDetector
 
 ARMS = ("mtml", "psm")
 

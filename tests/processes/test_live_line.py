@@ -2,7 +2,7 @@
 
 import io
 
-from dvrk_drake.processes.live_line import LiveLine
+from dvrk_drake.processes.live_status import LiveLine
 
 
 class Terminal(io.StringIO):

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-import dvrk_drake.analysis.study.study as study_module
-from dvrk_drake.analysis.simulation.simulation import Simulation
-from dvrk_drake.models.recording import Recording
+import dvrk_drake.experiments.study.study as study_module
+from dvrk_drake.experiments.simulation import Simulation
+from dvrk_drake.recordings.recording import Recording
 
 #: Names a folder of tickets. Where it is set, each simulation waits for a file there, and takes it.
 TICKETS = "DVRK_DRAKE_TEST_TICKETS"

@@ -11,7 +11,7 @@ from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 RATE = 1000.0
 #: White noise of the efforts, as a share of their RMS.

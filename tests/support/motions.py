@@ -13,12 +13,11 @@ from dvrk_drake.dynamics.dynamic_section import (
     RotorEstimate,
     SignalSettings,
 )
-from dvrk_drake.dynamics.inertial_parameters import parameters_from_pseudo_inertia
+from dvrk_drake.dynamics.inertial_parameters import parameters_from_pseudo_inertia, rotor_links
 from dvrk_drake.dynamics.physical_consistency import LinkScale, reached_bounds
-from dvrk_drake.dynamics.rotor_inertia import rotor_links
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.bounding_boxes import bounding_boxes
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 
 def fourier_motion(arm: Arm, generator: np.random.Generator, period: float, seconds: float, rate: float):

@@ -9,7 +9,7 @@ import numpy as np
 
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.arm_schema import Gains
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 Q_NAMES = [f"q{i}" for i in range(1, 8)]
 TAU_NAMES = [f"tau{i}" for i in range(1, 8)]

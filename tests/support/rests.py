@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 RATE = 200.0
 

@@ -9,7 +9,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import make_arm_plant
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 RATE, PERIOD, PASSES = 200.0, 6.0, 4
 #: White noise of the efforts, as a share of their RMS.

@@ -16,10 +16,9 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import tree_selector
-from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.arm_station import ArmStation, station_ports
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.station_ports import station_ports
 
 ARM = load_arm("mtml")
 MODEL = IdentifiedModel.from_arm(ARM)

@@ -14,8 +14,7 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes.live_view import show_status
-from dvrk_drake.systems.arm_view import ArmView, start_meshcat
-from dvrk_drake.systems.camera import ASPECT, HALF_HEIGHT, framing, geometry_corners
+from dvrk_drake.systems.arm_view import ASPECT, HALF_HEIGHT, ArmView, framing, geometry_corners, start_meshcat
 
 
 @pytest.fixture(scope="module")

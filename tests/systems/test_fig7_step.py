@@ -8,8 +8,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 
-from dvrk_drake.analysis.demo.demo import MTM_PLAN
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.experiments.demo.demo import MTM_PLAN
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController

@@ -8,12 +8,12 @@ from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePose
 from teleoperation_loop import MTM, PSM, angle
 
-from dvrk_drake.analysis.demo.teleoperation import (
+from dvrk_drake.experiments.demo.teleoperation import (
     SCALE,
     START_FOLLOWER,
     START_MASTER,
 )
-from dvrk_drake.systems.pose_trajectory_source import PoseTrajectorySource
+from dvrk_drake.systems.hand_path import PoseTrajectorySource
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
 

@@ -15,8 +15,8 @@ from patience import wait_until
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.pose_file import load_poses
-from dvrk_drake.models.recording import read_recording
+from dvrk_drake.recordings.pose_file import load_poses
+from dvrk_drake.recordings.recording import read_recording
 
 #: As few as identification takes.
 POSES = 8

@@ -15,9 +15,9 @@ from patience import PATIENCE, wait_until
 from status_logs import ARM, log_bytes, statuses
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.lcm_log import LcmLogReader
-from dvrk_drake.models.recording import read_recording
-from dvrk_drake.models.status_stream import measurements
+from dvrk_drake.recordings.lcm_log_reader import LcmLogReader
+from dvrk_drake.recordings.lcm_status_log import measurements
+from dvrk_drake.recordings.recording import read_recording
 
 TOOLS = Path(lcm.__file__).parents[1] / "bin"  # the programs themselves: those on the PATH start them as children
 COLUMNS = [f"{prefix}{i + 1}" for prefix in ("q", "qd", "tau") for i in range(7)]

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
-from dvrk_drake.analysis.check.report import Finding
+from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.static.doubts import find_doubts
 from dvrk_drake.analysis.static.static_identification import LEAST_POSES, average_repeated_poses
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: A hypothesis is accepted if it raises the log-likelihood by this much. On the public motions as recorded no exchange
 #: gains anything; on damaged ones the right one gains 25 or more, in most cases hundreds.

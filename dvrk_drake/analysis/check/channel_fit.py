@@ -12,14 +12,14 @@ from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, named_effects
 from dvrk_drake.analysis.dynamic.normal_equations import solve, squared_errors
 from dvrk_drake.analysis.signals.low_pass import low_pass, resample
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, default_settings, motion_grid
-from dvrk_drake.analysis.signals.phase_folds import period_of
+from dvrk_drake.analysis.signals.repetition import period_of
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_coordinates
+from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.effect_shapes import effect_shapes
 from dvrk_drake.dynamics.physical_consistency import LinkScale
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.models.recording import REST_SPEED, Recording
+from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: Prior standard deviations. Of links' parameters, and of the effects that the arm's file states: as shares of their
 #: size. Of simple friction, and of offsets, springs and cables of unknown size: as shares of the RMS effort.

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.report import Finding, JointSignals, RecordingReport
+from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport
 from dvrk_drake.analysis.signals.effort_lag import LAG_STEP, LONGEST_LAG, EffortLag, effort_lag
 from dvrk_drake.analysis.signals.low_pass import resample
 from dvrk_drake.analysis.signals.motion_signals import MotionSignals, motion_signals
 from dvrk_drake.analysis.signals.noise import cut_offs, narrow_band, spectra
 from dvrk_drake.analysis.signals.repetition import find_period, repeatability_floor
-from dvrk_drake.analysis.signals.rests import LONGEST_PERIOD
+from dvrk_drake.analysis.signals.static_segments import LONGEST_PERIOD
 from dvrk_drake.analysis.signals.true_time import TrueTime, repeated_block, repeated_rows, true_time
 from dvrk_drake.analysis.signals.velocity_agreement import VelocityAgreement, velocity_agreement
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import REST_SPEED, Recording
+from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: Below this share, repeated rows are chance.
 LEAST_REPEATED = 0.005

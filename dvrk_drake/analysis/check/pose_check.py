@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.report import Finding
+from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.static.doubts import find_doubts, usable_measurements
 from dvrk_drake.analysis.static.static_identification import LEAST_POSES, average_repeated_poses
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import holding_torques
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Poses at which the SDF's gravity is compared.
 MOST_COMPARED = 500

@@ -7,14 +7,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.check.channel_check import check_channels
+from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
 from dvrk_drake.analysis.check.motion_check import check_motion
 from dvrk_drake.analysis.check.pose_check import check_poses
-from dvrk_drake.analysis.check.report import Finding, JointSignals, RecordingReport, Severity
-from dvrk_drake.analysis.signals.rests import LEAST_ROWS, LONGEST_PERIOD
+from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
+from dvrk_drake.analysis.signals.static_segments import LEAST_ROWS, LONGEST_PERIOD, find_poses
 from dvrk_drake.analysis.static.doubts import check_effort_unit
-from dvrk_drake.errors import RecordingError
+from dvrk_drake.analysis.static.static_identification import usable_poses
+from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import REST_SPEED, Recording
+from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: A joint that moves less has never moved [rad], [m].
 LEAST_RANGE = 0.02, 0.002
@@ -221,3 +224,55 @@ def _time_factor(recording: Recording) -> float | None:
 
 def _without_source(message: str, source: str) -> str:
     return message.removeprefix(source).lstrip(": ")
+
+
+def check_for_identification(recording: Recording, arm: Arm) -> RecordingReport:
+    """As `check_recording`, with a refusal where `identify` refuses what may still be compared with a model.
+
+    Args:
+        recording: as read.
+        arm: which was recorded.
+    """
+    report = check_with_channels(recording, arm)
+    if report.refusals:
+        return report
+    refusals = _refusals_of_identify(recording, arm)
+    # What a refusal says again, and with what is needed.
+    others = [finding for finding in report.findings if not (refusals and finding.kind == "few poses")]
+    return replace(report, findings=(*refusals, *others))
+
+
+def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
+    """As `check_recording`, with the findings of `check_channels` for a recording that has no other refusals.
+
+    Exchanged channels look like efforts of a wrong sign: that refusal is replaced by the one that names the cause.
+    """
+    report = check_recording(recording, arm)
+    others = [finding for finding in report.refusals if finding.kind != "effort sign"]
+    if others or (report.kind == "motion" and not recording.motion(arm)):
+        return report
+    try:
+        found = check_channels(recording, arm)
+    except RecordingError:
+        return report  # too short or too coarse to be fitted: identify refuses it with that reason
+    if any(finding.severity == "refusal" for finding in found):
+        kept = [finding for finding in report.findings if finding.severity != "refusal"]
+        return replace(report, findings=(*found, *kept))
+    if report.refusals:
+        return report
+    order = {"warning": 0, "note": 1}
+    return replace(report, findings=tuple(sorted((*report.findings, *found), key=lambda f: order[f.severity])))
+
+
+def _refusals_of_identify(recording: Recording, arm: Arm) -> tuple[Finding, ...]:
+    try:
+        found = find_poses(recording, arm)
+        if found.moves:
+            motion_grid(recording, arm, default_settings(arm))
+            return ()
+        usable_poses(found.recording, arm)
+    except (RecordingError, IdentificationError) as error:
+        what, _, advice = str(error).removeprefix(f"{recording.source or 'recording'}: ").partition("; ")
+        return (Finding("refusal", "identify refuses", "identify", f"will refuse it: {what}", advice),)
+    # Of a motion with rests, they alone are identified from.
+    return () if found.recording is recording else check_recording(found.recording, arm).refusals

@@ -18,8 +18,8 @@ from dvrk_drake.dynamics.actuator_effects import (
     slides,
     spring_over,
 )
+from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.effect_shapes import effect_shapes
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 
@@ -51,10 +51,6 @@ class DynamicColumns:
     effects: tuple[ActuatorEffect, ...]
     shapes: tuple[NDArray[np.float64], ...]
     rows: NDArray[np.float64]
-
-    def of_actuator(self, i: int) -> NDArray[np.float64]:
-        """(r, p + e) all columns of one actuator."""
-        return np.hstack([self.rigid[:, i], self.shapes[i] * self.rows[:, i]])
 
 
 def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:

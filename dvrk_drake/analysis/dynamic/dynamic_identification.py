@@ -9,15 +9,13 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.choice import choose_effects, left_out_errors
 from dvrk_drake.analysis.dynamic.columns import drive_effects, dynamic_columns, optional_effects
-from dvrk_drake.analysis.dynamic.covariance import parameter_covariance
-from dvrk_drake.analysis.dynamic.estimates import DynamicEstimates
+from dvrk_drake.analysis.dynamic.effect_choice import choose_effects, left_out_errors
+from dvrk_drake.analysis.dynamic.estimates import DynamicEstimates, base_parameter_estimates
+from dvrk_drake.analysis.dynamic.parameter_uncertainty import parameter_covariance
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
-from dvrk_drake.analysis.dynamic.statics import base_parameter_estimates
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, default_settings, motion_grid
-from dvrk_drake.analysis.signals.phase_folds import period_of, phase_folds
-from dvrk_drake.analysis.signals.repetition import repeatability_floor
+from dvrk_drake.analysis.signals.repetition import period_of, phase_folds, repeatability_floor
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import (
@@ -29,7 +27,7 @@ from dvrk_drake.dynamics.dynamic_section import (
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics, Provenance
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import REST_SPEED, Recording
+from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: An effect whose effort is below this share of the actuators' is left out of the model.
 LEAST_EFFECT = 1e-4

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
+from scipy.linalg import matmul_toeplitz
+from scipy.signal import correlate
 
-from dvrk_drake.errors import IdentificationError
+from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
 
 #: Above this size of their correlation the data tell the sum or difference of two parameters, hardly each of them.
 STRONG_CORRELATION = 0.95
-#: Smallest eigenvalue of an information matrix scaled to a unit diagonal that can be told from rounding.
-_SMALLEST_EIGENVALUE = 1e-13
 
 
 @dataclass(frozen=True)
@@ -57,38 +57,113 @@ class ParameterUncertainty:
         return [StrongCorrelation(self.names[i], self.names[k], float(self.correlation[i, k])) for i, k in pairs]
 
 
-def parameter_uncertainty(names: Sequence[str], information: ArrayLike) -> ParameterUncertainty:
-    """Standard errors and correlations from an information matrix.
+#: Errors of an effort further apart than this have nothing to do with each other, but for whole periods [s].
+MEMORY = 1.0
+#: Rows are taken this many times as often as the cut-off of the low-pass needs.
+_OVERSAMPLING = 2.0
+#: Two passes that overlap by less than this share of the motion do not tell what repeats.
+_LEAST_OVERLAP = 0.2
+
+
+def parameter_covariance(
+    problem: DynamicProblem,
+    fit: ConsistentFit,
+    residuals: NDArray[np.float64],
+    rate: float,
+    cut_off: float,
+    period: float | None,
+) -> NDArray[np.float64]:
+    """(p + e, p + e) covariance of `fit.x`, given the effects; inequalities are not counted as knowledge.
+
+    With A = (X'WX + P)^-1, the inverse of the second derivative of the cost,
+
+        covariance = A (sum_i w_i^2 X_i' Omega_i X_i + P) A,
+
+    P being what the priors know and Omega_i the covariance of actuator i's error over time, as the residuals show it:
+    errors that last (friction that is not modelled quite right) count as few measurements, and those that come again
+    in every period of the motion count once, whatever the number of periods. Residuals of a fit are smaller than the
+    errors where it could bend to them, those of phases that it has not seen are larger by as much: with H the hat
+    matrix, (1 - H) e and e / (1 - H). The products of one with the other are neither (MacKinnon and White, "Some
+    heteroskedasticity-consistent covariance matrix estimators", 1985: HC2).
 
     Args:
-        names: (b,) of the parameters.
-        information: (b, b) Y' W Y with the inverse variances W of the rows' noise (plus what a prior knows): the
-            covariance of the estimate is its inverse. Rows whose noise is not independent count less than one each.
-
-    Raises:
-        IdentificationError: the data do not determine the parameters; names those that they leave open.
+        problem, fit: as solved.
+        residuals: (r, n) what the fit leaves of the efforts.
+        rate: of the rows [Hz].
+        cut_off: of the low-pass that they are behind [Hz].
+        period: after which the motion repeats [s], or None.
     """
-    N = np.asarray(information, float)
-    if N.shape != (len(names),) * 2 or not np.all(np.isfinite(N)):
-        raise IdentificationError(f"information matrix {N.shape} must be finite and ({len(names)}, {len(names)})")
-    # Scaled to a unit diagonal: parameters range over decades (kg m^2 at the shoulder, g mm^2 at the handle).
-    diagonal = np.diag(N)
-    if not np.all(diagonal > 0):
-        unmoved = [name for name, size in zip(names, diagonal, strict=True) if not size > 0]
-        raise IdentificationError(f"the data say nothing of {', '.join(unmoved)}")
-    scale = 1 / np.sqrt(diagonal)
-    eigenvalues, vectors = np.linalg.eigh(N * np.outer(scale, scale))
-    if eigenvalues[0] < _SMALLEST_EIGENVALUE:
-        largest = np.argsort(-np.abs(vectors[:, 0]))[:3]
-        open_ones = ", ".join(names[i] for i in sorted(largest) if abs(vectors[i, 0]) > 0.1)
-        raise IdentificationError(f"the data do not tell a combination of {open_ones}: move more, or give a prior")
-    scaled_covariance = (vectors / eigenvalues) @ vectors.T
-    spread = np.sqrt(np.diag(scaled_covariance))
-    return ParameterUncertainty(tuple(names), scale * spread, scaled_covariance / np.outer(spread, spread))
+    step = max(1, int(rate / (2 * cut_off * _OVERSAMPLING)))
+    rows = slice(None, None, step)
+    A = _inverse(fit.information + fit.prior_precision)
+    middle = fit.prior_precision.copy()
+    unseen = _unseen_residuals(problem, fit, residuals)
+    for i, weight in enumerate(fit.weights):
+        covariance = error_covariance(residuals[rows, i], unseen[rows, i], rate / step, period)
+        X = problem.chosen_columns(i, fit.chosen)[rows]
+        moved = np.flatnonzero(np.any(X, axis=0))
+        X = X[:, moved]
+        middle[np.ix_(moved, moved)] += (weight * step) ** 2 * (X.T @ matmul_toeplitz(covariance, X))
+    return np.asarray(A @ middle @ A, dtype=np.float64)
 
 
-def information_matrix(Y: NDArray[np.float64], residual_variance: ArrayLike) -> NDArray[np.float64]:
-    """(b, b) Y' W Y of a regressor Y (m, n, b) whose joints' residuals have the variances (n,) [N^2 m^2; N^2]."""
-    weighted = Y / np.sqrt(np.asarray(residual_variance, float))[:, None]
-    rows = weighted.reshape(-1, Y.shape[-1])
-    return rows.T @ rows
+def _unseen_residuals(
+    problem: DynamicProblem, fit: ConsistentFit, residuals: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(r, n) what is left of each fold by the fit to the others: one step of Newton's, exact but for inequalities."""
+    unseen = residuals.copy()
+    free = np.flatnonzero(fit.x > fit.lower)
+    columns = [problem.chosen_columns(i, fit.chosen)[:, free] for i in range(residuals.shape[1])]
+    known = (fit.information + fit.prior_precision)[np.ix_(free, free)]
+    for fold in range(int(problem.fold.max()) + 1):
+        rows = problem.fold == fold
+        X, e = [x[rows] for x in columns], residuals[rows].T
+        own = sum(weight * x.T @ x for weight, x in zip(fit.weights, X, strict=True))
+        slope = sum(weight * x.T @ left for weight, x, left in zip(fit.weights, X, e, strict=True))
+        step = _inverse(known - own) @ slope
+        unseen[rows] += np.column_stack([x @ step for x in X])
+    return unseen
+
+
+def error_covariance(
+    seen: NDArray[np.float64], unseen: NDArray[np.float64], rate: float, period: float | None
+) -> NDArray[np.float64]:
+    """(r,) covariance of an actuator's error with itself, by how many rows later.
+
+    `seen` and `unseen` (r,) are its residuals when the fit knew these rows and when it did not.
+
+    Up to `MEMORY` it is the error's own, tapered (Parzen's window); whole periods later that of the part of it that
+    repeats, which is what the first repetition shows.
+    """
+    count = len(seen)
+    both = correlate(seen, unseen, method="fft")
+    lags = (both + both[::-1])[count - 1 :] / 2 / np.arange(count, 0, -1)
+    reach = min(round(MEMORY * rate), count - 1)
+    window = _parzen(np.arange(-reach, reach + 1) / reach)
+    near = np.concatenate([lags[reach:0:-1], lags[: reach + 1]]) * window
+    covariance = np.zeros(count + reach)
+    covariance[: reach + 1] = near[reach:]
+    shift = 0 if period is None else round(period * rate)
+    if reach < shift and (count - shift - reach) > _LEAST_OVERLAP * count:
+        again = lags[shift - reach : shift + reach + 1] * window
+        for start in range(shift, count + reach, shift):
+            until = min(start + reach + 1, len(covariance))
+            covariance[start - reach : until] += again[: until - start + reach]
+    return _nearest_covariance(covariance[:count])
+
+
+def _parzen(u: NDArray[np.float64]) -> NDArray[np.float64]:
+    u = np.abs(u)
+    return np.asarray(np.where(u < 0.5, 1 - 6 * u**2 * (1 - u), 2 * (1 - u) ** 3))
+
+
+def _nearest_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Estimates of covariances can have negative spectra, which no error has."""
+    circulant = np.concatenate([covariance, covariance[-1:0:-1]])
+    spectrum = np.maximum(np.fft.rfft(circulant).real, 0.0)
+    return np.asarray(np.fft.irfft(spectrum, len(circulant))[: len(covariance)], dtype=np.float64)
+
+
+def _inverse(H: NDArray[np.float64]) -> NDArray[np.float64]:
+    scale = 1 / np.sqrt(np.diag(H))
+    return np.asarray(np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale), dtype=np.float64)

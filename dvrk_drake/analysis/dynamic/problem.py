@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DynamicColumns
+from dvrk_drake.analysis.dynamic.effect_selection import EffectSelection
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, squared_errors
-from dvrk_drake.analysis.dynamic.selection import EffectSelection
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.inertial_parameters import rotor_links
 from dvrk_drake.dynamics.physical_consistency import LinkScale, consistent_parameters, log_det_curvature
-from dvrk_drake.dynamics.rotor_inertia import rotor_links
 from dvrk_drake.models.bounding_boxes import BoundingBox, bounding_boxes
 
 #: Deviation of an inertial parameter from the SDF's, as a share of the link's own size; chosen by cross-validation.

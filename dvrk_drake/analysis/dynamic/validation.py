@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.signals.low_pass import low_pass
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
-from dvrk_drake.analysis.signals.phase_folds import period_of
-from dvrk_drake.analysis.signals.repetition import repeatability_floor
+from dvrk_drake.analysis.signals.repetition import period_of, repeatability_floor
 from dvrk_drake.analysis.verdict import judge, rule_text, worst
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Width of the smoothed sign of the friction that an error is searched for, as a share of the RMS speed.
 _FRICTION_WIDTH = 0.1

@@ -9,14 +9,12 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize_scalar
 
-from dvrk_drake.analysis.signals.drive_efforts import DriveEfforts, drive_efforts
-from dvrk_drake.analysis.signals.effort_sign import refuse_opposite_efforts
+from dvrk_drake.analysis.signals.drive_efforts import DriveEfforts, drive_efforts, refuse_opposite_efforts
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, motion_grid
-from dvrk_drake.analysis.signals.phase_folds import period_of
-from dvrk_drake.analysis.signals.repetition import SAME_MOTION
+from dvrk_drake.analysis.signals.repetition import SAME_MOTION, period_of
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: A motion that does not repeat may have begun so much sooner or later than the other [s].
 LONGEST_SHIFT = 5.0

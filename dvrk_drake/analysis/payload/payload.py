@@ -13,14 +13,14 @@ from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
 from dvrk_drake.analysis.payload.motion_difference import MotionDifference, motion_difference
 from dvrk_drake.analysis.payload.point_mass import PointMass, PointMassProblem
 from dvrk_drake.analysis.payload.whitening import Whitening
-from dvrk_drake.analysis.signals.phase_folds import phase_folds
+from dvrk_drake.analysis.signals.repetition import phase_folds
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Of the intervals that are reported.
 CONFIDENCE = 0.95

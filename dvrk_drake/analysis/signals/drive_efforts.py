@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid
 from dvrk_drake.dynamics.actuator_effects import effect_coordinates
-from dvrk_drake.dynamics.dynamic_model import DynamicModel
-from dvrk_drake.dynamics.effect_shapes import effect_shapes
+from dvrk_drake.dynamics.dynamic_model import DynamicModel, effect_shapes
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.recordings.recording import Recording
 
 FrictionPart = Literal["dry", "viscous"]
 #: Which kinds of effects are friction, and of which part: what a change of temperature or of grease changes together.
@@ -61,3 +62,31 @@ def drive_efforts(model: DynamicModel, grid: MotionGrid) -> DriveEfforts:
         grid.behind_filter(grid.efforts_at_rows(other)),
         {key: grid.behind_filter(grid.efforts_at_rows(x)) for key, x in friction.items()},
     )
+
+
+#: Efforts that correlate with the model's by less than this have the other sign: one of unknown sign is near 0.
+OPPOSITE = -0.3
+
+
+def refuse_opposite_efforts(
+    recording: Recording, names: tuple[str, ...], tau: NDArray[np.float64], expected: NDArray[np.float64]
+) -> None:
+    """Compares measured efforts with what a model expects, offsets aside.
+
+    Args:
+        recording: for the message.
+        names: of the n joints whose actuators they are.
+        tau, expected: (r, n) of the actuators, behind one low-pass [N m, N].
+
+    Raises:
+        RecordingError: an actuator's efforts go against the model's.
+    """
+    x, y = tau - np.mean(tau, axis=0), expected - np.mean(expected, axis=0)
+    size = np.sqrt(np.sum(x**2, axis=0) * np.sum(y**2, axis=0))
+    correlation = np.sum(x * y, axis=0) / np.maximum(size, np.finfo(float).tiny)
+    if len(wrong := np.flatnonzero(correlation < OPPOSITE)):
+        which = ", ".join(f"{names[j]} ({correlation[j]:.2f})" for j in wrong)
+        raise RecordingError(
+            f"{recording.source or 'recording'}: efforts go against the model's (correlation): {which}; tau or the "
+            "direction of q has the wrong sign there, or it is another arm: efforts are positive towards +q"
+        )

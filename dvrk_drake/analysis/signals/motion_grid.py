@@ -12,7 +12,7 @@ from dvrk_drake.analysis.signals.true_time import true_time
 from dvrk_drake.dynamics.dynamic_section import SignalSettings
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Rate of the grid [Hz]: fine enough for hysteresis to turn round where the joint does.
 GRID_RATE = 400.0

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.analysis.signals.low_pass import central_difference, low_pass, resample
 from dvrk_drake.analysis.signals.true_time import true_time
 from dvrk_drake.analysis.signals.velocity_agreement import velocity_agreement
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Motions that repeat: their period, and how well the arm repeats its efforts."""
+"""Motions that repeat: their period, how well the arm repeats its efforts, and parts that are predicted from others."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.signal import correlate
 
 from dvrk_drake.analysis.signals.low_pass import low_pass
+from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid
 
 #: A motion repeats if, a period later, its positions differ by less than this share of their standard deviation
 #: (RMS over the joints that move).
@@ -82,3 +83,32 @@ def repeatability_floor(
     size = np.sqrt(np.mean(filtered**2, axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.sqrt(np.mean(difference**2, axis=0) / 2) / size)
+
+
+FOLDS = 12
+#: What is nearer than this to the part that is predicted is not learnt from: the filters reach over [s].
+GAP = 0.1
+
+
+def period_of(grid: MotionGrid) -> float | None:
+    """After which the motion repeats [s]; None if it does not."""
+    return find_period(grid.arm.transmission.position(grid.q), GRID_RATE)
+
+
+def phase_folds(
+    grid: MotionGrid, period: float | None, folds: int = FOLDS
+) -> tuple[NDArray[np.int_], NDArray[np.bool_]]:
+    """The fold of each inner row, and which of them lie at its edge.
+
+    A motion that repeats is cut by its phase: cut by time, every stretch would be learnt from its own repetition.
+
+    Returns:
+        fold: (r,) 0..folds - 1.
+        edge: (r, 2) True within `GAP` of the fold before, of the fold after.
+    """
+    t = grid.row_times[grid.inner]
+    length = period if period is not None else float(t[-1] - t[0]) * (1 + 1e-9)
+    part = ((t - t[0]) % length) / length * folds
+    fold = np.minimum(part.astype(int), folds - 1)
+    gap = GAP * folds / length
+    return fold, np.column_stack([part - fold < gap, part - fold > 1 - gap])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.signals.low_pass import low_pass, resample
 from dvrk_drake.analysis.signals.velocity_agreement import velocity_agreement
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Two values closer than this share of their channel's RMS are the same: coordinates may have been converted.
 SAME_VALUE = 1e-9

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 #: Within this distance of a limit a joint may rest on its stop [rad], [m].
 STOP_MARGIN = 0.01, 0.002

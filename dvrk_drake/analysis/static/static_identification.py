@@ -24,7 +24,7 @@ from dvrk_drake.dynamics.identified_model import (
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import REST_SPEED, SAME_POSE, Recording
+from dvrk_drake.recordings.recording import REST_SPEED, SAME_POSE, Recording
 
 Method = Literal["robust", "paper"]
 

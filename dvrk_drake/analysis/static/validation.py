@@ -12,7 +12,7 @@ from dvrk_drake.analysis.static.linear_fit import rms
 from dvrk_drake.analysis.verdict import judge, rule_text, worst
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 
 @dataclass(frozen=True)

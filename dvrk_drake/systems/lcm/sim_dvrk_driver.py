@@ -18,11 +18,11 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.lcm.arm_clock import ArmClock
+from dvrk_drake.systems.lcm.arm_connection import TolerantSerializer
 from dvrk_drake.systems.lcm.dvrk_command_receiver import DvrkCommandReceiver
 from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status_sender import DvrkStatusSender
-from dvrk_drake.systems.lcm.serializer import TolerantSerializer
 
 
 class SimDvrkDriver(Diagram):

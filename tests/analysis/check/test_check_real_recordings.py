@@ -5,8 +5,8 @@ import pytest
 from check_findings import changed
 
 from dvrk_drake.analysis.check.recording_check import check_recording
-from dvrk_drake.analysis.convert.convert import read_wpi_csv, wpi_in_joint_coordinates
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.recordings.conversion import read_wpi_csv, wpi_in_joint_coordinates
 
 pytestmark = pytest.mark.slow
 

@@ -8,8 +8,7 @@ import pytest
 from synthetic_motion import RATE, trajectory
 
 from dvrk_drake.analysis.check.channel_check import check_channels
-from dvrk_drake.analysis.check.identifiable import check_with_channels
-from dvrk_drake.analysis.convert.convert import read_wpi_csv, wpi_in_joint_coordinates
+from dvrk_drake.analysis.check.recording_check import check_with_channels
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates
@@ -17,7 +16,8 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import holding_torques
-from dvrk_drake.models.recording import Recording, read_recording, write_recording
+from dvrk_drake.recordings.conversion import read_wpi_csv, wpi_in_joint_coordinates
+from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
 
 pytestmark = pytest.mark.slow
 

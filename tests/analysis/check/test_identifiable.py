@@ -6,12 +6,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.check.identifiable import check_for_identification
-from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.analysis.check.recording_check import check_for_identification, check_recording
 from dvrk_drake.cli import main
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import holding_torques
-from dvrk_drake.models.recording import Recording, read_recording, write_recording
+from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
 
 ARM = load_arm("mtmr")
 

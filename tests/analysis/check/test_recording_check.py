@@ -11,16 +11,16 @@ from synthetic_motion import EFFORT_NOISE, PERIOD, RATE, clean_motion
 
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.signals.low_pass import low_pass
-from dvrk_drake.analysis.signals.poses import find_poses
-from dvrk_drake.analysis.tables import make_table
+from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.cli import main
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.lcm_log import LcmEvent, event_bytes
 from dvrk_drake.models.lcm_messages import status_channel
 from dvrk_drake.models.plant import holding_torques
-from dvrk_drake.models.recording import Recording, read_recording, write_recording
+from dvrk_drake.recordings.lcm_log_reader import LcmEvent, event_bytes
+from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
+from dvrk_drake.reports.terminal_tables import make_table
 
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.dynamic.covariance import error_covariance, independent_measurements, parameter_covariance
+from dvrk_drake.analysis.dynamic.parameter_uncertainty import (
+    error_covariance,
+    parameter_covariance,
+)
 from dvrk_drake.analysis.signals.low_pass import low_pass
 
 RATE, CUT_OFF, PERIOD, SECONDS = 100.0, 5.0, 8.0, 32.0
@@ -16,6 +19,14 @@ T = np.arange(round(SECONDS * RATE)) / RATE
 
 def noise(generator, count=1):
     return low_pass(generator.normal(size=(len(T), count)), RATE, CUT_OFF)
+
+
+def independent_measurements(covariance):
+    """How many independent values tell as much of a variance as r with this covariance (r,)."""
+    count = len(covariance)
+    pairs = 2 * np.arange(count, 0, -1)
+    pairs[0] = count
+    return float(count**2 * covariance[0] ** 2 / max(np.sum(pairs * covariance**2), 1e-300))
 
 
 def test_low_passed_white_noise_has_two_independent_values_a_period_of_the_cut_off():

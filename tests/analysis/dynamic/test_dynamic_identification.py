@@ -9,18 +9,18 @@ from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 from rich.console import Console
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.dynamic.statics import base_parameter_map
-from dvrk_drake.analysis.dynamic.tables import print_dynamics
+from dvrk_drake.analysis.dynamic.estimates import base_parameter_map
 from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
-from dvrk_drake.analysis.tables import TABLE_WIDTH
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.reports.dynamic_identification import print_dynamics
+from dvrk_drake.reports.terminal_tables import TABLE_WIDTH
 
 NOISE = 0.05
 RATE = 1000.0

@@ -12,13 +12,13 @@ from io import StringIO
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.convert.convert import read_wpi_csv, wpi_in_joint_coordinates
 from dvrk_drake.analysis.dynamic.validation import validate_motion
-from dvrk_drake.analysis.recalibration.recalibration import recalibrate
+from dvrk_drake.analysis.recalibration import recalibrate
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import Recording, read_recording, write_recording
+from dvrk_drake.recordings.conversion import read_wpi_csv, wpi_in_joint_coordinates
+from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
 
 pytestmark = pytest.mark.slow
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from motions import true_dynamics
 
-from dvrk_drake.analysis.dynamic.statics import base_parameter_estimates
+from dvrk_drake.analysis.dynamic.estimates import base_parameter_estimates
 from dvrk_drake.analysis.static.effect_selection import effect_column
 from dvrk_drake.dynamics.actuator_effects import (
     POSITION_KINDS,

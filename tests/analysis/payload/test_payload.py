@@ -11,8 +11,6 @@ from pydrake.multibody.tree import MultibodyForces
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.payload.payload import as_good, estimate_payload
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
-from dvrk_drake.analysis.payload.tables import describe_better_links, print_payload
-from dvrk_drake.analysis.tables import make_console
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -20,7 +18,9 @@ from dvrk_drake.dynamics.inertial_parameters import LinkInertia, pseudo_inertia
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant
-from dvrk_drake.models.recording import Recording, read_recording, write_recording
+from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
+from dvrk_drake.reports.payload import describe_better_links, print_payload
+from dvrk_drake.reports.terminal_tables import make_console
 
 pytestmark = pytest.mark.slow
 

@@ -8,11 +8,11 @@ from motions import friction_everywhere, true_dynamics
 
 from dvrk_drake.analysis.signals.drive_efforts import drive_efforts
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, default_settings, motion_grid
-from dvrk_drake.analysis.signals.phase_folds import FOLDS, GAP, period_of, phase_folds
+from dvrk_drake.analysis.signals.repetition import FOLDS, GAP, period_of, phase_folds
 from dvrk_drake.dynamics.dynamic_section import SignalSettings
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 ARM = load_arm("mtml")
 N = ARM.num_joints

@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 from rests import motion_with_rests
 
-from dvrk_drake.analysis.signals.poses import find_poses
-from dvrk_drake.analysis.signals.rests import is_motion, rest_poses, smooth_velocity, stationary_runs
+from dvrk_drake.analysis.signals.static_segments import (
+    find_poses,
+    is_motion,
+    rest_poses,
+    smooth_velocity,
+    stationary_runs,
+)
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import Recording
+from dvrk_drake.recordings.recording import Recording
 
 ARM = load_arm("psm")
 

@@ -6,17 +6,15 @@ import numpy as np
 import pytest
 from rests import RATE, motion_with_rests
 
-from dvrk_drake.analysis.convert.convert import convert
-from dvrk_drake.analysis.signals.poses import find_poses
-from dvrk_drake.analysis.signals.rests import SAME_REST, rest_poses
-from dvrk_drake.analysis.signals.slow_parts import slow_parts
+from dvrk_drake.analysis.signals.static_segments import SAME_REST, find_poses, rest_poses, slow_parts
 from dvrk_drake.analysis.static.static_identification import LEAST_POSES, identify_static
 from dvrk_drake.analysis.static.validation import validate
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import Recording, read_recording
+from dvrk_drake.recordings.conversion import convert
+from dvrk_drake.recordings.recording import Recording, read_recording
 
 pytestmark = pytest.mark.slow
 

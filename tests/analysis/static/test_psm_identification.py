@@ -5,17 +5,17 @@ import json
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.collection import collect_static_poses
-from dvrk_drake.analysis.demo.true_arm import make_true_arm
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
+from dvrk_drake.experiments.demo.true_arm import make_true_arm
+from dvrk_drake.experiments.static_pose_collection import collect_static_poses
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
-from dvrk_drake.models.recording import Recording, write_recording
+from dvrk_drake.recordings.recording import Recording, write_recording
 
 COUNT = 16
 

@@ -15,7 +15,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import IdentificationError, ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.recording import Recording, read_recording
+from dvrk_drake.recordings.recording import Recording, read_recording
 
 pytestmark = pytest.mark.slow
 

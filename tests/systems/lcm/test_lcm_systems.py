@@ -17,9 +17,9 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import StatusFilter
 from dvrk_drake.models.message_key import create_key_file
 from dvrk_drake.systems.guard.settings import GuardSettings
+from dvrk_drake.systems.lcm.arm_connection import TolerantSerializer
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
-from dvrk_drake.systems.lcm.serializer import TolerantSerializer
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])

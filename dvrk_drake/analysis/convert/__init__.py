@@ -1,1 +1,0 @@
-"""Public recordings of other projects, into our format."""

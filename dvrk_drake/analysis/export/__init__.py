@@ -1,1 +1,0 @@
-"""A gravity compensation in the formats of others, compared with theirs."""

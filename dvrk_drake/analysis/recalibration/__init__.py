@@ -1,1 +1,0 @@
-"""Another day, the same arm: what drifts is identified anew from a short motion."""

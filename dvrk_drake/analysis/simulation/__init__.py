@@ -1,1 +1,0 @@
-"""One simulation: the scenario that describes it, and its run."""

@@ -1,1 +1,0 @@
-"""Force and torque that an operator feels at the handle."""

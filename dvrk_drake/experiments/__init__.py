@@ -1,0 +1,1 @@
+"""Simulated experiments: scenarios, studies, tuning, transparency, the paper's figures, the demo."""

@@ -1,0 +1,245 @@
+"""A master arm leads a patient side manipulator, side by side in one Meshcat: a played hand, or yours on sliders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import Meshcat, Rgba, Sphere
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
+from pydrake.visualization import MeshcatPoseSliders
+
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.systems.arm_view import start_meshcat
+from dvrk_drake.systems.hand_path import PoseTrajectorySource
+from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
+
+SCALE = 0.4
+#: Where the arms start [rad, m]: the handle before the operator, the instrument in the middle of its range.
+START_MASTER = np.array([0.0, 0.25, -0.1, 0.0, 1.2, 0.0, 0.0])
+START_FOLLOWER = np.array([0.0, 0.0, 0.13, 0.0, 0.0, 0.0, 0.5])
+#: Where the bases stand [m], alike in orientation: face to face, so that handle and tip are side by side.
+PLACES = {"mtml": (0.0, 0.45, 0.05), "psm": (0.0, -0.22, 0.0)}
+CAMERA, TARGET, ZOOM = (1.7, 0.45, 0.5), (0.0, -0.12, 0.08), 2.6
+#: Of the played motion [s]: the clutch is closed in these intervals.
+ENGAGED = ((0.5, 9.7), (11.2, 16.0))
+DURATION = 16.0
+PERIOD = 0.02
+BLUE, GREEN, GREY = Rgba(0.1, 0.35, 0.75), Rgba(0.1, 0.7, 0.2), Rgba(0.55, 0.55, 0.55)
+
+
+@dataclass(frozen=True)
+class TeleoperationResult:
+    """How well the tip followed the handle, over all samples (one every `PERIOD`) with a closed clutch.
+
+    Errors are those of the tip's displacement and rotation since the clutch closed, against the scaled displacement and
+    the rotation of the handle; both measured.
+
+    Attributes:
+        handle_path: length of the handle's way with a closed clutch [m].
+        rms_position_error, max_position_error: [m].
+        rms_rotation_error, max_rotation_error: [rad].
+        max_motion_held: farthest that the tip was from where the clutch opened, while it was open [m].
+    """
+
+    handle_path: float
+    rms_position_error: float
+    max_position_error: float
+    rms_rotation_error: float
+    max_rotation_error: float
+    max_motion_held: float
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Of every `PERIOD`: whether the follower followed, the handle's and the tip's pose in their bases."""
+
+    following: list[bool]
+    X_MG: list[RigidTransform]
+    X_FT: list[RigidTransform]
+
+
+def play_teleoperation(
+    meshcat: Meshcat | None = None, duration: float = DURATION, progress: Callable[[float], None] = lambda share: None
+) -> TeleoperationResult:
+    """Plays a hand that draws, turns the handle, lets the clutch go, comes back and draws on; records it in `meshcat`.
+
+    Args:
+        meshcat: where the arms and their paths are drawn; see `start_scene`.
+        duration: how much of it [s]; the whole takes `DURATION`.
+        progress: called with the finished share, 0..1.
+    """
+    builder = DiagramBuilder()
+    arms = builder.AddSystem(_make_arms(meshcat))
+    start = arms.CreateDefaultContext()
+    arms.set_positions(start, START_MASTER, START_FOLLOWER)
+    hand = builder.AddSystem(PoseTrajectorySource(_hand_motion(arms.X_MG(start))))
+    switches = [0.0, *np.ravel(ENGAGED)]
+    clutch = builder.AddSystem(
+        TrajectorySource(PiecewisePolynomial.ZeroOrderHold(switches, np.arange(len(switches))[None] % 2))
+    )
+    jaw = builder.AddSystem(TrajectorySource(_jaw_motion()))
+    for source, port in ((hand, "X_MG_desired"), (clutch, "engaged"), (jaw, "jaw_angle")):
+        builder.Connect(source.get_output_port(), arms.GetInputPort(port))
+    simulator = Simulator(builder.Build())
+    context = arms.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    arms.set_positions(context, START_MASTER, START_FOLLOWER)
+
+    samples = _Samples([], [], [])
+    if meshcat is not None:
+        meshcat.StartRecording(frames_per_second=32)
+    for t in np.arange(round(duration / PERIOD) + 1) * PERIOD:
+        simulator.AdvanceTo(t)
+        samples.following.append(bool(arms.GetOutputPort("following").Eval(context)[0]))
+        samples.X_MG.append(arms.X_MG(context))
+        samples.X_FT.append(arms.X_FT(context))
+        progress(t / duration)
+    if meshcat is not None:
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+        _draw_paths(meshcat, samples)
+    return _evaluate(samples)
+
+
+def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
+    """Simulates in real time with hand, clutch, jaw and scale on Meshcat's controls, until Stop or `duration` [s].
+
+    A lamp above the master is green while the follower follows.
+    """
+    arms = _make_arms(meshcat)
+    simulator = Simulator(arms)
+    context = simulator.get_mutable_context()
+    arms.set_positions(context, START_MASTER, START_FOLLOWER)
+    X_MG0 = arms.X_MG(context)
+    reach = np.array([0.8, 0.8, 0.8, 0.12, 0.12, 0.12])
+    sliders = MeshcatPoseSliders(
+        meshcat, lower_limit=-reach, upper_limit=reach, step=np.repeat([0.01, 0.002], 3), prefix="hand"
+    )
+    sliders_context = sliders.CreateDefaultContext()
+    meshcat.AddSlider("jaw", 0.0, 1.3, 0.01, START_FOLLOWER[6])
+    meshcat.AddSlider("scale", 0.1, 1.0, 0.05, SCALE)
+    meshcat.AddButton("Clutch", "Space")
+    meshcat.AddButton("Stop", "Escape")
+    scale, lamp = SCALE, None
+    simulator.set_target_realtime_rate(1.0)
+    while meshcat.GetButtonClicks("Stop") == 0 and context.get_time() < duration:
+        if (chosen := meshcat.GetSliderValue("scale")) != scale:
+            scale = chosen
+            arms.teleoperation.SetScale(arms.teleoperation.GetMyMutableContextFromRoot(context), scale)
+        X_MG = _moved(X_MG0, sliders.get_output_port().Eval(sliders_context))
+        arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(X_MG))
+        arms.GetInputPort("engaged").FixValue(context, [float(meshcat.GetButtonClicks("Clutch") % 2)])
+        arms.GetInputPort("jaw_angle").FixValue(context, [meshcat.GetSliderValue("jaw")])
+        simulator.AdvanceTo(context.get_time() + PERIOD)
+        if (follows := bool(arms.GetOutputPort("following").Eval(context)[0])) != lamp:
+            lamp = follows
+            meshcat.SetObject("mtml/lamp", Sphere(0.015), GREEN if lamp else GREY)
+            meshcat.SetTransform("mtml/lamp", RigidTransform([0.0, 0.0, 0.42]))
+
+
+def start_scene(port: int | None = None) -> Meshcat:
+    """A Meshcat with the camera on both arms, and places for them; on a free port unless one is given."""
+    meshcat = start_meshcat(port=port, camera=CAMERA, target=TARGET, zoom=ZOOM)
+    for name, p_WB in PLACES.items():
+        meshcat.SetTransform(name, RigidTransform(np.array(p_WB)))
+    return meshcat
+
+
+def _make_arms(meshcat: Meshcat | None) -> TeleoperatedArms:
+    return TeleoperatedArms(load_arm("mtml"), load_arm("psm"), scale=SCALE, meshcat=meshcat)
+
+
+def _moved(X: RigidTransform, move: RigidTransform) -> RigidTransform:
+    """X turned and displaced about its own origin, along the axes of its base."""
+    return RigidTransform(move.rotation() @ X.rotation(), X.translation() + move.translation())
+
+
+def _ramp(t: float, start: float, end: float) -> float:
+    """0 before `start`, 1 after `end`, smooth between."""
+    return float(np.sin(np.pi / 2 * np.clip((t - start) / (end - start), 0, 1)) ** 2)
+
+
+def _hand_motion(X_MG0: RigidTransform) -> PiecewisePose:
+    """The handle's way from its pose X_MG0; see `ENGAGED` for what the follower has of it."""
+
+    def move(t: float) -> RigidTransform:
+        eight, circle = 2 * np.pi * _ramp(t, 0.7, 4.5), 2 * np.pi * _ramp(t, 11.5, 15.2)
+        back = _ramp(t, 9.9, 11.0)
+        p = [
+            0.03 * np.sin(eight) + 0.04 * back,
+            0.06 * np.sin(eight) + 0.05 * back + 0.04 * (np.cos(circle) - 1),
+            0.04 * np.sin(2 * eight) - 0.03 * back + 0.04 * np.sin(circle),
+        ]
+        tilt, swing = np.sin(2 * np.pi * _ramp(t, 4.7, 7.2)), np.sin(2 * np.pi * _ramp(t, 6.9, 9.4))
+        return RigidTransform(RollPitchYaw(0.4 * tilt, 0.3 * back, 0.4 * swing), p)
+
+    times = np.arange(0.0, DURATION + PERIOD / 2, PERIOD)
+    return PiecewisePose.MakeLinear(times, [_moved(X_MG0, move(t)) for t in times])
+
+
+def _jaw_motion() -> PiecewisePolynomial:
+    times = np.arange(0.0, DURATION + PERIOD / 2, PERIOD)
+    opening = [[START_FOLLOWER[6] + 0.5 * (_ramp(t, 5.5, 6.3) - _ramp(t, 7.0, 7.8)) for t in times]]
+    return PiecewisePolynomial.FirstOrderHold(times, opening)
+
+
+def _segments(following: list[bool]) -> list[range]:
+    """Ranges of samples with the same state of the clutch."""
+    changes = np.flatnonzero(np.diff(np.array(following, float))) + 1
+    bounds = [0, *changes.tolist(), len(following)]
+    return [range(a, b) for a, b in pairwise(bounds)]
+
+
+def _evaluate(samples: _Samples) -> TeleoperationResult:
+    position, rotation, held, path = [0.0], [0.0], [0.0], 0.0
+    for segment in _segments(samples.following):
+        G0, T0 = samples.X_MG[segment[0]], samples.X_FT[segment[0]]
+        for i in segment:
+            G, T = samples.X_MG[i], samples.X_FT[i]
+            way = T.translation() - T0.translation()
+            if not samples.following[i]:
+                held.append(float(np.linalg.norm(way)))
+                continue
+            position.append(float(np.linalg.norm(way - SCALE * (G.translation() - G0.translation()))))
+            turned, wanted = T.rotation() @ T0.rotation().inverse(), G.rotation() @ G0.rotation().inverse()
+            rotation.append(_angle(turned @ wanted.inverse()))
+        if samples.following[segment[0]]:
+            path += float(np.linalg.norm(np.diff(_points(samples.X_MG, segment)), axis=0).sum())
+    return TeleoperationResult(
+        handle_path=path,
+        rms_position_error=_rms(position),
+        max_position_error=max(position),
+        rms_rotation_error=_rms(rotation),
+        max_rotation_error=max(rotation),
+        max_motion_held=max(held),
+    )
+
+
+def _angle(R: RotationMatrix) -> float:
+    return abs(float(R.ToAngleAxis().angle()))
+
+
+def _rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _points(poses: list[RigidTransform], segment: range) -> NDArray[np.float64]:
+    """(3, m) origins."""
+    return np.array([poses[i].translation() for i in segment]).T
+
+
+def _draw_paths(meshcat: Meshcat, samples: _Samples) -> None:
+    """Lines in the arms' bases: blue with a closed clutch, grey with an open one."""
+    for k, segment in enumerate(_segments(samples.following)):
+        color = BLUE if samples.following[segment[0]] else GREY
+        for name, poses in (("mtml", samples.X_MG), ("psm", samples.X_FT)):
+            if len(segment) > 1:
+                meshcat.SetLine(f"{name}/path/{k}", np.asfortranarray(_points(poses, segment)), 3.0, color)

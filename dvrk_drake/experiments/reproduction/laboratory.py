@@ -1,0 +1,154 @@
+"""What the figures of one run share: the folder, the recordings, the workers, and arms that are identified once."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.experiments.reproduction.drift_experiment import DURATION, Drifts, Release, release_all
+from dvrk_drake.experiments.reproduction.published import FIGURE_7_FAULTY, paper_model, with_zeroed
+from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM, PaperRecordings
+from dvrk_drake.experiments.reproduction.true_arms import KnownTruth, collect, paper_arm, unlike_its_drawing
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.recordings.recording import Recording, write_recording
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much is done; smaller numbers are for tests.
+
+    Attributes:
+        collected: poses that an arm is identified from.
+        releases: random poses that ours is released at.
+        paper_releases: the first of these, for the paper's parameters.
+        led_releases: the first of these, for ours led there first.
+        psm_releases: for the PSM.
+        path_poses: that a hand leads the arm through.
+        duration: of a release [s].
+    """
+
+    collected: int = 40
+    releases: int = 200
+    paper_releases: int = 20
+    led_releases: int = 20
+    psm_releases: int = 20
+    path_poses: int = 5
+    duration: float = DURATION
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """A true arm, poses collected on it, and the model that was identified from them, with its file."""
+
+    truth: KnownTruth
+    poses: Recording
+    model: IdentifiedModel
+    file: Path
+
+
+@dataclass(eq=False)
+class Laboratory:
+    """Everything is made when it is first asked for.
+
+    Attributes:
+        folder: that the results go to.
+        recordings: of the paper's arm.
+        executor: what is simulated runs there.
+        progress: called with what is being done and the finished share of it.
+        extent: how much is done.
+        seed: of true arms, poses and noise.
+    """
+
+    folder: Path
+    recordings: PaperRecordings
+    executor: Executor
+    progress: Callable[[str, float], None] = lambda what, share: None
+    extent: Extent = Extent()
+    seed: int = 0
+
+    @cached_property
+    def mtm(self) -> Identified:
+        """The paper's arm if its recording is there, else one unlike its drawing; identified."""
+        self.progress("finding the true MTM", 0.0)
+        if self.recordings.folder is None:
+            truth = unlike_its_drawing(PAPER_ARM, self.folder, self.seed)
+        else:
+            truth = paper_arm(self.recordings.poses, self.folder)
+        return self._identified(truth, PAPER_ARM)
+
+    @cached_property
+    def psm(self) -> Identified:
+        """A PSM unlike its drawing; identified."""
+        return self._identified(unlike_its_drawing("psm", self.folder, self.seed), "psm")
+
+    @cached_property
+    def paper_file(self) -> Path:
+        """The file of the paper's own parameters; on another arm than the paper's, of its method on the same poses."""
+        mtm, path = self.mtm, self.folder / "paper_model.yaml"
+        if mtm.truth.is_the_papers:
+            paper_model(load_arm(PAPER_ARM)).save(path)
+        else:
+            identify_static(mtm.poses, load_arm(PAPER_ARM), "paper").model.save(path)
+        return path
+
+    def release(
+        self,
+        name: str,
+        truth: KnownTruth,
+        model: Path,
+        poses: NDArray[np.float64],
+        what: str,
+        parts: Sequence[str] = ("all",),
+        damped: bool = False,
+        led: bool = False,
+        hysteresis_ratio: float = 0.0,
+        longest: float = DURATION,
+    ) -> Drifts:
+        """Of the arm `name`, at `poses` (m, n), under the model in a file, for at most `longest` [s]; `parts`,
+        `damped`, `led` and `hysteresis_ratio`: see `Release`."""
+        duration = min(self.extent.duration, longest)
+        every = Release(
+            name, truth.arm, tuple(parts), str(model), poses[0], damped, led, hysteresis_ratio, duration, self.seed
+        )
+        cases = [dataclasses.replace(every, start=pose, seed=self.seed + i) for i, pose in enumerate(poses)]
+        positions = release_all(cases, self.executor, lambda share: self.progress(what, share))
+        return Drifts(truth.arm, positions)
+
+    def random_poses(self, name: str, count: int) -> NDArray[np.float64]:
+        """(count, n) anywhere inside the limits; the first ones are the same whatever the count."""
+        poses = [load_arm(name).sample_poses(1, np.random.default_rng([self.seed, i]))[0] for i in range(count)]
+        return np.array(poses)
+
+    def zeroed(self, model: Path) -> Path:
+        """The file of the same model without torque on joints 5-7."""
+        path = model.with_stem(model.stem + "_zeroed")
+        with_zeroed(IdentifiedModel.load(model), FIGURE_7_FAULTY).save(path)
+        return path
+
+    def _identified(self, truth: KnownTruth, name: str) -> Identified:
+        label = name.upper()
+        poses = collect(
+            truth,
+            name,
+            self.extent.collected,
+            self.seed,
+            self.executor,
+            lambda share: self.progress(f"collecting poses of the {label}", share),
+        )
+        recording, file = self.folder / f"{name}_poses.csv", self.folder / f"{name}_model.yaml"
+        write_recording(poses, recording)
+        identification = identify_static(
+            poses, load_arm(name), progress=lambda share: self.progress(f"identifying the {label}", share)
+        )
+        identification.model.provenance.recording = recording.name
+        identification.model.save(file)
+        return Identified(truth, poses, identification.model, file)

@@ -1,0 +1,90 @@
+"""Mechanisms of the simulated arms: DH parameters of the MTM, remote centre and wrist axes of the PSM."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context
+
+from dvrk_drake.experiments.reproduction.published import LENGTHS, TableRow
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
+
+#: Of how many poses the rows are found.
+POSES = 20
+
+
+def recomputed_table(arm: Arm) -> tuple[NDArray[np.float64], float]:
+    """Rows (n, 5) sign, offset [rad], d [m], alpha [rad], a [m] from the plant's motion, and the largest error of any
+    transform that they give [m, or as a rotation matrix's entry].
+
+    The frames `paper_0..7` are fixed to the links; how they move against each other is the plant's doing, so a joint
+    that turned about another axis than its row's would show as an error.
+    """
+    plant = make_arm_plant(arm)
+    poses = np.vstack([np.zeros(arm.num_joints), arm.sample_poses(POSES, np.random.default_rng(0))])
+    links = np.array([_transforms(plant, arm, q) for q in poses])
+    rows, worst = [], 0.0
+    for j in range(arm.num_joints):
+        A = links[:, j]
+        theta = np.arctan2(A[:, 1, 0], A[:, 0, 0])
+        sign = float(np.sign(np.median(np.sin(theta[1:] - theta[0]) * np.sin(poses[1:, j]))))
+        offset = float(np.angle(np.mean(np.exp(1j * (theta - sign * poses[:, j])))))
+        alpha = float(np.arctan2(A[0, 2, 1], A[0, 2, 2]))
+        a = float(A[0, :2, 3] @ [np.cos(theta[0]), np.sin(theta[0])])
+        rows.append([sign, offset, float(A[0, 2, 3]), alpha, a])
+        again = np.array([_standard(sign * q + offset, rows[-1][2], alpha, a) for q in poses[:, j]])
+        worst = max(worst, float(np.abs(again - A).max()))
+    table = np.round(rows, 12) + 0.0  # no -0
+    table[:, [1, 3]] = np.where(table[:, [1, 3]] == np.round(-np.pi, 12), np.pi, table[:, [1, 3]])
+    return table, worst
+
+
+def _transforms(plant: MultibodyPlant, arm: Arm, q: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Of each joint, from the table's frame before it to the one behind it (4, 4)."""
+    context = plant.CreateDefaultContext()
+    set_arm_positions(plant, context, arm, q)
+    frames = [plant.GetFrameByName(f"paper_{i}") for i in range(arm.num_joints + 1)]
+    return [behind.CalcPose(context, before).GetAsMatrix4() for before, behind in pairwise(frames)]
+
+
+def _standard(theta: float, d: float, alpha: float, a: float) -> NDArray[np.float64]:
+    """Rz(theta) Tz(d) Tx(a) Rx(alpha) (4, 4)."""
+    c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
+    return np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1.0]])
+
+
+def published_row(row: TableRow) -> NDArray[np.float64]:
+    """(5,) sign, offset [rad], d [m], alpha [rad], a [m] of a row of Table I, with the arm's real lengths."""
+    d, a = ((-1) ** symbol.startswith("-") * LENGTHS[symbol.lstrip("-")] + 0.0 for symbol in (row.d, row.a))
+    return np.array([row.sign, row.offset, d, row.alpha, a])
+
+
+#: Poses at which the mechanism is measured.
+PSM_POSES = 200
+
+
+def mechanism_errors(arm: Arm) -> tuple[float, float]:
+    """Furthest that the shaft's axis ever passes from the remote centre [m], and the least angle between the axes of
+    wrist pitch and wrist yaw [rad], over random poses."""
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    remote, angle = 0.0, np.pi
+    for q in arm.sample_poses(PSM_POSES, np.random.default_rng(0)):
+        set_arm_positions(plant, context, arm, q)
+        point, shaft = _axis(plant, context, "roll")
+        remote = max(remote, float(np.linalg.norm(np.cross(point, shaft))))
+        _, pitch = _axis(plant, context, "wrist_pitch")
+        _, yaw = _axis(plant, context, "wrist_yaw")
+        angle = min(angle, float(np.arccos(min(1.0, abs(float(pitch @ yaw))))))
+    return remote, angle
+
+
+def _axis(plant: MultibodyPlant, context: Context, joint: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A point of a hinge's axis and its direction in the world, whose origin is the remote centre."""
+    hinge = plant.GetJointByName(joint)
+    X_WJ = hinge.frame_on_parent().CalcPoseInWorld(context)
+    return X_WJ.translation(), X_WJ.rotation() @ hinge.revolute_axis()

@@ -1,0 +1,129 @@
+"""What the paper publishes, and what its team's own files say: the numbers that ours stand beside.
+
+`paper_model` makes a model of the paper's twelve parameters, which our controller runs.
+
+Source: Rutfield, Zia, Boos, Santoso, Sujumnong, "Gravity Compensation Control of da Vinci Robot", WPI 2015, and the
+team's repository WPI-AIM/dvrk_gravity_comp. Drifts are read off the team's plots.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.multibody.tree import JacobianWrtVariable
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
+
+#: Real lengths of Table I's symbols [m]; L1 is of no joint's concern and 0 in the SDF.
+LENGTHS = {"0": 0.0, "L1": 0.0, "L2": 0.2794, "L3": 0.3645, "L4": 0.1506}
+
+
+class TableRow(NamedTuple):
+    """A row of Table I: theta = sign q + offset, then d and a as symbols and alpha, in rad."""
+
+    sign: int
+    offset: float
+    d: str
+    alpha: float
+    a: str
+
+
+_QUARTER = np.pi / 2
+TABLE_1 = (
+    TableRow(+1, 0.0, "-L1", -_QUARTER, "0"),
+    TableRow(-1, +_QUARTER, "0", 0.0, "L2"),
+    TableRow(-1, -_QUARTER, "0", +_QUARTER, "L3"),
+    TableRow(+1, 0.0, "L4", -_QUARTER, "0"),
+    TableRow(-1, np.pi, "0", -_QUARTER, "0"),
+    TableRow(+1, -_QUARTER, "0", +_QUARTER, "0"),
+    TableRow(-1, 0.0, "0", 0.0, "0"),
+)
+
+#: The twelve parameters [kg m] in the paper's order, identified with g = 9.9 m/s^2 and used with 9.81.
+PARAMETERS = (0.0414, -0.0192, 0.0328, 0.0095, -0.0033, -0.0003, -0.0071, -0.0188, -0.0015, -0.0003, -0.0001, 0.0005)
+#: The link (from 1) and the axis of its frame of Table I whose first moment each of them is, lumped with others.
+PARAMETER_PLACES = (
+    (2, "x"),
+    (2, "y"),
+    (3, "x"),
+    (4, "y"),
+    (5, "z"),
+    (6, "z"),
+    (4, "x"),
+    (5, "y"),
+    (5, "x"),
+    (6, "x"),
+    (7, "x"),
+    (7, "y"),
+)
+IDENTIFIED_WITH, CONTROLLED_WITH = 9.9, 9.81
+
+#: Fig. 4, mean over the 72 poses [(N m)^2], J2..J7.
+FIGURE_4_MEANS = (8.14e-3, 7.96e-3, 1.97e-3, 4.62e-4, 3.98e-5, 1.92e-5)
+
+#: Final drift [rad], J2..J7: the trials of Fig. 5 and 6, and the mean absolute one of the team's five trials of either.
+FIGURE_5 = (0.0102, 0.0051, -0.0138, -0.174, -0.021, 0.0)
+FIGURE_6 = (0.0101, -0.0099, 0.0050, -0.003, -0.316, -0.071)
+FIGURE_5_MEANS = (0.070, 0.020, 0.0085, 1.29, 0.315, 0.730)
+FIGURE_6_MEANS = (0.013, 0.041, 0.038, 0.491, 0.481, 0.742)
+
+#: Fig. 7: start [rad], gains at 100 Hz (N m/rad, N m s/rad, N m/rad a sample), masses of base and links [kg].
+FIGURE_7_START = (0.0, -0.22, -0.79, 0.0, 3.13, 0.0, 0.0)
+FIGURE_7_KP = (0.5, 0.8, 0.85, 3.7, 0.5, 0.02, 0.006)
+FIGURE_7_KV = (1.95, 0.95, 1.75, 0.2, 0.1, 0.8, 0.08)
+FIGURE_7_KI = (1e-5, 5e-5, 1e-4, 4e-4, 1e-6, 1e-7, 1e-8)
+FIGURE_7_MASSES = (0.9, 1.0, 0.9, 0.8, 0.4, 0.2, 0.2, 0.1)
+#: Of the joints whose damping term got positions.
+FIGURE_7_FAULTY = (4, 5, 6)
+#: Read off Fig. 7: period of J2 [s], |J2| after 59 s, amplitude of J6, of J7 early and late [rad].
+FIGURE_7_READ = {"J2 period": 22.0, "J2 at 59 s": 0.075, "J6": 0.022, "J7 early": 0.0115, "J7 late": 0.0155}
+
+
+#: More poses than parameters, for the change to our base parameters.
+_POSES = 40
+
+
+def paper_torque(arm: Arm, q: ArrayLike, parameters: Sequence[float] = PARAMETERS) -> NDArray[np.float64]:
+    """Torque (m, n) of the paper's twelve parameters [kg m] at poses q (m, n): its equation 8 with g = 9.81 m/s^2.
+
+    Each parameter is the first moment h of one link in its frame of Table I, so P = g sum z . R_i h_i, and
+    dP/dq_j = g sum z . (w_j x R_i h_i), w_j the angular velocity that joint j gives link i.
+    """
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    world = plant.world_frame()
+    tree = [plant.GetJointByName(name).velocity_start() for name in arm.joint_names]
+    torque = np.zeros(np.shape(q))
+    for k, pose in enumerate(np.asarray(q, float)):
+        set_arm_positions(plant, context, arm, pose)
+        for value, (link, axis) in zip(parameters, PARAMETER_PLACES, strict=True):
+            frame = plant.GetFrameByName(f"paper_{link}")
+            h_W = value * frame.CalcPoseInWorld(context).rotation().matrix()[:, "xyz".index(axis)]
+            J = plant.CalcJacobianAngularVelocity(context, JacobianWrtVariable.kV, frame, world, world)
+            # In a serial chain: joints of the linkage's other bars turn none of these links.
+            torque[k] += CONTROLLED_WITH * np.cross(J[:, tree].T, h_W)[:, 2]
+    return torque
+
+
+def paper_model(arm: Arm) -> IdentifiedModel:
+    """The model whose torque is `paper_torque`, in our base parameters: they span the same."""
+    q = arm.sample_poses(_POSES, np.random.default_rng(0))
+    model = IdentifiedModel.from_arm(arm)
+    Y = model.static_model.regressor(q)
+    beta = np.linalg.lstsq(Y.reshape(-1, Y.shape[2]), paper_torque(arm, q).ravel(), rcond=None)[0]
+    parameters = [
+        dataclasses.replace(p, value=float(value)) for p, value in zip(model.base_parameters, beta, strict=True)
+    ]
+    return dataclasses.replace(model, base_parameters=parameters)
+
+
+def with_zeroed(model: IdentifiedModel, joints: Sequence[int]) -> IdentifiedModel:
+    """The model with no torque on `joints` (from 0), as the paper's Fig. 6 has it."""
+    statistics = [dataclasses.replace(s, trust=0.0) if j in joints else s for j, s in enumerate(model.joints)]
+    return dataclasses.replace(model, joints=statistics)

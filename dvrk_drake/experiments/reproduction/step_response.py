@@ -1,0 +1,135 @@
+"""Fig. 7: a simulated MTM is told to go to zero, by the paper's controller and by ours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
+from dvrk_drake.experiments.reproduction import published
+from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM
+from dvrk_drake.export.sdf import to_text, with_inertias
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, tree_selector
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.closed_loop import add_closed_loop
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+
+#: Watched for so long [s]: the paper's, ours.
+DURATION, OUR_DURATION = 60.0, 10.0
+#: Between two samples of the paper's controller, which is also how often we look [s].
+PERIOD = 0.01
+#: What the paper's model gives each link about each axis [kg m^2]: its PSM's file says so, and the period of its J2.
+LINK_INERTIA = 1.0
+#: Of what the paper's chain does not have [kg, kg m^2]: the bars and rotors of the linkage.
+_NOTHING = 1e-6
+
+
+def paper_simulated_arm(arm: Arm, path: Path) -> Arm:
+    """The arm with the paper's point masses at the joints; writes its SDF."""
+    plant = make_arm_plant(arm)
+    carried = [plant.GetJointByName(name).child_body().name() for name in arm.joint_names]
+    links = []
+    for link in link_inertias(arm):
+        mass, inertia = _NOTHING, _NOTHING
+        if link.link in carried:
+            mass, inertia = published.FIGURE_7_MASSES[1 + carried.index(link.link)], LINK_INERTIA
+        links.append(LinkInertia(link.link, np.array([mass, 0, 0, 0, inertia, inertia, inertia, 0, 0, 0])))
+    with atomic_write(path) as stream:
+        stream.write(to_text(with_inertias(arm, links), "The paper's simulated MTM: point masses at the joints."))
+    return replace(arm, sdf=(str(path.resolve()),))
+
+
+def simulate_paper_controller(
+    arm: Arm, duration: float, faulty: bool, progress: Callable[[float], None] = lambda share: None
+) -> NDArray[np.float64]:
+    """q (samples, n) every `PERIOD` under the paper's equation 11, with its node's fault or without.
+
+    Joints 6 and 7 start at their published amplitudes: the rest of the start lies in a plane and never moves them, as
+    whatever disturbed Gazebo did.
+    """
+    plant = make_arm_plant(arm)
+    simulator = Simulator(plant)
+    context = simulator.get_mutable_context()
+    tree = tree_selector(plant, arm)
+    own = tree[[arm.tree_joint_names.index(name) for name in arm.joint_names]]
+    kp, kv, ki = map(np.array, (published.FIGURE_7_KP, published.FIGURE_7_KV, published.FIGURE_7_KI))
+    total, force = np.zeros(arm.num_joints), np.zeros(plant.num_velocities())
+    port = plant.get_applied_generalized_force_input_port()
+    start = np.array(published.FIGURE_7_START)
+    start[5:] = published.FIGURE_7_READ["J6"], published.FIGURE_7_READ["J7 early"]
+    set_arm_positions(plant, context, arm, start)
+    samples = round(duration / PERIOD) + 1
+    q = np.empty((samples, arm.num_joints))
+    for k in range(samples):
+        q[k] = plant.GetPositions(context)[own]
+        v = plant.GetVelocities(context)[own]
+        if faulty:
+            v[list(published.FIGURE_7_FAULTY)] = q[k, list(published.FIGURE_7_FAULTY)]
+        total -= q[k]
+        force[own] = _gravity(plant, simulator, arm) - kp * q[k] - kv * v + ki * total
+        port.FixValue(context, force)
+        if k + 1 < samples:
+            simulator.AdvanceTo((k + 1) * PERIOD)
+        if k % 100 == 0:
+            progress(k / samples)
+    return q
+
+
+def simulate_ours(true_arm: Arm, model: IdentifiedModel, duration: float) -> NDArray[np.float64]:
+    """q (samples, n) every `PERIOD` under gravity compensation and PID, with all effects but the stops."""
+    arm = load_arm(PAPER_ARM)
+    station = ArmStation(arm, plant_arm=true_arm, effects=true_arm.effects.without("stops"))
+    builder = DiagramBuilder()
+    controller = GravityPidController(model)
+    add_closed_loop(builder, station, controller, ConstantVectorSource(np.zeros(2 * arm.num_joints)))
+    log = LogVectorOutput(station.GetOutputPort(f"{PAPER_ARM}.state_true"), builder, PERIOD)
+    simulator = Simulator(builder.Build())
+    context = simulator.get_mutable_context()
+    station.set_positions(station.GetMyMutableContextFromRoot(context), published.FIGURE_7_START)
+    simulator.AdvanceTo(duration)
+    positions: NDArray[np.float64] = log.FindLog(context).data()[: arm.num_joints].T
+    return positions.copy()
+
+
+def _gravity(plant: MultibodyPlant, simulator: Simulator, arm: Arm) -> NDArray[np.float64]:
+    return holding_torque(plant, simulator.get_context(), arm)
+
+
+def swings(arm: Arm, faulty: bool) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """The arm about zero under the paper's gains, its node's fault or velocities in all damping terms; no integral.
+
+    Returns:
+        Eigenvalues (k,) [1/s] with positive imaginary part, and the joints' parts (n, k) of their eigenvectors.
+    """
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    set_arm_positions(plant, context, arm, np.zeros(arm.num_joints))
+    tree, G = tree_selector(plant, arm), arm.linkage.matrix
+    M = G.T @ plant.CalcMassMatrix(context)[np.ix_(tree, tree)] @ G
+    K, D = np.diag(published.FIGURE_7_KP), np.diag(published.FIGURE_7_KV)
+    if faulty:
+        wrist = list(published.FIGURE_7_FAULTY)
+        K[wrist] += D[wrist]
+        D[wrist] = 0.0
+    zero, one = np.zeros_like(M), np.eye(len(M))
+    values, vectors = np.linalg.eig(np.block([[zero, one], [-np.linalg.solve(M, K), -np.linalg.solve(M, D)]]))
+    use = values.imag > 1e-6
+    return values[use], vectors[: len(M), use]
+
+
+def slowest_swing(arm: Arm) -> float:
+    """Longest period [s] of a swing that moves joint 2, with the fault."""
+    values, vectors = swings(arm, faulty=True)
+    moves = np.abs(vectors[1]) > 0.1 * np.abs(vectors).max(axis=0)
+    return float(2 * np.pi / values.imag[moves].min())

@@ -1,0 +1,161 @@
+"""Simulated arms that no controller has a model of, and poses collected on them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from concurrent.futures import Executor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
+from dvrk_drake.dynamics.model_links import model_bodies
+from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM
+from dvrk_drake.experiments.static_pose_collection import collect_static_poses
+from dvrk_drake.export.sdf import to_text, with_inertias
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.coupled_limits import beside
+from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.files import atomic_write
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.systems.arm_station import ArmStation
+
+#: How much heavier or lighter than drawn a link is, where nothing better is known.
+SPREAD = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class KnownTruth:
+    """An arm with all effects of a real one, and what holds it.
+
+    Attributes:
+        arm: to simulate; its SDF is a file of the output folder, its `effects` are the real arm's.
+        model: the torque that holds it against gravity, cables and springs; for judging, never for a controller.
+        is_the_papers: it is the arm that the paper's parameters are of.
+        origin: where it comes from, a sentence.
+    """
+
+    arm: Arm
+    model: IdentifiedModel
+    is_the_papers: bool
+    origin: str
+
+
+def paper_arm(recording: Recording, folder: Path) -> KnownTruth:
+    """The paper's own MTM, as its recording shows it to a robust identification; writes its SDF into `folder`.
+
+    Its links are the possible bodies nearest to our SDF's that have the identified gravity, its cables and springs are
+    the identified effects. Friction, stops, encoders, motors and delays are those of `mechanisms/mtm.yaml`: no
+    recording of this arm shows them. Friction that is larger towards one side leaves a constant torque in poses: where
+    the arm has such friction, an identified offset is not there a second time.
+
+    Raises:
+        RecordingError, IdentificationError, ModelError: the recording is not of an MTM at rest.
+    """
+    arm = load_arm(PAPER_ARM)
+    model = identify_static(recording, arm).model
+    one_sided = {law.coordinate for law in arm.effects.friction if law.kind == "presliding forward"}
+    lasting = [e for e in model.effects if not (e.kind == "offset" and _at_actuator(e.coordinate) in one_sided)]
+    statistics = [dataclasses.replace(joint, trust=1.0) for joint in model.joints]
+    model = dataclasses.replace(model, joints=statistics, effects=lasting)
+    laws = [DriveEffect(e.coordinate, e.kind, e.scale, e.value) for e in model.effects]
+    effects = dataclasses.replace(arm.effects, cables=laws, springs=[])
+    true_arm = _with_links(arm, model_bodies(model).links, folder / "true_mtm.sdf", "the paper's recording")
+    origin = (
+        "The true arm is the paper's MTM as our identification sees it in the paper's 72 poses (gravity, cables, "
+        "springs), with the friction, stops, encoders, motors and delays of `mechanisms/mtm.yaml`, which are "
+        "another MTM's. Joint 6 shows no torque in that recording beyond friction, and joint 7 a constant one, "
+        "which is what its friction leaves, larger towards one side: there the true arm has less to compensate than "
+        "the real one seems to have had."
+    )
+    return KnownTruth(dataclasses.replace(true_arm, effects=effects), model, True, origin)
+
+
+def _at_actuator(coordinate: str) -> str:
+    return "actuator." + coordinate.partition(".")[2]
+
+
+def unlike_its_drawing(name: str, folder: Path, seed: int) -> KnownTruth:
+    """An arm whose links are each up to `SPREAD` heavier or lighter than the SDF's; writes its SDF into `folder`.
+
+    An MTM has no wrist spring then: the identified spring balances an identified wrist, which is heavier than the
+    SDF's, and would exceed the motor's torque at a sixth of all poses.
+    """
+    arm = load_arm(name)
+    generator = np.random.default_rng(seed)
+    links = [
+        LinkInertia(link.link, link.parameters * generator.uniform(1 - SPREAD, 1 + SPREAD))
+        for link in link_inertias(arm)
+    ]
+    true_arm = _with_links(arm, links, folder / f"true_{name}.sdf", "no arm: each link's mass is drawn at random")
+    if name == PAPER_ARM:
+        true_arm = dataclasses.replace(true_arm, effects=arm.effects.without("springs"))
+    effects = [
+        ActuatorEffectEstimate(law.coordinate, law.kind, law.scale, law.coefficient)
+        for law in [*true_arm.effects.cables, *true_arm.effects.springs]
+    ]
+    model = dataclasses.replace(IdentifiedModel.from_arm(true_arm), arm=arm.source, effects=effects)
+    origin = (
+        f"The true arm is the SDF's with links that are each up to {100 * SPREAD:.0f} % heavier or lighter (drawn with "
+        f"seed {seed}), and the effects of `mechanisms/`: friction, cables, encoders, motors, delays."
+    )
+    return KnownTruth(true_arm, model, False, origin)
+
+
+def _with_links(arm: Arm, links: list[LinkInertia] | tuple[LinkInertia, ...], path: Path, origin: str) -> Arm:
+    with atomic_write(path) as stream:
+        stream.write(to_text(with_inertias(arm, links), f"{arm.name}, inertial parameters of {origin}."))
+    return dataclasses.replace(arm, sdf=(str(path.resolve()),))
+
+
+#: From how far on either side a pose is approached, so that dry friction cancels [rad], [m].
+APPROACH = 0.2, 0.02
+#: Free at both ends of each range, as a share of it; and how far a handle is turned that turns more than twice [rad].
+MARGIN, REACH = 0.05, 1.6
+#: Poses that are collected in one go.
+_CHUNK = 10
+
+
+def collect(
+    truth: KnownTruth,
+    name: str,
+    count: int,
+    seed: int,
+    executor: Executor,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Recording:
+    """`count` poses of a true arm with all its effects, each approached from both sides and averaged.
+
+    The controller that leads it knows what the SDF says. Chunks of poses run at once on the executor's workers, each
+    from a start of its own, with noise of its own; the result does not depend on the workers.
+    """
+    arm = load_arm(name)
+    poses = arm.sample_poses(count, np.random.default_rng(seed), margin=MARGIN)
+    wide = (arm.position_upper - arm.position_lower > 4 * np.pi) & ~arm.prismatic
+    poses[:, wide] = np.clip(poses[:, wide], -REACH, REACH)
+    chunks = np.array_split(poses, -(-count // _CHUNK))
+    futures = [executor.submit(_collect_chunk, name, truth.arm, c, seed + i) for i, c in enumerate(chunks)]
+    for done, _ in enumerate(as_completed(futures), 1):
+        progress(done / len(futures))
+    rows = np.concatenate([future.result() for future in futures])
+    q, tau = np.split(rows, 2, axis=1)
+    return Recording(q=q, tau=tau, source=f"{count} poses of the simulated {arm.name}")
+
+
+def _collect_chunk(name: str, true_arm: Arm, poses: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+    """(m, 2n) means of q and tau over both sides."""
+    arm = load_arm(name)
+    offset = arm.per_joint(*APPROACH)
+    visited = np.concatenate([[beside(arm, q, -offset), q, beside(arm, q, offset), q] for q in poses])
+    station = ArmStation(arm, plant_arm=true_arm, effects=true_arm.effects, seed=seed)
+    generator = np.random.default_rng(seed)
+    nominal = IdentifiedModel.from_arm(arm)
+    recording = collect_static_poses(station, nominal, visited, effort_noise=0.0, generator=generator)
+    rows = np.hstack([recording.q, recording.measured_effort()])
+    return (rows[1::4] + rows[3::4]) / 2

@@ -1,0 +1,252 @@
+"""What to simulate: the schema of a scenario, and what of it makes no sense; `scenario_file` reads it.
+
+No postponed annotations here: yaml_load_typed reads the types at run time.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
+from dvrk_drake.dynamics.arm_frame import ArmFrame
+from dvrk_drake.dynamics.friction_compensation import LARGEST_HYSTERESIS_RATIO, LARGEST_RATIO
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ArmError, ScenarioError
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm_schema import GRAVITIES, Gains
+from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
+from dvrk_drake.models.loop_closure import Closure
+from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.systems.gravity_pid_controller import Mode
+from dvrk_drake.systems.hand import Grip
+
+#: Longest simulation [s] and finest recording that are taken for meant.
+LONGEST, LEAST_SAMPLE_PERIOD = 3600.0, 1e-3
+#: Positions; `check_pose` has the limits of the arm.
+_POSITIONS = within(-1e4, 1e4, "rad or m")
+_GRIP = {grip.name: grip for grip in dataclasses.fields(Grip)}
+
+
+@dataclass
+class ControllerScenario:
+    """`mode` is "hold", "gravity" or "damped"; `model` the file of an identified model, or empty for
+    what the SDF states.
+
+    `gains` replaces the arm's own (kp, kd, ki: one number a joint; in a file also the name of a file of gains).
+    `friction_ratio` is the share of the friction that the arm's files state which is compensated, and
+    `hysteresis_ratio` that of the part that springs back, see `check_ratios`; in mode "gravity" only.
+    `parameter_error` makes the model wrong: each of its base parameters is multiplied by a factor of its own from
+    1 - `parameter_error`..1 + `parameter_error`, drawn by the scenario's seed. `knows` names those of "cables" and
+    "springs" of the arm's own effects that the model has beside the SDF; not for a model from a file.
+    """
+
+    mode: str = "hold"
+    model: str = ""
+    knows: list[str] = field(default_factory=list)
+    gains: Gains | None = None
+    friction_ratio: float = field(default=0.0, metadata=within(0.0, LARGEST_RATIO))
+    hysteresis_ratio: float = field(default=0.0, metadata=within(0.0, LARGEST_HYSTERESIS_RATIO))
+    parameter_error: float = field(default=0.0, metadata=within(0.0, 1.0))
+
+
+@dataclass
+class Target:
+    """At `time` [s] the arm is wanted at rest at `pose` [rad, m], one number a joint."""
+
+    time: float = field(default=0.0, metadata=within(0.0, LONGEST, "s"))
+    pose: list[float] = field(default_factory=list, metadata=_POSITIONS)
+
+
+@dataclass
+class HandScenario:
+    """A person who takes the arm at `frame` and pulls it about, as firmly as the numbers say: see `systems.hand`.
+
+    The hand goes where the frame is while the joints pass the poses of `path` at their times; it holds on from the
+    first to the last. Empty: nobody touches the arm. `frame` is one of the arm's SDF: an MTM's handle is dh_7, a PSM's
+    instrument dh_6.
+    """
+
+    path: list[Target] = field(default_factory=list)
+    frame: str = "dh_7"
+    stiffness: float = field(default=Grip.stiffness, metadata=_GRIP["stiffness"].metadata)
+    damping: float = field(default=Grip.damping, metadata=_GRIP["damping"].metadata)
+    rotational_stiffness: float = field(
+        default=Grip.rotational_stiffness, metadata=_GRIP["rotational_stiffness"].metadata
+    )
+    rotational_damping: float = field(default=Grip.rotational_damping, metadata=_GRIP["rotational_damping"].metadata)
+    max_force: float = field(default=Grip.max_force, metadata=_GRIP["max_force"].metadata)
+    max_torque: float = field(default=Grip.max_torque, metadata=_GRIP["max_torque"].metadata)
+
+    @property
+    def grip(self) -> Grip:
+        """How firmly it holds."""
+        return Grip(**{f.name: getattr(self, f.name) for f in dataclasses.fields(Grip)})
+
+
+@dataclass
+class Scenario:
+    """Schema of a scenario file. One scenario gives one result, bit for bit.
+
+    Attributes:
+        arm: name, or path of an arm's YAML file; paths are relative to the folder that the command runs in.
+        closure: how the linkage's loops are held: "ball" or "mimic".
+        gravity: (3,) in the base frame [m/s^2]; the arm's own if left out.
+        time_step: of the plant and period of the controller [s].
+        duration: of the simulation [s].
+        sample_period: of the recording [s].
+        controller: what drives the arm.
+        start: pose at the start, at rest; zero, or the nearest pose inside the limits, if left out.
+        targets: where the arm shall be when; before, between and after them it is at rest at each. Mode "hold" only.
+        hand: a person who moves the arm.
+        effects: more of them in the drive of the simulated arm, of position alone; the controller does not know them.
+        stretch: actuator -> cable of the simulated arm that stretches, beside those of `real_arm`.
+        real_arm: parts of the arm's own `effects` that the simulation has, by name; ["all"] for all of them.
+        effort_noise: standard deviation of recorded efforts, as a share of the effort limits.
+        seed: of all noise, and of the controller's parameter error.
+    """
+
+    arm: str = ""
+    closure: str = "ball"
+    gravity: list[float] | None = field(default=None, metadata=GRAVITIES)
+    time_step: float = field(default=1e-3, metadata=within(1e-5, 0.01, "s"))
+    duration: float = field(default=5.0, metadata=within(LEAST_SAMPLE_PERIOD, LONGEST, "s"))
+    sample_period: float = field(default=0.01, metadata=within(LEAST_SAMPLE_PERIOD, LONGEST, "s"))
+    controller: ControllerScenario = field(default_factory=ControllerScenario)
+    start: list[float] | None = field(default=None, metadata=_POSITIONS)
+    targets: list[Target] = field(default_factory=list)
+    hand: HandScenario = field(default_factory=HandScenario)
+    effects: list[DriveEffect] = field(default_factory=list)
+    stretch: dict[str, Cable] = field(default_factory=dict)
+    real_arm: list[str] = field(default_factory=list)
+    effort_noise: float = field(default=0.0, metadata=within(0.0, 1.0))
+    seed: int = field(default=0, metadata=within(0, 2**63 - 1))
+
+    @cached_property
+    def mounted_arm(self) -> Arm:
+        """The arm, with gravity from where the scenario says."""
+        arm = load_arm(self.arm)
+        return arm if self.gravity is None else arm.with_gravity(self.gravity)
+
+    @cached_property
+    def model(self) -> IdentifiedModel:
+        """What the controller believes."""
+        file, error = self.controller.model, self.controller.parameter_error
+        known = [effect for part in self.controller.knows for effect in getattr(self.mounted_arm.effects, part)]
+        model = IdentifiedModel.load(file) if file else IdentifiedModel.from_arm(self.mounted_arm, known)
+        if error == 0.0:
+            return model
+        # A stream of its own: the seed alone is the noise's.
+        generator = np.random.default_rng([self.seed, 1])
+        return model.with_scaled_parameters(generator.uniform(1 - error, 1 + error, len(model.base_parameters)))
+
+    @property
+    def all_effects(self) -> ArmEffects | None:
+        """What the simulated arm has beside its links: `real_arm`, `effects` and `stretch`; None if there is nothing.
+
+        Raises:
+            ArmError: a name that is no part.
+        """
+        if not (self.real_arm or self.effects or self.stretch):
+            return None
+        own = self.mounted_arm.effects.only(self.real_arm)
+        return own.joined(ArmEffects(cables=self.effects, stretch=self.stretch))
+
+    def knots(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Times (m,) and poses (m, n) that the arm shall rest at: the start, then the targets."""
+        arm = self.mounted_arm
+        home = np.clip(0.0, arm.position_lower, arm.position_upper)
+        poses = [home if self.start is None else self.start, *(target.pose for target in self.targets)]
+        return np.array([0.0, *(target.time for target in self.targets)]), np.array(poses, float)
+
+    def check(self) -> None:
+        """Refuses what cannot be simulated.
+
+        Raises:
+            ScenarioError: names the field, its value, and what is allowed.
+            ArmError, ModelError: the arm or the controller's model cannot be loaded.
+        """
+        if not self.arm:
+            raise ScenarioError("arm is missing; give an arm's name, or the path of its YAML file")
+        arm = self.mounted_arm
+        _check_choice("closure", self.closure, get_args(Closure))
+        _check_choice("controller.mode", self.controller.mode, get_args(Mode))
+        if fault := number_fault(self):
+            raise ScenarioError(fault)
+        if self.duration < self.sample_period:
+            raise ScenarioError(f"duration is {self.duration:g}; allowed: {self.sample_period:g}..{LONGEST:g} s")
+        try:
+            arm.effects.only(self.real_arm)
+            ArmEffects(stretch=self.stretch).check(arm.joint_names)
+        except ArmError as error:
+            raise ScenarioError(f"simulated arm: {error}") from error
+        if self.start is not None:
+            check_pose("start", self.start, arm)
+        self._check_targets("targets", self.targets, 0.0)
+        self._check_targets("hand.path", self.hand.path, -1.0)
+        self._check_hand()
+        for part in self.controller.knows:
+            _check_choice("controller.knows", part, ("cables", "springs"))
+        if self.controller.knows and self.controller.model:
+            raise ScenarioError("controller.knows is of a model from the arm's files; controller.model names another")
+        if (gains := self.controller.gains) and (fault := arm.gains_fault(gains)):
+            raise ScenarioError(f"controller.{fault}")
+        for name in ("friction_ratio", "hysteresis_ratio"):
+            if getattr(self.controller, name) and self.controller.mode != "gravity":
+                raise ScenarioError(f'controller.{name} needs mode "gravity"; it is "{self.controller.mode}"')
+        if self.targets and self.controller.mode != "hold":
+            raise ScenarioError(f'targets need controller.mode "hold"; it is "{self.controller.mode}"')
+        for i, effect in enumerate(self.effects):
+            law = ActuatorEffect(effect.coordinate, effect.kind, effect.scale)
+            if fault := effect_fault(arm, law, POSITION_KINDS):
+                raise ScenarioError(f"effects[{i}].{fault}")
+        if self.model.load_arm().name != arm.name:
+            raise ScenarioError(f"controller.model {self.controller.model} is of {self.model.arm}, not of {self.arm}")
+
+    def _check_targets(self, name: str, targets: list[Target], after: float) -> None:
+        for i, target in enumerate(targets):
+            check_pose(f"{name}[{i}].pose", target.pose, self.mounted_arm)
+            if not after < target.time <= self.duration:
+                earliest = "0 s or later" if after < 0 else f"after {after:g} s"
+                raise ScenarioError(
+                    f"{name}[{i}].time = {target.time:g} s must be {earliest} and at most the duration, "
+                    f"{self.duration:g} s"
+                )
+            after = target.time
+
+    def _check_hand(self) -> None:
+        if not self.hand.path:
+            return
+        ArmFrame(self.mounted_arm, self.hand.frame)
+        if len(self.hand.path) < 2:
+            raise ScenarioError("hand.path needs two poses or more: from when to when the hand holds on")
+
+
+def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
+    if value not in allowed:
+        raise ScenarioError(f'{name} is "{value}"; allowed: {", ".join(allowed)}')
+
+
+def check_pose(name: str, pose: list[float], arm: Arm) -> None:
+    """Refuses a pose that `arm` cannot take; `name` begins the message.
+
+    Raises:
+        ScenarioError: not n finite numbers, or outside the limits.
+    """
+    n, q = arm.num_joints, np.array(pose, float)
+    if len(q) != n:
+        raise ScenarioError(
+            f"{name} has {len(q)} number{'s' * (len(q) != 1)}; {arm.name} has {n} joints: {', '.join(arm.joint_names)}"
+        )
+    if not np.all(np.isfinite(q)):
+        raise ScenarioError(f"{name} must be finite numbers; got {q.tolist()}")
+    if violations := arm.limit_violations(q, 1e-9):
+        message = f"{name}: {'; '.join(violations)} [rad, m] of {arm.name}"
+        far = arm.prismatic & (np.abs(q) > 2 * arm.position_upper)
+        if np.any(far) and np.all(np.abs(q[far]) / 1000 <= arm.position_upper[far]):
+            message += f"; is {arm.joint_names[int(np.argmax(far))]} in mm? It must be in m"
+        raise ScenarioError(message)

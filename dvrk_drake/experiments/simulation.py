@@ -1,0 +1,158 @@
+"""Runs a scenario: an arm under control, simulated and recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Meshcat
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
+
+from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
+from dvrk_drake.experiments.scenario import Scenario
+from dvrk_drake.models.loop_closure import Closure
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.closed_loop import add_closed_loop
+from dvrk_drake.systems.friction_compensator import FrictionCompensator
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
+from dvrk_drake.systems.hand import Hand
+from dvrk_drake.systems.hand_path import HandPath
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """What a scenario gave.
+
+    Attributes:
+        recording: t, q, qd, tau (m, n) as the arm measures them: exact without `real_arm`, but for the scenario's noise
+            on tau.
+        state_true: (m, 2n) q, then v as they are.
+        hand: (m, 6) torque [N m], then force [N] of the hand on the arm at the frame that it holds, in the base; zeros
+            without one.
+        desired: (m, n) where the arm was wanted; None but in "hold" mode.
+    """
+
+    recording: Recording
+    state_true: NDArray[np.float64]
+    hand: NDArray[np.float64]
+    desired: NDArray[np.float64] | None
+
+    @property
+    def time(self) -> NDArray[np.float64]:
+        """(m,) of the recording's samples [s]."""
+        assert self.recording.t is not None
+        return self.recording.t
+
+
+def simulate(
+    scenario: Scenario, meshcat: Meshcat | None = None, progress: Callable[[float], None] = lambda share: None
+) -> Simulation:
+    """Simulates and records; the same scenario gives the same numbers, bit for bit.
+
+    Between two poses the arm is led along a cubic in time, straight in joint space, so it stays inside linear limits.
+
+    Args:
+        scenario: what to do.
+        meshcat: draws the arm there, in real time, and has the recording at the end.
+        progress: called with the finished share, 0..1.
+
+    Raises:
+        ScenarioError: the scenario asks for what cannot be simulated.
+    """
+    scenario.check()
+    arm = scenario.mounted_arm
+    name = arm.name.lower()
+    times, poses = scenario.knots()
+    holds = scenario.controller.mode == "hold"
+    station = ArmStation(
+        arm,
+        closure=cast(Closure, scenario.closure),
+        time_step=scenario.time_step,
+        meshcat=meshcat,
+        effects=scenario.all_effects,
+        seed=scenario.seed,
+    )
+    controller = GravityPidController(
+        scenario.model,
+        period=scenario.time_step,
+        gains=scenario.controller.gains,
+        mode=cast(Mode, scenario.controller.mode),
+    )
+    trajectory = _trajectory(times, poses, scenario.duration)
+    desired = TrajectorySource(trajectory, output_derivative_order=1) if holds else None
+    builder = DiagramBuilder()
+    add_closed_loop(builder, station, controller, desired, friction=_friction(scenario))
+    hand = _add_hand(builder, station, scenario)
+    simulator = Simulator(builder.Build())
+    context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    station.set_positions(context, poses[0])
+    if meshcat is not None:
+        simulator.set_target_realtime_rate(1.0)
+        meshcat.StartRecording()
+
+    samples = 1 + int(scenario.duration / scenario.sample_period + 1e-9)
+    t = scenario.sample_period * np.arange(samples, dtype=np.float64)
+    names = ("state_estimated", "effort_measured", "state_true")
+    sources = [(station.GetOutputPort(f"{name}.{port}"), context) for port in names]
+    if hand is not None:
+        sources.append((hand.GetOutputPort("spatial_force"), hand.GetMyContextFromRoot(simulator.get_context())))
+    rows = []
+    simulator.Initialize()
+    for sample in t:
+        if sample > 0:  # AdvanceTo(0) would make the plant's first step already
+            simulator.AdvanceTo(sample)
+        rows.append(np.concatenate([port.Eval(of) for port, of in sources]))
+        progress(sample / scenario.duration)
+    if meshcat is not None:
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+    n = arm.num_joints
+    q, qd, tau, state_true, hand_force = np.split(np.array(rows), [n, 2 * n, 3 * n, 5 * n], axis=1)
+    noise = np.random.default_rng(scenario.seed).normal(size=tau.shape)
+    tau = tau + scenario.effort_noise * arm.effort_limits * noise
+    recording = Recording(q=q, qd=qd, tau=tau, t=t, source="simulation")
+    if hand is None:
+        hand_force = np.zeros((samples, 6))
+    return Simulation(recording, state_true, hand_force, trajectory.vector_values(t).T if holds else None)
+
+
+def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration: float) -> PiecewisePolynomial:
+    """At rest at each pose at its time, and at the last one until the end."""
+    times, poses = np.append(times, max(duration, times[-1]) + 1.0), np.vstack([poses, poses[-1:]])
+    return PiecewisePolynomial.CubicHermite(times, poses.T, np.zeros_like(poses.T))
+
+
+def _friction(scenario: Scenario) -> FrictionCompensator | None:
+    wanted = scenario.controller
+    if not (wanted.friction_ratio or wanted.hysteresis_ratio):
+        return None
+    return FrictionCompensator(
+        Friction.of_arm(scenario.mounted_arm),
+        ratio=wanted.friction_ratio,
+        hysteresis_ratio=wanted.hysteresis_ratio,
+        holding_error=holding_error(scenario.model),
+        period=scenario.time_step,
+    )
+
+
+def _add_hand(builder: DiagramBuilder, station: ArmStation, scenario: Scenario) -> Hand | None:
+    path, frame, arm = scenario.hand.path, scenario.hand.frame, scenario.mounted_arm
+    if not path:
+        return None
+    poses = np.array([target.pose for target in path])
+    times = [target.time for target in path]
+    way = PiecewisePolynomial.CubicHermite(times, poses.T, np.zeros_like(poses.T))
+    hand = builder.AddNamedSystem("hand", Hand(arm, frame, scenario.hand.grip, scenario.time_step))
+    wants = builder.AddNamedSystem("hand_path", HandPath(arm, frame, way))
+    builder.Connect(wants.get_output_port(), hand.GetInputPort("X_BG_desired"))
+    name = arm.name.lower()
+    builder.Connect(station.GetOutputPort(f"{name}.state_true"), hand.GetInputPort("state_estimated"))
+    builder.Connect(hand.GetOutputPort("effort_disturbance"), station.GetInputPort(f"{name}.effort_disturbance"))
+    return hand

@@ -1,0 +1,211 @@
+"""What to run many times, as a file: the schema of a study, read strictly, and the cases that it asks for.
+
+No postponed annotations here: yaml_load_typed reads the types at run time.
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from xml.etree.ElementTree import tostring
+
+import numpy as np
+from pydrake.common.yaml import yaml_dump_typed
+
+from dvrk_drake.errors import DvrkDrakeError, StudyError
+from dvrk_drake.experiments.scenario import Scenario, check_pose
+from dvrk_drake.experiments.scenario_file import load_scenario
+from dvrk_drake.experiments.study.measures import Measure
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.sdf_model import compose_sdf
+from dvrk_drake.models.typed_yaml import load_typed_yaml
+
+#: The columns of the results beside start and measures.
+RESERVED = ("study", "case", "variation", "pose", "seed", "error")
+
+
+@dataclass
+class RandomPoses:
+    """`count` poses, uniform in the joint box and inside the coupled limits; see `Arm.sample_poses`."""
+
+    count: int = field(default=0, metadata=within(1, 10**6))
+    seed: int = field(default=0, metadata=within(0, 2**63 - 1))
+    margin: float = field(default=0.0, metadata=within(0.0, 0.49))
+
+
+@dataclass
+class Variation:
+    """The scenario changed by settings "key=value", under a name."""
+
+    name: str = ""
+    set: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run: number `index` from 0, of a `variation`, from the `start` that is pose number `pose` from 0.
+
+    `seed` is what the scenario gets.
+    """
+
+    index: int
+    variation: str
+    pose: int
+    seed: int
+    start: tuple[float, ...]
+
+
+@dataclass
+class Study:
+    """Schema of a study file: a scenario over poses, seeds and variations. One study gives one table of results.
+
+    Attributes:
+        scenario: name of an arm, or path of a scenario's YAML file, relative to the folder that the command runs in.
+        set: settings "key=value" of the scenario, as `dvrk-drake simulate --set` takes them.
+        poses: where the arm starts, one list of n numbers [rad, m] each; the scenario's own start if left out.
+        random_poses: as many random ones, instead of `poses`.
+        seeds: each pose is run with each of them. A run's own seed is drawn from it and the pose's number, so that
+            runs are independent; variations share it, so that they differ in nothing else.
+        variations: each is run from each pose with each seed; the scenario as it is if left out.
+        measures: what is computed of each run.
+    """
+
+    scenario: str = ""
+    set: list[str] = field(default_factory=list)
+    poses: list[list[float]] = field(default_factory=list, metadata=within(-1e4, 1e4, "rad or m"))
+    random_poses: RandomPoses | None = None
+    seeds: list[int] = field(default_factory=lambda: [0], metadata=within(0, 2**63 - 1))
+    variations: list[Variation] = field(default_factory=lambda: [Variation("as stated")])
+    measures: list[Measure] = field(default_factory=list)
+
+    @cached_property
+    def scenarios(self) -> dict[str, Scenario]:
+        """Variation -> its scenario, start and seed apart.
+
+        Raises:
+            ScenarioError: a setting that a scenario refuses.
+        """
+        return {v.name: load_scenario(self.scenario, [*self.set, *v.set]) for v in self.variations}
+
+    @property
+    def arm(self) -> Arm:
+        """What is simulated."""
+        return next(iter(self.scenarios.values())).mounted_arm
+
+    @cached_property
+    def cases(self) -> tuple[Case, ...]:
+        """All runs; those of one pose follow each other, so that a part of a study is a smaller study."""
+        starts = self._starts()
+        runs = [(k, seed, v.name) for k in range(len(starts)) for seed in self.seeds for v in self.variations]
+        return tuple(Case(i, v, k, _seed_of_run(seed, k), tuple(starts[k])) for i, (k, seed, v) in enumerate(runs))
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Differs between studies whose results may differ: of all inputs, files included, and of versions."""
+        content = {
+            "versions": versions(),
+            "scenarios": {name: dataclasses.asdict(scenario) for name, scenario in self.scenarios.items()},
+            "models": [yaml_dump_typed(scenario.model) for scenario in self.scenarios.values()],
+            "arms": [dataclasses.asdict(scenario.mounted_arm) for scenario in self.scenarios.values()],
+            "sdf": [
+                tostring(compose_sdf(scenario.mounted_arm.sdf, scenario.mounted_arm.mirrored_links), "unicode")
+                for scenario in self.scenarios.values()
+            ],
+            "cases": [dataclasses.astuple(case) for case in self.cases],
+            "measures": [dataclasses.asdict(measure) for measure in self.measures],
+        }
+        text = json.dumps(content, default=lambda array: array.tolist())
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    def scenario_of(self, case: Case) -> Scenario:
+        """What `dvrk-drake simulate` would be given to repeat a case."""
+        scenario = self.scenarios[case.variation]
+        controller = scenario.controller
+        if controller.model:  # workers may have another working folder
+            controller = dataclasses.replace(controller, model=os.path.realpath(controller.model))
+        arm = scenario.mounted_arm.source
+        return dataclasses.replace(scenario, arm=arm, controller=controller, start=list(case.start), seed=case.seed)
+
+    def check(self) -> None:
+        """Refuses what cannot be run, before anything runs.
+
+        Raises:
+            StudyError: names the field, its value, and what is allowed.
+            ScenarioError, ArmError, ModelError: the scenario, with the settings of a variation or from a pose.
+        """
+        if not self.scenario:
+            raise StudyError("scenario is missing; give an arm's name, or the path of a scenario's YAML file")
+        if not (self.seeds and self.variations and self.measures):
+            raise StudyError("seeds, variations and measures must not be empty")
+        if fault := number_fault(self):
+            raise StudyError(fault)
+        if len({*self.seeds}) < len(self.seeds):
+            raise StudyError(f"seeds must be different whole numbers from 0; got {self.seeds}")
+        _check_names("variations", [variation.name for variation in self.variations])
+        if any(scenario.mounted_arm.joint_names != self.arm.joint_names for scenario in self.scenarios.values()):
+            raise StudyError("all variations must have the same joints")
+        for i, measure in enumerate(self.measures):
+            for scenario in self.scenarios.values():
+                try:
+                    measure.check(scenario)
+                except StudyError as error:
+                    raise StudyError(f"measures[{i}].{error}") from error
+        _check_names("measures", [measure.column for measure in self.measures])
+        for column in (measure.column for measure in self.measures):
+            if column in RESERVED or not re.fullmatch(r"[A-Za-z_]\w*", column) or re.fullmatch(r"q\d+", column):
+                raise StudyError(f'measures: "{column}" cannot be a column; allowed: a word, but {", ".join(RESERVED)}')
+        self._check_poses()
+
+    def _check_poses(self) -> None:
+        for k, pose in enumerate(self.poses):
+            for scenario in self.scenarios.values():
+                check_pose(f"poses[{k}]", pose, scenario.mounted_arm)
+        if self.random_poses is None:
+            return
+        if self.poses:
+            raise StudyError("poses and random_poses: give one of them")
+
+    def _starts(self) -> list[list[float]]:
+        """Where the arm starts."""
+        if self.random_poses is not None:
+            random = self.random_poses
+            return self.arm.sample_poses(random.count, np.random.default_rng(random.seed), random.margin).tolist()
+        if self.poses:
+            return self.poses
+        return next(iter(self.scenarios.values())).knots()[1][:1].tolist()
+
+
+def load_study(path: str | Path, settings: Sequence[str] = ()) -> Study:
+    """Reads a study file, adds settings "key=value" of its scenario, and checks it.
+
+    Raises:
+        StudyError: the file cannot be read, has an unknown key, or asks for what makes no sense.
+    """
+    study = load_typed_yaml(Study, path, StudyError, "a study")
+    study.set = [*study.set, *settings]
+    try:
+        study.check()
+    except DvrkDrakeError as error:
+        raise StudyError(f"{path}: {error}") from error
+    return study
+
+
+def versions() -> dict[str, str]:
+    """Of what results depend on."""
+    return {package: version(package) for package in ("dvrk-drake", "drake", "numpy")}
+
+
+def _seed_of_run(seed: int, pose: int) -> int:
+    return int(np.random.SeedSequence([seed, pose]).generate_state(1)[0])
+
+
+def _check_names(what: str, names: list[str]) -> None:
+    if len({*names}) < len(names) or not all(name.isprintable() and name for name in names):
+        raise StudyError(f"{what} must have different names, of one line; got {names}")

@@ -1,0 +1,210 @@
+"""The results of a study as a file: a row a run as they come, whole whatever ends the process, sorted in the end."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import fcntl
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from dvrk_drake.errors import StudyError
+from dvrk_drake.experiments.study.study_file import Case, Study
+from dvrk_drake.models.files import atomic_write
+from dvrk_drake.recordings.csv_rows import read_bytes
+from dvrk_drake.recordings.growing_file import GrowingFile
+from dvrk_drake.recordings.recording import column_names
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a run gave: `values` by column of the measures; or none, and the `error` that ended it, in one line."""
+
+    values: Mapping[str, float | bool]
+    error: str = ""
+
+
+class StudyTable:
+    """The results of one study in a CSV file: one row a run, under a header.
+
+    Columns: study, its fingerprint; case, the number of the run; variation; pose, the number of the start; seed, of
+    the scenario; q1..qn, the start [rad, m]; one a measure: a number, inf, true or false; error, empty unless the run
+    failed, and then its measures are. Numbers have every digit.
+
+    It is a context manager that keeps other processes off the file meanwhile.
+    """
+
+    def __init__(self, path: str | Path, study: Study) -> None:
+        """At `path`, which is new or was begun with the same study.
+
+        Raises:
+            StudyError: it was begun with another study, is no table of a study, or another process writes it.
+            RecordingError: it cannot be read or written.
+        """
+        self._path, self._study = Path(path), study
+        self._names = [measure.column for measure in study.measures]
+        self._starts = column_names("q", study.arm.num_joints)
+        self._header = ["study", "case", "variation", "pose", "seed", *self._starts, *self._names, "error"]
+        self._lock = _lock(self._path)
+        try:
+            self.rows = self._read()
+            self._file = GrowingFile(self._path, resume=True)
+        except BaseException:
+            self._lock.close()
+            raise
+        if not self._path.stat().st_size:
+            self._file.append(_line(self._header))
+
+    def __enter__(self) -> StudyTable:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+        self._lock.close()
+
+    def append(self, case: Case, row: Row) -> None:
+        """Adds the row of a case that has none yet.
+
+        Raises:
+            RecordingError: it cannot be written; the rows before are whole.
+        """
+        self._file.append(_line(self._cells(case, row)))
+        self.rows[case.index] = row
+
+    def sort(self) -> None:
+        """Brings the rows into the order of the cases, at once or not at all."""
+        with atomic_write(self._path, "wb") as stream:
+            stream.write(_line(self._header))
+            stream.writelines(_line(self._cells(case, self.rows[case.index])) for case in self._study.cases)
+
+    def _cells(self, case: Case, row: Row) -> list[str]:
+        key = [self._study.fingerprint, str(case.index), case.variation, str(case.pose), str(case.seed)]
+        values = [_text(row.values[name]) if name in row.values else "" for name in self._names]
+        return [*key, *map(repr, case.start), *values, row.error]
+
+    def _read(self) -> dict[int, Row]:
+        """The whole rows that are there, by the number of their case."""
+        content, begin = read_bytes(self._path), _line(self._header)
+        whole, tail = content[: content.rfind(b"\n") + 1], content[content.rfind(b"\n") + 1 :]
+        if not whole and begin.startswith(tail):
+            return {}  # new, or killed in the middle of the header
+        try:
+            rows = list(csv.reader(io.StringIO(whole.decode(), newline=""), strict=True))
+        except (UnicodeDecodeError, csv.Error):
+            rows = []
+        if not rows or rows[0][:2] != self._header[:2]:
+            raise StudyError(f"{self._path}: is there and is no table of a study; name another output")
+        header, *rows = rows
+        found: dict[int, Row] = {}
+        for line, cells in enumerate(rows, 2):
+            where = f"{self._path}:{line}"
+            if header != self._header or cells[:1] != [self._study.fingerprint]:
+                raise StudyError(
+                    f"{where}: was begun with another study (its file, or what that names, or a version changed); "
+                    "name another output"
+                )
+            if len(cells) != len(header) or not cells[1].isdigit() or int(cells[1]) >= len(self._study.cases):
+                raise StudyError(f"{where}: was changed by hand: is no row of this study; name another output")
+            if int(cells[1]) in found:
+                raise StudyError(f"{where}: has case {cells[1]} again; name another output")
+            found[int(cells[1])] = self._row(cells, where)
+        return found
+
+    def _row(self, cells: list[str], where: str) -> Row:
+        if cells[-1]:
+            return Row({}, cells[-1])
+        texts = cells[-1 - len(self._names) : -1]
+        try:
+            return Row({name: _value(text) for name, text in zip(self._names, texts, strict=True)})
+        except ValueError as error:
+            raise StudyError(f"{where}: was changed by hand: {error}; name another output") from error
+
+
+def _line(cells: list[str]) -> bytes:
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerow(cells)
+    return stream.getvalue().encode()
+
+
+def _text(value: float | bool) -> str:
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _value(text: str) -> float | bool:
+    return text == "true" if text in ("true", "false") else float(text)
+
+
+def _lock(path: Path) -> IO[bytes]:
+    """Holds `path`, which is made if it is not there, until it is closed."""
+    try:
+        file = open(path, "ab")  # noqa: SIM115
+    except OSError as error:
+        raise StudyError(f"{path}: cannot be written: {error.strerror}") from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        file.close()
+        raise StudyError(f"{path}: another study is writing it") from error
+    return file
+
+
+try:
+    import pyarrow
+    import pyarrow.parquet
+except ImportError:
+    pyarrow = None
+
+
+class ParquetStudyTable(StudyTable):
+    """A `StudyTable` whose end is a Parquet file with the same columns.
+
+    A Parquet file cannot be read before its end is written. So rows go, as they come, into a CSV file beside it, whose
+    name is the Parquet file's and `.rows.csv`; when all are there they become the Parquet file, and that one goes.
+    """
+
+    def __init__(self, path: str | Path, study: Study) -> None:
+        """At `path`, which is new or was made by the same study.
+
+        Raises:
+            StudyError: as of a `StudyTable`, or pyarrow is not installed.
+            RecordingError: it cannot be read or written.
+        """
+        if pyarrow is None:
+            raise StudyError(f"{path}: Parquet needs pyarrow: pip install 'dvrk-drake[parquet]', or name a .csv")
+        self._parquet = Path(path)
+        finished = _finished_rows(self._parquet, study) if self._parquet.exists() else {}
+        super().__init__(f"{path}.rows.csv", study)
+        self.rows.update(finished)
+
+    def sort(self) -> None:
+        """Writes the Parquet file, in the order of the cases, at once or not at all."""
+        content = []
+        for case in self._study.cases:
+            key = {"study": self._study.fingerprint, **dataclasses.asdict(case), "case": case.index}
+            starts = {name: q for name, q in zip(self._starts, case.start, strict=True)}
+            row = self.rows[case.index]
+            content.append({**key, **starts, **row.values, "error": row.error or None})
+        with atomic_write(self._parquet, "wb") as stream:
+            pyarrow.parquet.write_table(pyarrow.Table.from_pylist(content, self._schema()), stream)
+        self._path.unlink()
+
+    def _schema(self) -> pyarrow.Schema:
+        text, whole, number = pyarrow.string(), pyarrow.int64(), pyarrow.float64()
+        types = {"study": text, "case": whole, "variation": text, "pose": whole, "seed": whole, "error": text}
+        types |= {measure.column: pyarrow.bool_() if measure.is_answer else number for measure in self._study.measures}
+        return pyarrow.schema([(name, types.get(name, number)) for name in self._header])
+
+
+def _finished_rows(path: Path, study: Study) -> dict[int, Row]:
+    """The rows of a finished study."""
+    try:
+        content = pyarrow.parquet.read_table(path).to_pylist()
+    except (OSError, pyarrow.ArrowException) as error:
+        raise StudyError(f"{path}: is there and is no table of a study; name another output") from error
+    if {row.get("study") for row in content} != {study.fingerprint}:
+        raise StudyError(f"{path}: was made by another study; name another output")
+    names = [measure.column for measure in study.measures]
+    return {row["case"]: Row({} if row["error"] else {n: row[n] for n in names}, row["error"] or "") for row in content}

@@ -1,0 +1,189 @@
+"""How much an operator feels of an arm: force and torque at the handle while a hand leads it along a path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
+
+from dvrk_drake.dynamics.arm_frame import ArmFrame, handle_frame
+from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ScenarioError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import ArmEffects
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.closed_loop import connect_controller
+from dvrk_drake.systems.friction_compensator import FrictionCompensator
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.hand import Grip, Hand
+from dvrk_drake.systems.hand_path import PoseTrajectorySource
+
+#: Of what is recorded [s].
+SAMPLE_PERIOD = 5e-3
+#: Until the hand has taken hold of the arm; what it feels before does not count [s].
+TAKES_HOLD = 1.0
+#: A motion that leaves the limits further is not this arm's [rad, m].
+LEAVES = 0.1
+
+
+@dataclass(frozen=True)
+class Compensation:
+    """What the motors do: nothing, or carry the arm's weight as `model` says, and maybe a share of its friction.
+
+    Attributes:
+        name: in tables and plots.
+        model: whose gravity torque; None for limp motors.
+        friction_ratio: share of the friction, as `safe_ratios` allows.
+        friction: which; that of the arm's files by default.
+    """
+
+    name: str
+    model: IdentifiedModel | None = None
+    friction_ratio: float = 0.0
+    friction: Friction | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Felt:
+    """What a hand felt along a path.
+
+    Attributes:
+        name: of the compensation.
+        time: (m,) [s].
+        torque, force: (m, 3) of the hand on the arm at the handle, in the base frame [N m], [N].
+        deviation: (m,) of the handle from where the hand wanted it [m].
+    """
+
+    name: str
+    time: NDArray[np.float64]
+    torque: NDArray[np.float64]
+    force: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+
+    @property
+    def rms_force(self) -> float:
+        """[N] once the hand has taken hold."""
+        return _rms(self.force[self.time >= TAKES_HOLD])
+
+    @property
+    def rms_torque(self) -> float:
+        """[N m] once the hand has taken hold."""
+        return _rms(self.torque[self.time >= TAKES_HOLD])
+
+    def peak(self) -> tuple[float, float]:
+        """The force [N] and torque [N m] that are exceeded in a twentieth of the time."""
+        late = self.time >= TAKES_HOLD
+        norms = (np.linalg.norm(x[late], axis=1) for x in (self.force, self.torque))
+        force, torque = (float(np.percentile(norm, 95)) for norm in norms)
+        return force, torque
+
+
+def rambling_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int = 0) -> PiecewisePolynomial:
+    """A smooth motion of the joints through random poses, as slow as a hand, for lack of a recorded one."""
+    q = arm.sample_poses(poses, np.random.default_rng(seed), margin=0.25)
+    times = seconds_each * np.arange(poses, dtype=float)
+    return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
+        times, q.T, np.zeros(arm.num_joints), np.zeros(arm.num_joints)
+    )
+
+
+def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> PiecewisePolynomial:
+    """The motion of a recording, inside the arm's limits, `speed` times as fast.
+
+    Raises:
+        ScenarioError: no times, no positive speed, or a motion that leaves the limits by more than 0.1 rad or m.
+        RecordingError: another number of joints.
+    """
+    recording = recording.in_joint_coordinates(arm)
+    if recording.t is None:
+        raise ScenarioError(f"{recording.source}: has no times; a path needs column t")
+    if not 0 < speed <= 10:
+        raise ScenarioError(f"speed is {speed:g}; allowed: above 0, up to 10")
+    A, lower, upper = arm.limit_matrix()
+    outside = np.max(np.maximum(lower - recording.q @ A.T, recording.q @ A.T - upper), axis=0)
+    if np.any(outside > LEAVES):
+        j = int(np.argmax(outside))
+        name = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)][j]
+        raise ScenarioError(
+            f"{recording.source}: {name} leaves the limits of {arm.name} by {outside[j]:.2g} rad or m; is it a motion "
+            f"of this arm's joints, not of another arm's or of actuators?"
+        )
+    t, keep = np.unique(recording.t, return_index=True)
+    if len(t) < 3:
+        raise ScenarioError(f"{recording.source}: has {len(t)} different times; a path needs 3 or more")
+    q = np.clip(recording.q[keep], arm.position_lower, arm.position_upper)
+    return PiecewisePolynomial.CubicShapePreserving((t - t[0]) / speed, q.T, zero_end_point_derivatives=True)
+
+
+def feel(
+    arm: Arm,
+    path: PiecewisePolynomial,
+    compensation: Compensation,
+    *,
+    effects: ArmEffects | None = None,
+    grip: Grip | None = None,
+    frame_name: str = "",
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Felt:
+    """Lets a hand lead the handle of a simulated arm along the way that `path` takes it.
+
+    Args:
+        arm: which.
+        path: of its joints [rad, m] over time, from 0 [s]; the hand leads the pose of the handle that it means.
+        compensation: what the motors do.
+        effects: of the real arm that the simulation has, e.g. `arm.effects`; none by default.
+        grip: of the hand.
+        frame_name: of the handle; by default `handle_frame`.
+        seed: of the effects' noise.
+        progress: called with the finished share, 0..1.
+    """
+    name, frame = arm.name.lower(), ArmFrame(arm, frame_name := frame_name or handle_frame(arm))
+    knots = np.arange(path.start_time(), path.end_time(), 0.02)
+    poses = [frame.pose(path.value(t).ravel()) for t in knots]
+    builder = DiagramBuilder()
+    station = builder.AddSystem(ArmStation(arm, effects=effects, seed=seed))
+    if compensation.model is not None:
+        controller = GravityPidController(compensation.model, mode="gravity")
+        connect_controller(builder, station, controller, friction=_friction(arm, compensation))
+    hand = builder.AddSystem(Hand(arm, frame_name, grip))
+    way = builder.AddSystem(PoseTrajectorySource(PiecewisePose.MakeLinear(knots, poses)))
+    builder.Connect(station.GetOutputPort(f"{name}.state_true"), hand.GetInputPort("state_estimated"))
+    builder.Connect(way.get_output_port(), hand.GetInputPort("X_BG_desired"))
+    builder.Connect(hand.GetOutputPort("effort_disturbance"), station.GetInputPort(f"{name}.effort_disturbance"))
+    simulator = Simulator(builder.Build())
+    root = simulator.get_mutable_context()
+    station.set_positions(station.GetMyMutableContextFromRoot(root), path.value(0.0).ravel())
+    simulator.Initialize()
+    # Multiples, not sums: where rounding tells the time from that of a step, the step would count or not by chance.
+    times = SAMPLE_PERIOD * np.arange(1, int(path.end_time() / SAMPLE_PERIOD), dtype=np.float64)
+    forces, deviation = np.empty((len(times), 6)), np.empty(len(times))
+    state = station.GetOutputPort(f"{name}.state_true")
+    for i, t in enumerate(times):
+        simulator.AdvanceTo(t)
+        forces[i] = hand.GetOutputPort("spatial_force").Eval(hand.GetMyContextFromRoot(root))
+        q = state.Eval(station.GetMyContextFromRoot(root))[: arm.num_joints]
+        wanted = way.get_output_port().Eval(way.GetMyContextFromRoot(root))
+        deviation[i] = np.linalg.norm(wanted.translation() - frame.pose(q).translation())
+        progress((i + 1) / len(times))
+    return Felt(compensation.name, times, forces[:, :3], forces[:, 3:], deviation)
+
+
+def _friction(arm: Arm, compensation: Compensation) -> FrictionCompensator | None:
+    if not compensation.friction_ratio or compensation.model is None:
+        return None
+    friction = compensation.friction or Friction.of_arm(arm)
+    return FrictionCompensator(
+        friction, ratio=compensation.friction_ratio, holding_error=holding_error(compensation.model)
+    )
+
+
+def _rms(vectors: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))

@@ -1,0 +1,213 @@
+"""Gains from what a model knows of an arm: its mass matrix over the joint box, friction, encoders, motors and delay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.dynamics.actuator_effects import joint_row
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.experiments.tuning.sampled_loop import Margins, SampledLoop, Sampling, place
+from dvrk_drake.experiments.tuning.settings import band, counts, effort_limits, rounded_gains
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.models.plant import holding_torques, make_arm_plant, set_arm_positions, tree_selector
+
+#: Damping ratio of a joint at its largest inertia, without its dry friction, which damps it more.
+DAMPING_RATIO = 0.8
+#: The least margins at any inertia that the joint has in its box: 30 degrees, and twice the gain.
+PHASE_MARGIN, GAIN_MARGIN = np.pi / 6, 2.0
+#: One count of its encoder may shake a motor by its dry friction, or by this share of its largest effort if more.
+SHAKE = 0.05
+#: A joint that sticks at the edge of its band is to be on its way again after this time [s]...
+BREAK_AWAY = 0.25
+#: ...with this part of the largest gravity torque unknown, but Ki is at most this share of Kp times the frequency.
+GRAVITY_ERROR, INTEGRAL_SHARE = 0.2, 0.15
+#: Frequencies that are tried, the fastest first [rad/s].
+FREQUENCIES = np.geomspace(300.0, 1.0, 400)
+#: Poses of the joint box where the mass matrix is looked at, and of these where all joints are looked at together.
+POSES, TOGETHER = 200, 20
+
+
+@dataclass(frozen=True)
+class JointFacts:
+    """What one joint's gains depend on [kg m^2, N m, rad; kg, N, m].
+
+    Attributes:
+        inertia: the least that its motor can feel, all other joints free; and the largest, all others held.
+        dry_friction: what holds it at rest, at most.
+        viscous: friction.
+        gravity: the largest gravity torque on it.
+        count: what its position is known to.
+        band: how near is near enough.
+        effort_limit: the largest effort that it has.
+    """
+
+    inertia: tuple[float, float]
+    dry_friction: float
+    viscous: float
+    gravity: float
+    count: float
+    band: float
+    effort_limit: float
+
+
+@dataclass(frozen=True)
+class JointDesign:
+    """Gains of one joint and where they come from.
+
+    Attributes:
+        kp, kd, ki: the gains.
+        frequency: of the closed loop at the largest inertia [rad/s].
+        margins: at the least and at the largest inertia.
+        limited_by: what would be violated by a faster loop.
+    """
+
+    kp: float
+    kd: float
+    ki: float
+    frequency: float
+    margins: tuple[Margins, Margins]
+    limited_by: str
+
+
+@dataclass(frozen=True)
+class ArmDesign:
+    """Gains of an arm and where they come from.
+
+    Attributes:
+        gains: of all joints.
+        facts: of each joint.
+        joints: the design of each.
+    """
+
+    gains: Gains
+    facts: tuple[JointFacts, ...]
+    joints: tuple[JointDesign, ...]
+
+
+def design_arm(arm: Arm) -> ArmDesign:
+    """Designs each joint by itself, then looks at all of them together, at poses all over the joint box.
+
+    Together they must be stable with a period of delay more than the arm has and 20 % less inertia than the model.
+    Until they are, the frequency of the joint that takes part most in the motion that grows comes down by a tenth.
+
+    Raises:
+        ControllerError: no gains are good, for one joint or for all together.
+    """
+    sampling = sampling_of(arm)
+    masses = mass_matrices(arm, arm.sample_poses(POSES, np.random.default_rng(1)))
+    facts = joint_facts(arm, masses)
+    joints = [_named(arm, name, fact, sampling) for name, fact in zip(arm.joint_names, facts, strict=True)]
+    slowed = np.ones(arm.num_joints)
+    harder = Sampling(sampling.period, sampling.ticks + 1, sampling.cut_off)
+    viscous = [fact.viscous for fact in facts]
+    loops = [SampledLoop(0.8 * M, harder, viscous) for M in masses[:: POSES // TOGETHER]]
+    while np.min(slowed) > 0.1:
+        gains = rounded_gains((joint.kp, joint.kd, joint.ki) for joint in joints)
+        growth, shares = max((loop.least_damped_mode(gains) for loop in loops), key=lambda mode: mode[0])
+        if growth < 1.0:
+            return ArmDesign(gains, facts, tuple(joints))
+        slow = int(np.argmax(shares))
+        slowed[slow] *= 0.9
+        joints[slow] = design_joint(facts[slow], sampling, slowed[slow])
+    raise ControllerError(f"{arm.name}: no gains with which all joints are stable together")
+
+
+def _named(arm: Arm, name: str, fact: JointFacts, sampling: Sampling) -> JointDesign:
+    try:
+        return design_joint(fact, sampling)
+    except ControllerError as error:
+        raise ControllerError(f"{arm.name}, {name}: {error}") from error
+
+
+def design_joint(fact: JointFacts, sampling: Sampling, slowed: float = 1.0) -> JointDesign:
+    """The fastest gains that nothing speaks against, then `slowed` times that frequency.
+
+    Raises:
+        ControllerError: something speaks against all gains.
+    """
+    limited_by = "fastest tried"
+    for w in FREQUENCIES:
+        design = _joint_gains(fact, sampling, w)
+        if reason := _objection(fact, sampling, design):
+            limited_by = reason
+            continue
+        if slowed < 1.0:
+            limited_by = "other joints"
+            design = _joint_gains(fact, sampling, slowed * w)
+        kp, kd, ki = design
+        low, high = (SampledLoop(M, sampling, fact.viscous).margins(Gains([kp], [kd], [ki])) for M in fact.inertia)
+        return JointDesign(kp, kd, ki, float(slowed * w), (low, high), limited_by)
+    raise ControllerError(f"no gains for {FREQUENCIES[-1]:g} rad/s or more, limited by: {limited_by}")
+
+
+def _joint_gains(fact: JointFacts, sampling: Sampling, w: float) -> tuple[float, float, float]:
+    """At the largest inertia."""
+    kp, kd = place(fact.inertia[1], w, DAMPING_RATIO, sampling, fact.viscous)
+    unknown = fact.dry_friction + GRAVITY_ERROR * fact.gravity
+    return kp, kd, min(unknown / (fact.band * BREAK_AWAY), INTEGRAL_SHARE * w * kp)
+
+
+def _objection(fact: JointFacts, sampling: Sampling, design: tuple[float, float, float]) -> str:
+    """What speaks against gains; "" if nothing does."""
+    kp, kd, ki = design
+    # One count in one period, before the low-pass has spread it.
+    jolt = fact.count * (kp + kd * (1.0 - sampling.decay) / sampling.period)
+    if jolt > max(fact.dry_friction, SHAKE * fact.effort_limit):
+        return "encoder count"
+    for M in fact.inertia:
+        margins = SampledLoop(M, sampling, fact.viscous).margins(Gains([kp], [kd], [ki]))
+        if margins.phase < PHASE_MARGIN:
+            return "phase margin"
+        if margins.gain < GAIN_MARGIN:
+            return "gain margin"
+    return ""
+
+
+def sampling_of(arm: Arm, period: float = 1e-3) -> Sampling:
+    """When an arm is measured and driven: its own delay, and the period that a controller beside it takes."""
+    delay, encoder = arm.effects.delay, arm.effects.encoder
+    own = delay.measurement + delay.command if delay else 0
+    return Sampling(period, own + 1, encoder.velocity_cut_off if encoder else np.inf)
+
+
+def mass_matrices(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(m, n, n) of the joints at poses (m, n), with the linkage that follows them and the rotors: G' M G."""
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    tree, G = tree_selector(plant, arm), arm.linkage.matrix
+    masses = []
+    for q in poses:
+        set_arm_positions(plant, context, arm, q)
+        masses.append(G.T @ plant.CalcMassMatrix(context)[np.ix_(tree, tree)] @ G)
+    return np.array(masses)
+
+
+def joint_facts(arm: Arm, masses: NDArray[np.float64]) -> tuple[JointFacts, ...]:
+    """Of each joint; `masses` (m, n, n) are of poses all over the joint box."""
+    least = 1.0 / np.max(np.diagonal(np.linalg.inv(masses), axis1=1, axis2=2), axis=0)
+    largest = np.max(np.diagonal(masses, axis1=1, axis2=2), axis=0)
+    columns = (least, largest, *friction(arm), largest_gravity(arm), counts(arm), band(arm), effort_limits(arm))
+    rows = zip(*columns, strict=True)
+    return tuple(JointFacts((float(row[0]), float(row[1])), *map(float, row[2:])) for row in rows)
+
+
+def friction(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(n,) what dry friction holds in both directions [N m, N], (n,) viscous [N m s/rad; N s/m], each joint alone."""
+    dry, viscous = np.zeros(arm.num_joints), np.zeros(arm.num_joints)
+    for effect in arm.effects.friction:
+        row = np.abs(joint_row(arm, effect.coordinate))
+        if effect.kind == "viscous":
+            viscous += effect.coefficient * row**2
+        elif effect.kind != "presliding forward":  # that holds in one direction only
+            dry += effect.coefficient * row
+    return dry, viscous
+
+
+def largest_gravity(arm: Arm) -> NDArray[np.float64]:
+    """(n,) the largest torque that holds the arm against gravity, over poses of its box [N m, N]."""
+    poses = arm.sample_poses(POSES, np.random.default_rng(1))
+    return np.asarray(np.abs(holding_torques(arm, poses)).max(axis=0))

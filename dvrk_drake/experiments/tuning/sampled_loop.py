@@ -1,0 +1,158 @@
+"""Joints under PID control as a linear sampled system: stability, margins, and the gains that place them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.signal import cont2discrete
+
+from dvrk_drake.models.arm_schema import Gains
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """When and how joints are measured and driven.
+
+    Attributes:
+        period: of measurement and control [s].
+        ticks: periods from a measurement to the effort that answers it.
+        cut_off: of the low-pass behind the difference of two readings [Hz]; infinite for the difference itself.
+    """
+
+    period: float = 1e-3
+    ticks: int = 2
+    cut_off: float = 30.0
+
+    @property
+    def decay(self) -> float:
+        """What the low-pass of the velocity keeps of its last value."""
+        return math.exp(-2.0 * math.pi * self.cut_off * self.period)
+
+    @property
+    def position_lag(self) -> float:
+        """Between a position and the effort that answers it, on average over the period that this is held [s]."""
+        return (self.ticks + 0.5) * self.period
+
+    @property
+    def velocity_lag(self) -> float:
+        """The same of a velocity: the difference is half a period old, the low-pass adds its own lag [s]."""
+        return self.position_lag + (0.5 + self.decay / (1.0 - self.decay)) * self.period
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Of one joint's open loop, which is cut at the motor.
+
+    Attributes:
+        phase: the least at any frequency where the gain is 1 [rad]; not positive if the loop is unstable.
+        crossover: that frequency [rad/s].
+        gain: by what the loop may be amplified before it is unstable.
+    """
+
+    phase: float
+    crossover: float
+    gain: float
+
+
+class SampledLoop:
+    """n joints with a mass matrix M, viscous friction b and the law of GravityPidController, linear:
+
+    M vd = u - b v between two samples; u = Kp e + Kd de + Ki sum(e) h of what was measured `ticks` periods ago, held
+    for a period; e = -q. Gravity is compensated. Velocity as in `systems.arm_effects.drive_step.DriveStep`.
+    """
+
+    def __init__(self, M: ArrayLike, sampling: Sampling, viscous: ArrayLike = 0.0) -> None:
+        """Of M (n, n) [kg m^2; kg] and `viscous` (n,) [N m s/rad; N s/m]."""
+        self._M = np.atleast_2d(np.asarray(M, float))
+        n = self._n = len(self._M)
+        self._sampling = sampling
+        M_inverse = np.linalg.inv(self._M)
+        b = np.diag(np.broadcast_to(np.asarray(viscous, float), n))
+        zero, eye = np.zeros((n, n)), np.eye(n)
+        A = np.block([[zero, eye], [zero, -M_inverse @ b]])
+        self._plant = cont2discrete((A, np.vstack([zero, M_inverse]), np.eye(2 * n), 0), sampling.period)[:2]
+
+    def closed_loop(self, gains: Gains) -> NDArray[np.float64]:
+        """A with x[k+1] = A x[k]. x (n (5 + 2 ticks),) is q, v; the last reading and velocity estimate; the
+        measurements under way, oldest first; the integral as an effort: see `at_rest`."""
+        size = self._n * (5 + 2 * self._sampling.ticks)
+        return np.column_stack([self._advance(x, gains) for x in np.eye(size)])
+
+    def at_rest(self, q: ArrayLike) -> NDArray[np.float64]:
+        """The state of joints that have been at q (n,) for long."""
+        still = np.concatenate([np.broadcast_to(np.asarray(q, float), self._n), np.zeros(self._n)])
+        return np.concatenate([np.tile(still, 2 + self._sampling.ticks), np.zeros(self._n)])
+
+    def _advance(self, x: NDArray[np.float64], gains: Gains) -> NDArray[np.float64]:
+        n, h, decay = self._n, self._sampling.period, self._sampling.decay
+        plant, memory, queue, integral = np.split(x, [2 * n, 4 * n, len(x) - n])
+        reading = plant[:n]
+        velocity = decay * memory[n:] + (1.0 - decay) * (reading - memory[:n]) / h
+        measured = np.concatenate([reading, velocity])
+        queue = np.concatenate([queue, measured])
+        q, v = queue[:n], queue[n : 2 * n]
+        integral = integral - h * np.asarray(gains.ki) * q
+        effort = integral - np.asarray(gains.kp) * q - np.asarray(gains.kd) * v
+        A, B = self._plant
+        return np.concatenate([A @ plant + B @ effort, measured, queue[2 * n :], integral])
+
+    def is_stable(self, gains: Gains) -> bool:
+        """Whether every motion dies away."""
+        return bool(np.max(np.abs(np.linalg.eigvals(self.closed_loop(gains)))) < 1.0)
+
+    def least_damped_mode(self, gains: Gains) -> tuple[float, NDArray[np.float64]]:
+        """What the slowest motion to decay is multiplied by in a period, and each joint's share (n,) of its kinetic
+        energy, leaving out what couples them."""
+        z, modes = np.linalg.eig(self.closed_loop(gains))
+        worst = int(np.argmax(np.abs(z)))
+        v = np.abs(modes[self._n : 2 * self._n, worst])
+        energy = np.diag(self._M) * v**2
+        return float(np.abs(z[worst])), energy / max(energy.sum(), np.finfo(float).tiny)
+
+    def margins(self, gains: Gains) -> Margins:
+        """Of a single joint."""
+        assert self._n == 1
+        h, decay = self._sampling.period, self._sampling.decay
+        w = np.geomspace(1e-2, np.pi / h, 4000)
+        z = np.exp(1j * w * h)
+        (A, B), eye = self._plant, np.eye(2)
+        plant = np.linalg.solve(z[:, None, None] * eye - A, np.broadcast_to(B, (len(z), 2, 1)))[:, 0, 0]
+        velocity = (1 - decay) / (1 - decay / z) * (1 - 1 / z) / h
+        law = gains.kp[0] + gains.kd[0] * velocity + gains.ki[0] * h / (1 - 1 / z)
+        loop = law * plant / z**self._sampling.ticks
+        stable = self.is_stable(gains)
+        size, phase = np.abs(loop), np.unwrap(np.angle(loop))
+        crossings = np.flatnonzero((size[:-1] >= 1) & (size[1:] < 1))
+        # A double integrator begins at -pi; with an integral in the law at -3 pi / 2.
+        margins = [abs((phase[i] + 2 * np.pi) % (2 * np.pi) - np.pi) for i in crossings]
+        turns = np.flatnonzero(np.diff(np.sign(np.imag(loop))) * (np.real(loop[:-1]) < 0))
+        amplify = [1 / size[i] for i in turns if size[i] < 1]
+        if not stable or not margins:
+            return Margins(0.0, float(w[crossings[-1]]) if len(crossings) else 0.0, 1.0)
+        least = int(np.argmin(margins))
+        return Margins(float(margins[least]), float(w[crossings[least]]), float(min(amplify, default=np.inf)))
+
+
+def place(
+    inertia: float, frequency: float, damping_ratio: float, sampling: Sampling, viscous: float = 0.0
+) -> tuple[float, float]:
+    """kp and kd with which one joint has this natural frequency and damping, delay included.
+
+    To second order in s a lag T of position takes Kp T of the damping and a lag T_v of velocity takes Kd T_v of the
+    inertia: (M - Kd T_v + Kp T^2 / 2) s^2 + (b + Kd - Kp T) s + Kp = 0. That is m (s^2 + 2 z w s + w^2) if
+    m (1 + (2 z w + w^2 T) T_v - w^2 T^2 / 2) = M + b T_v, Kp = m w^2, Kd = 2 z w m + Kp T - b; kd is never negative.
+
+    Args:
+        inertia: M [kg m^2; kg].
+        frequency: w [rad/s]; far below the inverse of the lags, or the gains place it only roughly.
+        damping_ratio: z.
+        sampling: gives the lags.
+        viscous: friction b of the joint [N m s/rad; N s/m].
+    """
+    w, z, T, T_v = frequency, damping_ratio, sampling.position_lag, sampling.velocity_lag
+    m = (inertia + viscous * T_v) / (1.0 + (2.0 * z * w + w**2 * T) * T_v - 0.5 * (w * T) ** 2)
+    kp = m * w**2
+    return kp, max(2.0 * z * w * m + kp * T - viscous, 0.0)

@@ -1,0 +1,223 @@
+"""The file that the dVRK's controller compensates the gravity of a PSM with: its linkage as a chain of seven links.
+
+The controller moves the chain by [q1, 0, q2, -q2, q2, q3/2, q3/2], computes the torques t1..t7 that hold it, and takes
+[t1, t3 - t4 + t5, t7] for yaw, pitch and insertion. So link 3 is the back crank, link 4 the bar, link 5 the end link;
+the parallelograms' other bars and the counterweight, which the chain lacks, are moments of these. Link 7 is all that
+the insertion lifts, less the counterweight; link 6 weighs nothing, as the weight that it would add at half the speed
+is not in t7.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.multibody.plant import MultibodyPlant
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.inertial_parameters import LinkInertia
+from dvrk_drake.dynamics.model_links import model_bodies
+from dvrk_drake.errors import ModelError
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import check_tolerance, round_up
+from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.plant import make_arm_plant
+
+ARM_JOINTS = ("yaw", "pitch", "insertion")
+NAMES = ("yaw", "intermediate yaw", "pitch 1", "pitch 2", "pitch 3", "insertion 1", "insertion 2")
+#: Positions of the chain's joints from yaw, pitch and insertion.
+CHAIN_FROM_ARM = np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, -1, 0], [0, 1, 0], [0, 0, 0.5], [0, 0, 0.5]])
+#: Torques of yaw, pitch and insertion from those of the chain's joints.
+ARM_FROM_CHAIN = np.array([[1, 0, 0, 0, 0, 0, 0], [0, 0, 1, -1, 1, 0, 0], [0, 0, 0, 0, 0, 0, 1]])
+PRISMATIC = np.array([False] * 5 + [True] * 2)
+#: Link of the chain -> bodies of the arm whose mass it gets.
+_BODIES = {
+    0: ("yaw_link",),
+    2: ("back_crank_link", "front_crank_link"),
+    3: ("bottom_bar_link", "top_bar_link"),
+    4: ("end_link",),
+}
+#: Links of the chain whose first moments are fitted; that of the last is that of what the insertion carries.
+_FITTED = tuple(_BODIES)
+_LAST = 6
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicCompensation:
+    """Modified DH, X_(i-1)i = Rx(alpha) Tx(A) Rz(theta) Tz(D), and the mass of each of the seven links.
+
+    Attributes:
+        alpha, A, theta, D: (7,) at zero joint positions [rad, m].
+        mass: (7,) [kg].
+        center: (7, 3) centre of mass in the link's DH frame [m].
+        error: (3,) largest difference from the model over the joint box, instrument straight [N m, N m, N].
+        wrist: (3,) largest torque that the instrument's own joints add or take, which the file knows nothing of.
+    """
+
+    alpha: NDArray[np.float64]
+    A: NDArray[np.float64]
+    theta: NDArray[np.float64]
+    D: NDArray[np.float64]
+    mass: NDArray[np.float64]
+    center: NDArray[np.float64]
+    error: NDArray[np.float64]
+    wrist: NDArray[np.float64]
+
+    def save(self, path: str | Path) -> None:
+        """Writes the file at once or not at all."""
+        joints = [
+            {
+                "name": name,
+                "alpha": self.alpha[i],
+                "A": self.A[i],
+                "theta": self.theta[i],
+                "D": self.D[i],
+                "type": "prismatic" if PRISMATIC[i] else "revolute",
+                "mode": "passive" if i == 1 else "active",
+                "mass": self.mass[i],
+                **dict(zip(("cx", "cy", "cz"), self.center[i].tolist(), strict=True)),
+            }
+            for i, name in enumerate(NAMES)
+        ]
+        with atomic_write(path) as stream:
+            json.dump({"DH": {"convention": "modified", "joints": joints}}, stream, indent=2)
+            stream.write("\n")
+
+
+def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> KinematicCompensation:
+    """The controller's file that says what the model says of yaw, pitch and insertion, the instrument straight.
+
+    Raises:
+        ModelError: not the model of a PSM, a counterweight that outweighs all that the insertion carries, or an error
+            above `tolerance` [N m, N]: joint effects, trust below 1.
+    """
+    arm = model.load_arm()
+    plant = make_arm_plant(arm)
+    if arm.joint_names[:3] != ARM_JOINTS or not plant.HasBodyNamed("back_crank_link"):
+        raise ModelError(f"{arm.name}: the controller's kinematic compensation file is one of a PSM; joints differ")
+    check_tolerance(tolerance)
+    alpha, A, theta, D = _chain(plant)
+    q = arm.sample_poses(600, np.random.default_rng(0))
+    straight = np.where(np.arange(arm.num_joints) < 3, q, 0.0)
+    beta = np.array([p.value for p in model.base_parameters])
+    tau = (model.trust * (model.static_model.regressor(straight)[:, :, : len(beta)] @ beta))[:, :3]
+    # (m, 3, 7, 4) torque on yaw, pitch and insertion per mass and first moment of each link of the chain.
+    frames = [_frames(alpha, A, theta, D, pose) for pose in straight[:, :3]]
+    Y = np.array([_regressor(X, arm.gravity) for X in frames])
+    mass, moment = _prior(model_bodies(model).links, plant, _frames(alpha, A, theta, D, np.zeros(3)))
+    lifted = Y[:, 2, _LAST, 0]
+    mass_7 = float(lifted @ tau[:, 2] / (lifted @ lifted))
+    if not mass_7 > 0:
+        raise ModelError(
+            f"{arm.name}: the counterweight outweighs what the insertion carries by {-mass_7:.3g} kg; the controller's "
+            "file has no negative mass"
+        )
+    moment[_LAST] *= mass_7 / mass[_LAST]
+    mass[_LAST] = mass_7
+    known = np.concatenate([mass[:, None], moment], axis=1)
+    unknown = Y[:, :, _FITTED, 1:].reshape(tau.size, -1)
+    step = np.linalg.lstsq(unknown, (tau - np.einsum("mjlk,lk->mj", Y, known)).ravel(), rcond=1e-9)[0]
+    known[_FITTED, 1:] += step.reshape(-1, 3)
+    tau_model = model.holding_torque(straight)[:, :3]
+    error = np.abs(np.einsum("mjlk,lk->mj", Y, known) - tau_model).max(axis=0)
+    if error.max() > tolerance:
+        off = ", ".join(f"{name} {e:.2g}" for name, e in zip(ARM_JOINTS, error, strict=True) if e > tolerance)
+        raise ModelError(
+            f"the controller's file cannot hold this model: over the joint box it would be off by up to {off} "
+            "(N m; N on insertion). It knows gravity only, and trust only where it is 1; left out: "
+            f"{_left_out(model, straight)}. To accept it: --gc-tolerance {round_up(error.max()):g}"
+        )
+    center = np.divide(known[:, 1:], mass[:, None], out=np.zeros((7, 3)), where=mass[:, None] > 0)
+    wrist = np.abs(model.holding_torque(q)[:, :3] - tau_model).max(axis=0)
+    return KinematicCompensation(alpha, A, theta, D, mass, center, error, wrist)
+
+
+def _left_out(model: IdentifiedModel, q: NDArray[np.float64]) -> str:
+    """The model's effects on yaw, pitch and insertion at rest, with the largest torque of each at poses q (m, n)."""
+    gravity = len(model.base_parameters)
+    tau = np.abs(model.static_model.regressor(q)[:, :3, gravity:] * model.theta[gravity:]).max(axis=(0, 1))
+    said = [f"{e.effect} {t:.2g}" for e, t in zip(model.holding_effects, tau, strict=True) if t > 0]
+    return ", ".join(said) or "no effects"
+
+
+def _chain(plant: MultibodyPlant) -> tuple[NDArray[np.float64], ...]:
+    """alpha, A, theta, D from where the SDF's joints are at home; the linkage lies in the plane x = 0."""
+    context = plant.CreateDefaultContext()
+    p_A, p_B, p_E = (
+        plant.GetJointByName(name).frame_on_child().CalcPoseInWorld(context).translation()
+        for name in ("pitch", "bottom_bar", "end")
+    )
+    p_3 = plant.GetFrameByName("dh_3").CalcPoseInWorld(context).translation()
+    crank, bar = p_B - p_A, p_E - p_B
+    # Frame 2 stands in the remote centre of motion, x to the rear (-y), y up, z along the pitch axis (-x).
+    crank_angle, bar_angle = (np.arctan2(v[2], -v[1]) for v in (crank, bar))
+    half, whole = np.pi / 2, np.pi
+    alpha = np.array([half, -half, 0, 0, 0, -half, 0])
+    A = np.array([0, 0, -p_A[1], np.linalg.norm(crank), np.linalg.norm(bar), -p_E[1], 0])
+    theta = np.array([half, -half, crank_angle, bar_angle - crank_angle, whole - bar_angle, 0, 0])
+    D = np.array([0, 0, 0, 0, 0, 0, p_E[2] - p_3[2]])
+    return alpha, A, theta, D
+
+
+def _frames(
+    alpha: NDArray[np.float64],
+    A: NDArray[np.float64],
+    theta: NDArray[np.float64],
+    D: NDArray[np.float64],
+    q: ArrayLike,
+) -> NDArray[np.float64]:
+    """X_0i (7, 4, 4) at yaw, pitch and insertion q (3,)."""
+    chain = CHAIN_FROM_ARM @ np.asarray(q, dtype=np.float64)
+    X, frames = np.eye(4), []
+    for i in range(len(NAMES)):
+        angle, distance = (theta[i], D[i] + chain[i]) if PRISMATIC[i] else (theta[i] + chain[i], D[i])
+        (sa, ca), (st, ct) = ((np.sin(x), np.cos(x)) for x in (alpha[i], angle))
+        X = X @ np.array(
+            [
+                [ct, -st, 0, A[i]],
+                [st * ca, ct * ca, -sa, -sa * distance],
+                [st * sa, ct * sa, ca, ca * distance],
+                [0, 0, 0, 1],
+            ]
+        )
+        frames.append(X)
+    return np.array(frames)
+
+
+def _regressor(X: NDArray[np.float64], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 7, 4) torque on yaw, pitch, insertion per mass and first moment of each link that holds the chain at X."""
+    chain = np.zeros((len(NAMES), len(NAMES), 4))
+    for joint in range(len(NAMES)):
+        z, origin = X[joint, :3, 2], X[joint, :3, 3]
+        for link in range(joint, len(NAMES)):
+            R, p = X[link, :3, :3], X[link, :3, 3]
+            if PRISMATIC[joint]:
+                chain[joint, link, 0] = -z @ gravity
+            else:
+                # -z . (r x g) = -(g x z) . r of the point r = p - origin, or per axis of the first moment
+                lever = -np.cross(gravity, z)
+                chain[joint, link] = lever @ (p - origin), *(lever @ R)
+    return np.einsum("jk,klm->jlm", ARM_FROM_CHAIN, chain)
+
+
+def _prior(
+    links: tuple[LinkInertia, ...], plant: MultibodyPlant, home: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Masses (7,) and first moments (7, 3) in the DH frames of the bodies that the chain's links stand for, at home."""
+    context = plant.CreateDefaultContext()
+    by_name = {link.link: link.parameters for link in links}
+    if missing := {name for names in _BODIES.values() for name in names} - set(by_name):
+        raise ModelError(f"the SDF has no link {', '.join(sorted(missing))}, as every PSM of the dVRK has")
+    others = set(by_name) - {name for names in _BODIES.values() for name in names} - {"counterweight_link"}
+    mass, moment = np.zeros(7), np.zeros((7, 3))
+    for i, names in {**_BODIES, _LAST: tuple(others)}.items():
+        X_0i = home[i]
+        for name in names:
+            m, h = by_name[name][0], by_name[name][1:4]
+            X_0L = plant.GetBodyByName(name).EvalPoseInWorld(context)
+            moment_0 = X_0L.rotation().matrix() @ h + m * (X_0L.translation() - X_0i[:3, 3])
+            mass[i] += m
+            moment[i] += X_0i[:3, :3].T @ moment_0
+    return mass, moment

@@ -1,0 +1,68 @@
+"""Coupled limits of an arm, lower <= sum of coefficient * joint position <= upper: their checks, and poses inside."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.models.arm_schema import ANGLE_WIDTHS, ANGLES, TRAVEL_WIDTHS, TRAVELS, CoupledLimit
+from dvrk_drake.models.schema_fault import number_fault
+
+if TYPE_CHECKING:
+    from dvrk_drake.models.arm import Arm
+
+
+def coupled_limit_fault(arm: Arm, limit: CoupledLimit) -> str:
+    """The first fault of a coupled limit, with what is allowed; or ""."""
+    key = f"coupled_limits.{limit.name}"
+    row = np.array([limit.coefficients.get(name, 0.0) for name in arm.joint_names])
+    coupled = row != 0
+    if not np.any(coupled):
+        return f"{key}: coefficients are all 0; allowed: a joint with another coefficient at least"
+    slides = bool(np.all(arm.prismatic[coupled]))
+    if fault := number_fault(limit):
+        return f"{key}.{fault}"
+    if fault := limits_fault(key, limit.lower, limit.upper, slides):
+        return fault
+    ends = np.sort(row * [arm.position_lower, arm.position_upper], axis=0).sum(axis=1)
+    if ends[1] < limit.lower or ends[0] > limit.upper:
+        return (
+            f"{key}: no pose inside position_limits meets {limit.lower:g}..{limit.upper:g}; "
+            f"allowed: limits that overlap {ends[0]:.4g}..{ends[1]:.4g}"
+        )
+    return ""
+
+
+def can_meet_coupled_limits(arm: Arm) -> bool:
+    """Whether a pose inside the position limits meets all coupled limits."""
+    from scipy.optimize import linprog  # slow to import, and few arms have two coupled limits
+
+    A, lower, upper = arm.limit_matrix()
+    n = arm.num_joints
+    bounds = np.column_stack([lower[:n], upper[:n]])
+    inequalities = np.vstack([A[n:], -A[n:]]), np.concatenate([upper[n:], -lower[n:]])
+    return bool(linprog(np.zeros(n), *inequalities, bounds=bounds).success)
+
+
+def limits_fault(key: str, lower: float, upper: float, slides: bool) -> str:
+    """The first fault of a lower and an upper limit of a position, with what is allowed; or ""."""
+    positions, widths = (TRAVELS, TRAVEL_WIDTHS) if slides else (ANGLES, ANGLE_WIDTHS)
+    if fault := positions.fault(f"{key}[0]", lower) or positions.fault(f"{key}[1]", upper):
+        return fault
+    if not lower < upper:
+        return f"{key} is [{lower:g}, {upper:g}]; allowed: [lower, upper] with lower < upper"
+    return widths.fault(f"{key}: upper - lower", upper - lower)
+
+
+def beside(arm: Arm, pose: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    """pose + offset (n,), where the offset of each joint is shortened so that no limit of `arm` is crossed."""
+    A, lower, upper = arm.limit_matrix()
+    change = A @ offset
+    room = np.where(change > 0, upper - A @ pose, A @ pose - lower)
+    share = np.clip(np.divide(room, np.abs(change), out=np.ones_like(room), where=change != 0), 0.0, 1.0)
+    joint_share = np.array([share[A[:, j] != 0].min() for j in range(arm.num_joints)])
+    point = pose + joint_share * offset
+    # Coupled limits with coefficients of both signs could be crossed by shortening one joint alone.
+    return pose if arm.limit_violations(point, 1e-9) else point

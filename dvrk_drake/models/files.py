@@ -1,0 +1,158 @@
+"""Input files opened with clear errors, and output files written at once or not at all."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from io import FileIO
+from pathlib import Path
+from typing import IO, Any
+
+from dvrk_drake.errors import DvrkDrakeError
+
+#: Largest settings or model file [bytes]; a model of a PSM with dynamics has 60 kB.
+LARGEST_TEXT = 4_000_000
+#: Largest file that is read as a whole in any other format [bytes].
+LARGEST_BINARY = 256_000_000
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | None = None) -> FileIO:
+    """Opens a regular file for reading, unbuffered.
+
+    A FIFO or a device is refused without waiting for it.
+
+    Args:
+        path: the file, or a link to it.
+        error: the type of error to raise.
+        largest: largest size that is accepted [bytes]; None for any size.
+
+    Raises:
+        DvrkDrakeError: of the type `error`; no such file, no regular file, too large, or it cannot be read.
+    """
+    try:
+        # Without O_NONBLOCK, opening a FIFO would wait for its writer.
+        file = open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb", buffering=0)  # noqa: SIM115
+    except FileNotFoundError as cause:
+        raise error(f"{path}: no such file") from cause
+    except IsADirectoryError as cause:
+        raise error(f"{path}: is not a file but a folder") from cause
+    except OSError as cause:
+        raise error(f"{path}: cannot be read: {cause.strerror}") from cause
+    except ValueError as cause:  # a null character
+        raise error(f"{str(path)!r}: is not the name of a file: {cause}") from cause
+    status = os.fstat(file.fileno())
+    if not stat.S_ISREG(status.st_mode):
+        file.close()
+        kind = _KINDS.get(stat.S_IFMT(status.st_mode), "something else")
+        raise error(f"{path}: is not a file but {kind}; write its content into a file first")
+    if largest is not None and status.st_size > largest:
+        file.close()
+        raise error(f"{path}: has {status.st_size / 1e6:.1f} MB; allowed: at most {largest / 1e6:g} MB")
+    return file
+
+
+def read_input(path: str | Path, error: type[DvrkDrakeError], largest: int = LARGEST_BINARY) -> bytes:
+    """Returns the content of a file.
+
+    Raises:
+        DvrkDrakeError: as `open_input`.
+    """
+    with open_input(path, error, largest) as file:
+        try:
+            content = file.read(largest + 1)
+        except OSError as cause:
+            raise error(f"{path}: cannot be read: {cause.strerror}") from cause
+    if len(content) > largest:  # it grew, or its size is not known before
+        raise error(f"{path}: is larger than {largest / 1e6:g} MB, which is the most that is allowed")
+    return content
+
+
+def read_text_input(path: str | Path, error: type[DvrkDrakeError], largest: int = LARGEST_TEXT) -> str:
+    """Returns the text of a file in UTF-8, with or without a byte-order mark.
+
+    Raises:
+        DvrkDrakeError: as `open_input`, or it is no such text.
+    """
+    content = read_input(path, error, largest)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as cause:
+        raise error(f"{path}: not a text file in UTF-8: {cause.reason} at byte {cause.start}") from cause
+
+
+def read_json_input(path: str | Path, error: type[DvrkDrakeError], largest: int = LARGEST_TEXT) -> Any:
+    """Returns the content of a JSON file.
+
+    Raises:
+        DvrkDrakeError: as `read_text_input`, or it is not JSON.
+    """
+    try:
+        return json.loads(read_text_input(path, error, largest))
+    except RecursionError as cause:
+        raise error(f"{path}: not JSON that can be read: its lists and tables are nested too deeply") from cause
+    except ValueError as cause:
+        raise error(f"{path}: not JSON: {cause}") from cause
+
+
+#: What the disk, not the caller's own code, may answer to a write.
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+
+
+@contextmanager
+def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO]:
+    """A stream into a temporary file that replaces `path` if the block ends well, and vanishes if not.
+
+    A link stays a link: what it points to is replaced. An existing file keeps its permissions.
+
+    Args:
+        path: the file to be.
+        mode: "w" for text in UTF-8 without newline translation, or "wb".
+
+    Raises:
+        DvrkDrakeError: no such folder, the file cannot be written, or it is no regular file (/dev/null).
+    """
+    target = Path(os.path.realpath(path))
+    exists = os.path.exists(target)
+    if exists and not target.is_file():
+        raise DvrkDrakeError(f"{path}: is not a regular file, so it cannot be replaced; name a file")
+    if exists and not os.access(target, os.W_OK):
+        raise DvrkDrakeError(f"{path}: cannot be written: it is read-only")
+    permissions = target.stat().st_mode & 0o777 if exists else 0o666 & ~_umask()
+    try:
+        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name[:100]}.")
+    except OSError as error:
+        raise DvrkDrakeError(f"{path}: cannot be written: {error.strerror}") from error
+    text: dict[str, Any] = {} if "b" in mode else {"encoding": "utf-8", "newline": ""}
+    try:
+        with os.fdopen(handle, mode, **text) as stream:
+            yield stream
+        os.chmod(temporary, permissions)
+        try:
+            os.replace(temporary, target)
+        except OSError as error:
+            raise DvrkDrakeError(f"{path}: cannot be written: {error.strerror}") from error
+    except BaseException as error:
+        with suppress(FileNotFoundError):
+            os.unlink(temporary)
+        if isinstance(error, OSError) and error.errno in _DISK_ERRORS:
+            raise DvrkDrakeError(f"{path}: cannot be written: {error.strerror}") from error
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

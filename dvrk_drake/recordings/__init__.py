@@ -1,0 +1,1 @@
+"""Recordings of arms: data, file formats, conversion."""

@@ -1,0 +1,175 @@
+"""Recordings converted to the CSV of this project: CSVs with a header, LCM logs, and public recordings of real arms.
+
+The public ones have two layouts, both of the WPI AIM lab; `docs/public_recordings.md` says how to obtain them.
+
+- "team-mat", https://github.com/WPI-AIM/dvrk_gravity_comp: a MATLAB array of 8 x 2 x N.
+- "wpi-csv", https://github.com/WPI-AIM/dvrk_dynamics_identification: a CSV of 21 columns without a header.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import os
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.recordings.csv_rows import read_bytes
+from dvrk_drake.recordings.lcm_log_reader import is_lcm_log
+from dvrk_drake.recordings.public_formats import (
+    looks_like_matlab,
+    made_times,
+    read_team_mat,
+    read_wpi_csv,
+    refuse_rate,
+    time_notes,
+    wpi_in_joint_coordinates,
+)
+from dvrk_drake.recordings.recording import Coordinates, Recording, column_names, read_recording, write_recording
+
+Format = Literal["csv", "team-mat", "wpi-csv", "lcm-log"]
+
+#: Formats that say what their numbers are of. A CSV with a header does not.
+DEFINED_COORDINATES: dict[str, Coordinates] = {"team-mat": "joint", "wpi-csv": "actuator", "lcm-log": "joint"}
+
+
+def convert(
+    path: str | Path,
+    output: str | Path,
+    *,
+    format: Format | None = None,
+    coordinates: Coordinates | None = None,
+    variable: str | None = None,
+    rate: float | None = None,
+    arm: Arm | None = None,
+    skip_invalid: bool = False,
+) -> Recording:
+    """Reads a recording and writes it as the CSV that `read_recording` reads, at once or not at all.
+
+    Time stamps of the recording are kept as they are.
+
+    Args:
+        path: the recording.
+        output: the CSV to write; an existing file is replaced.
+        format: None to look at the file.
+        coordinates: "csv": what q, qd and tau are of, which such a file does not say. Other formats define it.
+        variable: "team-mat": which variable; needed if several fit.
+        rate: of a CSV without time stamps: samples a second [Hz]. "wpi-csv": default 200; "csv": default no times.
+        arm: "csv", "wpi-csv": write joint coordinates of this arm; otherwise the file's own.
+            "lcm-log": the arm whose statuses are read; needed if there are several.
+        skip_invalid: leave out invalid rows (or poses) and count them, instead of refusing the file.
+
+    Returns:
+        The recording as written; `source`, `lines` and `notes` are of the original.
+
+    Raises:
+        RecordingError: the file does not have the format's layout, its coordinates are not known, or an option is not
+            for its format.
+        DvrkDrakeError: the output cannot be written.
+    """
+    if format is not None and format not in get_args(Format):
+        raise RecordingError(f'unknown format "{format}"; known formats: {", ".join(get_args(Format))}')
+    if coordinates is not None and coordinates not in get_args(Coordinates):
+        raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
+    if os.path.exists(output) and os.path.exists(path) and os.path.samefile(path, output):
+        raise RecordingError(f"{output}: is the recording itself; name another output")
+    chosen = format or detect_format(path)
+    defined = DEFINED_COORDINATES.get(chosen)
+    if defined is not None and coordinates not in (None, defined):
+        raise RecordingError(f"{path}: {chosen} is in {defined} coordinates, not {coordinates}")
+    if variable is not None and chosen in ("csv", "wpi-csv"):
+        raise RecordingError(f"{path}: --variable does not apply to {chosen}, which has no variables")
+    if chosen == "lcm-log":
+        if rate is not None or variable is not None or skip_invalid:
+            raise RecordingError(f"{path}: --rate, --variable and --skip-invalid do not apply to an LCM log")
+        if not is_lcm_log(Path(path)):
+            raise RecordingError(f"{path}: is not an LCM log")
+        recording = read_recording(path, arm)
+    elif chosen == "team-mat":
+        if rate is not None:
+            raise RecordingError(f"{path}: --rate does not apply to team-mat, whose poses have no time")
+        if arm is not None:
+            raise RecordingError(f"{path}: --arm does not apply to team-mat, which is in joint coordinates")
+        recording = read_team_mat(path, variable=variable, skip_invalid=skip_invalid)
+    elif chosen == "wpi-csv":
+        recording = read_wpi_csv(path, rate, skip_invalid=skip_invalid)
+        if arm is not None:
+            recording = wpi_in_joint_coordinates(recording, arm)
+    elif coordinates is None:
+        raise RecordingError(
+            f"{path}: its header does not say whether the numbers are of the joints or of the actuators; pass "
+            "--coordinates joint or --coordinates actuator (coordinates= in Python)"
+        )
+    else:
+        recording = _read_csv(Path(path), coordinates, rate, arm, skip_invalid)
+    if recording.coordinates == "actuator":
+        first, *others = recording.notes
+        note = (
+            "in actuator coordinates, which a CSV cannot say: pass --coordinates actuator to every command that reads "
+            "it, or convert with --arm"
+        )
+        if chosen == "wpi-csv":
+            note += " (of a PSM always: its roll is not the dVRK's actuator)"
+        recording = dataclasses.replace(recording, notes=(first, note, *others))
+    write_recording(recording, output)
+    return recording
+
+
+def _read_csv(
+    path: Path, coordinates: Coordinates, rate: float | None, arm: Arm | None, skip_invalid: bool
+) -> Recording:
+    """A CSV with a header that names q1.., with notes on its times and on what is not kept of it."""
+    recording = read_recording(path, arm, coordinates, skip_invalid=skip_invalid)
+    if recording.t is not None:
+        refuse_rate(path, rate)
+        assert recording.lines is not None
+        notes = time_notes(recording.t, recording.lines)
+    elif rate is not None:
+        assert recording.lines is not None
+        t, note = made_times(np.arange(len(recording)), rate)
+        recording, notes = dataclasses.replace(recording, t=t), [note]
+    else:
+        notes = [f"{len(recording)} rows without time stamps (no column t), as poses have; --rate HZ makes them"]
+    kept = [name for prefix in ("t", "q", "qd", "tau") for name in column_names(prefix, recording.q.shape[1])]
+    if other := [name for name in _header(read_bytes(path)) if name and name not in kept]:
+        notes.append(f"columns left out, which are not q, qd, tau or t: {', '.join(other)}")
+    if arm is not None:
+        recording = recording.in_joint_coordinates(arm)
+        recording.check_fits(arm)
+    return dataclasses.replace(recording, notes=(*notes, *recording.notes))
+
+
+def detect_format(path: str | Path) -> Format:
+    """The format a file seems to have, from its first bytes: LCM, MATLAB or text, and there whether a header names q1.
+
+    The reader judges the rest.
+
+    Raises:
+        RecordingError: no such file, or it is empty or none of them.
+    """
+    path = Path(path)
+    if is_lcm_log(path):
+        return "lcm-log"
+    content = read_bytes(path)
+    if not content.strip():
+        raise RecordingError(f"{path}: is empty")
+    if looks_like_matlab(path, content):
+        return "team-mat"
+    if b"\0" in content[:_HEAD]:
+        raise RecordingError(f"{path}: neither an LCM log, a MATLAB file (team-mat) nor a text file in UTF-8 (CSV)")
+    return "csv" if "q1" in _header(content) else "wpi-csv"
+
+
+#: First bytes that are looked at, in which a header ends.
+_HEAD = 4096
+
+
+def _header(content: bytes) -> list[str]:
+    """The cells of the first line that is not blank."""
+    text = content[:_HEAD].decode("utf-8-sig", errors="replace")
+    line = next((line for line in text.splitlines() if line.strip(" ,")), "")
+    return [cell.strip() for cell in next(csv.reader([line]), [])]

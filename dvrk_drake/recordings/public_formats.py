@@ -1,0 +1,280 @@
+"""Public recordings of real arms: motions as CSVs of 21 columns, static poses as MATLAB arrays of 8 x 2 x N.
+
+Of the WPI AIM lab, https://github.com/WPI-AIM/dvrk_dynamics_identification and
+https://github.com/WPI-AIM/dvrk_gravity_comp; `docs/public_recordings.md` says how to obtain them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import scipy.io
+from numpy.typing import NDArray
+
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.linear_map import LinearMap
+from dvrk_drake.recordings.csv_rows import (
+    is_number,
+    listed,
+    parse_finite,
+    parse_or_nan,
+    read_bytes,
+    read_rows,
+    skipped_note,
+)
+from dvrk_drake.recordings.recording import Recording
+
+#: Nominal rate of the recordings [Hz].
+WPI_RATE = 200.0
+
+#: Joints that are counted at the joint itself, although a disc drives them.
+WPI_DIRECT_JOINTS = ("roll",)
+
+_NUM_JOINTS = 7
+_WPI_COLUMNS = [f"{prefix}{i + 1}" for prefix in ("q", "qd", "tau") for i in range(_NUM_JOINTS)]
+_WPI_LAYOUT = "21 numbers a row: q1..q7, qd1..qd7, tau1..tau7"
+
+
+def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: bool = False) -> Recording:
+    """A motion from a CSV without a header: q1..q7, qd1..qd7, tau1..tau7, in actuator coordinates.
+
+    Units are rad, rad/s and N m. Of a PSM, axis 3 is in m, m/s and N, and axis 7 is the jaw. The file has
+    no time stamps: t = row / rate. The CSV that `convert` wrote without an arm (header t, q1.., qd1.., tau1..) is
+    read as well. It keeps its time stamps.
+
+    Format: https://github.com/WPI-AIM/dvrk_dynamics_identification, files
+    `data/*/measured_trajectory/*_results.csv`.
+
+    Args:
+        path: the CSV file.
+        rate: samples a second [Hz]; default: `WPI_RATE`.
+        skip_invalid: leave out rows with an empty cell, a NaN or an infinity instead of refusing the file; the other
+            rows keep their t.
+
+    Raises:
+        RecordingError: not such a file, fewer than two rows, a cell that is no finite number, or a rate for a file that
+            has time stamps.
+    """
+    path = Path(path)
+    rows, sha256 = read_rows(path)
+    if not rows:
+        raise RecordingError(f"{path}: is empty; needs {_WPI_LAYOUT}")
+    first_line, first = rows[0]
+    timed = first == ["t", *_WPI_COLUMNS]
+    names = ["t", *_WPI_COLUMNS] if timed else _WPI_COLUMNS
+    if timed:
+        refuse_rate(path, rate)
+        rows = rows[1:]
+    elif not any(is_number(cell) for cell in first):
+        raise RecordingError(
+            f"{path}:{first_line}: has a header, which wpi-csv has not ({_WPI_LAYOUT}); "
+            "a CSV whose header names q1..q7 needs no conversion"
+        )
+    values = np.empty((len(rows), len(names)))
+    parse = parse_or_nan if skip_invalid else parse_finite
+    for row, (line, cells) in enumerate(rows):
+        if len(cells) != len(names):
+            layout = f"its header names {len(names)} columns" if timed else f"wpi-csv has {_WPI_LAYOUT}"
+            raise RecordingError(f"{path}:{line}: has {len(cells)} cells; {layout}")
+        for column, cell in enumerate(cells):
+            values[row, column] = parse(cell, f"{path}:{line}: {names[column]} (column {column + 1})")
+    valid = np.all(np.isfinite(values), axis=1)
+    lines = np.array([line for line, _ in rows])
+    kept = values[valid]
+    if len(kept) < 2:
+        raise RecordingError(f"{path}: has {len(kept)} valid row{'s' * (len(kept) != 1)}; a motion needs at least 2")
+    if timed:
+        t, kept = kept[:, 0], kept[:, 1:]
+        notes = time_notes(t, lines[valid])
+    else:
+        t, note = made_times(np.flatnonzero(valid), WPI_RATE if rate is None else rate)
+        notes = [note]
+    if len(kept) < len(values):
+        notes.append(skipped_note(lines[~valid], len(values)))
+    repeats = int(np.sum(np.all(np.diff(kept, axis=0) == 0, axis=1)))
+    if repeats:
+        notes.append(f"{repeats} of {len(kept)} rows repeat the row before them (polled too fast); they are kept")
+    q, qd, tau = np.split(kept, 3, axis=1)
+    return Recording(
+        q=q,
+        tau=tau,
+        qd=qd,
+        t=t,
+        coordinates="actuator",
+        source=str(path),
+        lines=lines[valid],
+        notes=tuple(notes),
+        sha256=sha256,
+    )
+
+
+def refuse_rate(path: Path, rate: float | None) -> None:
+    """Raises RecordingError if a rate is given for a file that has time stamps."""
+    if rate is not None:
+        raise RecordingError(f"{path}: --rate does not apply: the file has time stamps (column t), which are kept")
+
+
+def made_times(rows: NDArray[np.intp], rate: float) -> tuple[NDArray[np.float64], str]:
+    """Times [s] for the numbers of rows of a file without time stamps, and the note that says so.
+
+    Raises:
+        RecordingError: the rate is no positive number.
+    """
+    if not (np.isfinite(rate) and rate > 0):
+        raise RecordingError(f"rate must be a positive number of Hz, not {rate}")
+    return rows / rate, f"{len(rows)} samples; the file has no time stamps, so t = row / {rate:g} Hz"
+
+
+def time_notes(t: NDArray[np.float64], lines: NDArray[np.int_]) -> list[str]:
+    """What a user must know of time stamps (m,) that are kept; `lines` (m,) are those of the file."""
+    steps = np.diff(t)
+    interval = f", median interval {1e3 * np.median(steps):.4g} ms" if len(steps) else ""
+    notes = [f"{len(t)} rows, t from {t[0]:g} to {t[-1]:g} s as in the file{interval}"]
+    if np.any(steps <= 0):
+        repeated, back = int(np.sum(steps == 0)), int(np.sum(steps < 0))
+        notes.append(
+            f"t does not always increase: {repeated} row{'s repeat' if repeated != 1 else ' repeats'} the t before "
+            f"{'them' if repeated != 1 else 'it'}, {back} go{'es' * (back == 1)} back, first at line "
+            f"{lines[1:][steps <= 0][0]}; kept, but a motion with such times is refused by identify"
+        )
+    return notes
+
+
+def wpi_in_joint_coordinates(recording: Recording, arm: Arm) -> Recording:
+    """A "wpi-csv" recording of `arm`, in actuator coordinates, in joint coordinates.
+
+    Its actuators are the dVRK's but for the roll of a PSM, which is the joint's own (Wang et al. 2019, PSM's table).
+
+    Raises:
+        RecordingError: wrong number of joints, or poses that the arm cannot have taken.
+    """
+    J = arm.transmission.matrix.copy()
+    for joint in set(WPI_DIRECT_JOINTS) & set(arm.joint_names):
+        row = arm.joint_names.index(joint)
+        J[row] = np.eye(arm.num_joints)[row]
+    converted = recording.in_joint_coordinates(dataclasses.replace(arm, transmission=LinearMap(J, np.zeros(len(J)))))
+    converted.check_fits(arm)
+    return converted
+
+
+_MTM_JOINTS = 7
+_MATLAB_REAL = {"double", "single", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
+_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_MATLAB_73 = (b"\x00\x02IM", b"\x02\x00MI")
+
+_T = TypeVar("_T")
+
+
+def looks_like_matlab(path: Path, content: bytes) -> bool:
+    """Whether a file with this content is one of MATLAB's, by its first bytes or its name."""
+    return content[126:128] in (b"IM", b"MI") or content[:8] == _HDF5_MAGIC or path.suffix.lower() == ".mat"
+
+
+def read_team_mat(path: str | Path, *, variable: str | None = None, skip_invalid: bool = False) -> Recording:
+    """Static poses from a MATLAB array of 8 x 2 x N: joint, position (first) or effort (second), pose.
+
+    The first seven rows are the joints in the dVRK's order [rad, N m], in joint coordinates; the eighth, the
+    gripper, is not actuated and dropped. 8 x 2 is one pose, because MATLAB drops trailing dimensions of 1. A
+    pose is invalid if it has a NaN or an infinity in its first seven rows, or only zeros: the arrays are
+    allocated before they are filled. In messages and in `Recording.lines`, poses count from 1 as in MATLAB.
+
+    Format: https://github.com/WPI-AIM/dvrk_gravity_comp, `GettingTorques/GetData.m`. MATLAB files up to
+    version 7; version 7.3 (HDF5) is not supported.
+
+    Args:
+        path: the `.mat` file.
+        variable: the array's name; None if the file has only one that fits.
+        skip_invalid: leave out invalid poses instead of refusing the file.
+
+    Raises:
+        RecordingError: not such a file, no or several variables fit, or a pose is invalid.
+    """
+    path = Path(path)
+    content = read_bytes(path)
+    name, array = _team_array(path, content, variable)
+    count = array.shape[2]
+    joints = array[:_MTM_JOINTS]
+    invalid = ~np.all(np.isfinite(joints), axis=(0, 1)) | ~np.any(joints, axis=(0, 1))
+    if np.any(invalid) and not skip_invalid:
+        raise RecordingError(_first_invalid_pose(path, joints, invalid))
+    if np.all(invalid):
+        raise RecordingError(f"{path}: variable {name} has no valid pose among its {count}")
+    kept = joints[:, :, ~invalid]
+    notes = [
+        f"{kept.shape[2]} static poses from variable {name}, in joint coordinates",
+        "the eighth row (gripper, not actuated) is dropped",
+    ]
+    if np.any(invalid):
+        poses = listed(np.flatnonzero(invalid) + 1)
+        notes.append(f"{np.sum(invalid)} of {count} poses skipped (NaN, infinite or all zeros): {poses}")
+    return Recording(
+        q=kept[:, 0].T.copy(),
+        tau=kept[:, 1].T.copy(),
+        source=str(path),
+        lines=np.flatnonzero(~invalid) + 1,
+        notes=tuple(notes),
+        sha256=hashlib.sha256(content).hexdigest(),
+    )
+
+
+def _team_array(path: Path, content: bytes, variable: str | None) -> tuple[str, NDArray[np.float64]]:
+    """The chosen variable and its name, always as (8, 2, N)."""
+    if content[:8] == _HDF5_MAGIC or content[124:128] in _MATLAB_73:
+        raise RecordingError(
+            f"{path}: is a MATLAB v7.3 (HDF5) file, which is not supported; load it in MATLAB and save it with '-v7'"
+        )
+    listed = _matlab(path, lambda: scipy.io.whosmat(io.BytesIO(content)))
+    found = ", ".join(f"{n} ({' x '.join(map(str, s))} {kind})" for n, s, kind in listed) or "no variables"
+    fitting = [n for n, s, kind in listed if s[:2] == (8, 2) and len(s) <= 3 and kind in _MATLAB_REAL]
+    layout = "8 x 2 x N real numbers (joint; position or effort; pose)"
+    if variable is not None:
+        if variable not in (n for n, _, _ in listed):
+            raise RecordingError(f"{path}: has no variable {variable}; it has: {found}")
+        if variable not in fitting:
+            raise RecordingError(f"{path}: variable {variable} must be {layout}; the file has: {found}")
+    elif not fitting:
+        raise RecordingError(f"{path}: no variable is {layout}; it has: {found}")
+    elif len(fitting) > 1:
+        raise RecordingError(
+            f"{path}: several variables fit: {', '.join(fitting)}; "
+            "choose one with --variable NAME (variable= in Python)"
+        )
+    name = variable or fitting[0]
+    array = _matlab(path, lambda: scipy.io.loadmat(io.BytesIO(content), variable_names=[name])[name])
+    if np.iscomplexobj(array):
+        raise RecordingError(f"{path}: variable {name} is complex; it must be {layout}")
+    if array.size == 0:
+        raise RecordingError(f"{path}: variable {name} has no poses")
+    return name, array.astype(float).reshape(8, 2, -1)
+
+
+def _matlab(path: Path, read: Callable[[], _T]) -> _T:
+    try:
+        with warnings.catch_warnings():
+            # "returned data may be corrupt"
+            warnings.simplefilter("error", UserWarning)
+            return read()
+    except Exception as error:
+        # A damaged file makes scipy raise anything: ValueError, OSError, MatReadError, zlib.error, ...
+        text = " ".join(str(error).split())
+        raise RecordingError(f"{path}: not a MATLAB file that can be read: {text}") from error
+
+
+def _first_invalid_pose(path: Path, joints: NDArray[np.float64], invalid: NDArray[np.bool_]) -> str:
+    pose = int(np.flatnonzero(invalid)[0])
+    bad = np.argwhere(~np.isfinite(joints[:, :, pose]))
+    problem = "pose has only zeros, so it was never recorded"
+    if len(bad):
+        joint, which = bad[0]
+        name, value = f"{('q', 'tau')[which]}{joint + 1}", joints[joint, which, pose]
+        problem = f"{name} is {value}; only finite numbers are allowed"
+    count = f"{np.sum(invalid)} of {len(invalid)} poses"
+    return f"{path}:{pose + 1}: {problem}; {count} are invalid (--skip-invalid leaves them out)"

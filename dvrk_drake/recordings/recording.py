@@ -1,0 +1,363 @@
+"""A recording of an arm: positions and efforts over time or over poses, read from CSV or an LCM log, written to CSV."""
+
+from __future__ import annotations
+
+import csv
+import math
+from array import array
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.files import atomic_write
+from dvrk_drake.recordings.csv_rows import CsvReader, is_number, parse_finite, parse_or_nan, skipped_note
+from dvrk_drake.recordings.lcm_log_reader import is_lcm_log
+from dvrk_drake.recordings.lcm_status_log import read_status_log
+
+Coordinates = Literal["joint", "actuator"]
+
+#: A pose further than this outside the limits is refused [rad], [m]; nearer ones are real: stops give way.
+LIMIT_TOLERANCE = 0.2, 0.02
+#: No position, speed or effort of these arms is larger, in whatever unit it may be by mistake.
+LARGEST = 1e6
+#: Most rows of a CSV; 15 min at 1 kHz. With these, `check` takes 1.5 GB.
+LARGEST_COUNT = 900_000
+#: RMS joint speed above which a recording counts as a motion [rad/s], [m/s].
+REST_SPEED = 0.05, 0.005
+#: Poses whose joints all agree this well are one pose [rad], [m].
+SAME_POSE = 0.01, 0.001
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One row a sample; rad and N m, m and N on a prismatic joint, s.
+
+    Attributes:
+        q: (m, n) positions.
+        tau: (m, n) efforts that the motors apply, or None.
+        qd: (m, n) velocities, or None.
+        t: (m,) time, or None for poses.
+        coordinates: whether q, qd and tau are of the joints or of the actuators.
+        source: where it came from, for messages.
+        lines: (m,) line of each row in the source, of an LCM log the event's number, for messages.
+        sha256: of the source's bytes, or "".
+        notes: what a user must know of how it was read, a line each: damage, messages left out.
+    """
+
+    q: NDArray[np.float64]
+    tau: NDArray[np.float64] | None = None
+    qd: NDArray[np.float64] | None = None
+    t: NDArray[np.float64] | None = None
+    coordinates: Coordinates = "joint"
+    source: str = ""
+    lines: NDArray[np.int_] | None = None
+    sha256: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def where(self, row: int) -> str:
+        """`file:line` of a row, or the row's number where there is no file."""
+        source = self.source or "recording"
+        return f"{source}:{self.lines[row]}" if self.lines is not None else f"{source}: row {row + 1}"
+
+    def motion(self, arm: Arm) -> str:
+        """Which joint moves most and how fast, e.g. "joint 1 at 0.2 rad/s RMS"; empty if all rest, or nothing tells.
+
+        From qd, or from q over t where samples follow within 0.1 s: between poses the arm may well have moved.
+        """
+        if self.qd is not None:
+            qd = self.qd
+        elif self.t is not None and len(self) > 1 and np.all(np.diff(self.t) > 0) and np.median(np.diff(self.t)) < 0.1:
+            qd = np.diff(self.q, axis=0) / np.diff(self.t)[:, None]
+        else:
+            return ""
+        speed = np.sqrt(np.mean(qd**2, axis=0))
+        share = speed / arm.per_joint(*REST_SPEED)
+        joint = int(np.argmax(share))
+        unit = "m/s" if arm.prismatic[joint] else "rad/s"
+        return f"joint {joint + 1} at {speed[joint]:.2g} {unit} RMS" if share[joint] > 1 else ""
+
+    def measured_effort(self) -> NDArray[np.float64]:
+        """tau (m, n).
+
+        Raises:
+            RecordingError: the recording has none.
+        """
+        if self.tau is None:
+            raise RecordingError(
+                f"{self.source or 'recording'}: has no efforts; needs columns tau1..tau{self.q.shape[1]}"
+            )
+        return self.tau
+
+    def in_joint_coordinates(self, arm: Arm) -> Recording:
+        """The same recording with q, qd and tau of the arm's joints.
+
+        Raises:
+            RecordingError: wrong number of joints.
+        """
+        self._check_joint_count(arm)
+        if self.coordinates == "joint":
+            return self
+        to_joint = arm.transmission.inverse()
+        return replace(
+            self,
+            q=to_joint.position(self.q),
+            qd=None if self.qd is None else to_joint.velocity(self.qd),
+            tau=None if self.tau is None else arm.transmission.pull_back_effort(self.tau),
+            coordinates="joint",
+        )
+
+    def in_actuator_coordinates(self, arm: Arm) -> Recording:
+        """The same recording with q, qd and tau of the arm's actuators.
+
+        Raises:
+            RecordingError: wrong number of joints.
+        """
+        self._check_joint_count(arm)
+        if self.coordinates == "actuator":
+            return self
+        return replace(
+            self,
+            q=arm.transmission.position(self.q),
+            qd=None if self.qd is None else arm.transmission.velocity(self.qd),
+            tau=None if self.tau is None else arm.transmission.inverse().pull_back_effort(self.tau),
+            coordinates="actuator",
+        )
+
+    def check_fits(self, arm: Arm) -> None:
+        """Refuses poses that `arm` cannot have taken.
+
+        Raises:
+            RecordingError: wrong number of joints, a unit suspected to be wrong, or a pose far outside the limits.
+        """
+        self._check_sizes()
+        q = self.in_joint_coordinates(arm).q
+        excess = np.maximum(arm.position_lower - q, q - arm.position_upper) / arm.per_joint(*LIMIT_TOLERANCE)
+        row, joint = np.unravel_index(np.argmax(excess), excess.shape)
+        if excess[row, joint] <= 1:
+            return
+        lower, upper = arm.position_lower[joint], arm.position_upper[joint]
+        message = (
+            f"{self.where(int(row))}: {arm.joint_names[joint]} (q{joint + 1}) = {q[row, joint]:.4g} "
+            f"is outside {lower:.4g}..{upper:.4g}{' m' if arm.prismatic[joint] else ''} of {arm.name}"
+        )
+        outside = np.mean(np.any(excess > 1, axis=1))
+        shares = np.max(np.abs(q) / np.maximum(-arm.position_lower, arm.position_upper), axis=0)
+        turning = np.max(shares[~arm.prismatic])
+        # Another arm or other coordinates exceed the limits by a factor of 2 or 3, degrees by up to 57.
+        if outside > 0.3 and turning > 4 and np.radians(turning) <= 1.2:
+            message += "; are these degrees, or is it another arm? Positions must be in rad (m on a prismatic joint)"
+        elif arm.prismatic[joint] and shares[joint] > 4:
+            message += "; are these millimetres or centimetres? A prismatic joint must be in m, its effort in N"
+        else:
+            message += "; is this the right arm, and are the coordinates (joint or actuator) right?"
+        if pairs := self._exchanges_within_limits(arm):
+            message += f" Or are columns exchanged? Within the limits with {', '.join(pairs)} exchanged"
+        raise RecordingError(message)
+
+    def _exchanges_within_limits(self, arm: Arm) -> list[str]:
+        """Pairs of columns, such as "q1 and q4", that put all poses within the limits if they are exchanged."""
+        pairs, tolerance = [], arm.per_joint(*LIMIT_TOLERANCE)
+        for i, j in combinations(range(arm.num_joints), 2):
+            order = np.arange(arm.num_joints)
+            order[[i, j]] = j, i
+            q = replace(self, q=self.q[:, order], qd=None, tau=None).in_joint_coordinates(arm).q
+            if np.all((q >= arm.position_lower - tolerance) & (q <= arm.position_upper + tolerance)):
+                pairs.append(f"q{i + 1} and q{j + 1}")
+        return pairs
+
+    def _check_sizes(self) -> None:
+        for name, values in (("q", self.q), ("qd", self.qd), ("tau", self.tau)):
+            if values is not None and np.any(np.abs(values) > LARGEST):
+                row, joint = np.argwhere(np.abs(values) > LARGEST)[0]
+                raise RecordingError(
+                    f"{self.where(int(row))}: {name}{joint + 1} = {values[row, joint]:g} is no reading of an arm; "
+                    f"at most {LARGEST:g}"
+                )
+
+    def _check_joint_count(self, arm: Arm) -> None:
+        if self.q.shape[1] != arm.num_joints:
+            source = self.source or "recording"
+            raise RecordingError(
+                f"{source}: has {self.q.shape[1]} joints, {arm.name} has {arm.num_joints}: {', '.join(arm.joint_names)}"
+            )
+
+
+def read_recording(
+    path: str | Path,
+    arm: Arm | None = None,
+    coordinates: Coordinates = "joint",
+    progress: Callable[[float], object] = lambda share: None,
+    *,
+    skip_invalid: bool = False,
+) -> Recording:
+    """Reads a CSV, or an LCM log with the DVRK_STATUS messages of an arm; the file's first bytes tell which.
+
+    A CSV has a header: q1..qn, optionally t, qd1..qdn and tau1..taun, in any order; others are ignored. What is read of
+    a log: `read_status_log`.
+
+    Args:
+        path: the CSV or log.
+        arm: whose joints are counted and named in messages, and whose statuses are read of a log; without it a CSV has
+            7 joints, as all arms have so far, and a log statuses of one arm only.
+        coordinates: what q, qd and tau are of; a log's are of the joints.
+        progress: called with the share 0..1 of a CSV that was read.
+        skip_invalid: leave out rows of a CSV with an empty cell, a NaN or an infinity, and note them, instead of
+            refusing the file.
+
+    Raises:
+        RecordingError: names the file, the line and the column of what is wrong.
+    """
+    if coordinates not in get_args(Coordinates):
+        raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
+    path = Path(path)
+    if is_lcm_log(path):
+        if coordinates != "joint":
+            raise RecordingError(f"{path}: an LCM log is in joint coordinates, not {coordinates}")
+        log = read_status_log(path, arm)
+        return Recording(log.q, log.tau, log.qd, log.t, "joint", str(path), log.events, log.sha256, log.notes)
+    return _read_csv(path, arm, coordinates, progress, skip_invalid)
+
+
+def _read_csv(
+    path: Path,
+    arm: Arm | None,
+    coordinates: Coordinates,
+    progress: Callable[[float], object],
+    skip_invalid: bool,
+) -> Recording:
+    num_joints = arm.num_joints if arm else 7
+    with CsvReader(path, progress) as reader:
+        header_line, cells = next(iter(reader), (0, []))
+        if not cells:
+            raise RecordingError(f"{path}: is empty; needs a header with {_wanted(num_joints)}")
+        header = [cell.strip() for cell in cells]
+        blocks = _columns_of_blocks(f"{path}:{header_line}", header, arm, num_joints)
+        values, lines, skipped = _read_numbers(path, reader, header, blocks, skip_invalid)
+        sha256 = reader.sha256()
+    if not lines:
+        rows = "no row of finite numbers" if skipped else "a header but no rows"
+        raise RecordingError(f"{path}: has {rows}")
+    q, qd, tau, t = (
+        np.frombuffer(values[prefix]).reshape(len(lines), -1) if prefix in values else None
+        for prefix in ("q", "qd", "tau", "t")
+    )
+    assert q is not None
+    times = None if t is None else t[:, 0]
+    notes = (skipped_note(np.array(skipped), len(lines) + len(skipped)),) if skipped else ()
+    return Recording(q, tau, qd, times, coordinates, str(path), np.frombuffer(lines, np.int64), sha256, notes)
+
+
+def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joints: int) -> dict[str, list[int]]:
+    """Prefix -> the columns in which a header has q, qd, tau and t."""
+    if all(is_number(cell) for cell in header):
+        raise RecordingError(
+            f"{where}: has no header; the first line must name the columns, "
+            f"{_wanted(num_joints)} (dvrk-drake convert reads headerless public formats)"
+        )
+    if twice := next((name for name, count in Counter(header).items() if name and count > 1), ""):
+        raise RecordingError(f"{where}: column {twice[:30]} is named twice")
+    blocks = {}
+    for prefix, needed in (("q", True), ("qd", False), ("tau", False)):
+        names = column_names(prefix, num_joints)
+        missing = [name for name in names if name not in header]
+        if len(missing) == num_joints and not needed:
+            continue
+        if missing:
+            raise RecordingError(
+                f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
+                f"needs {_wanted(num_joints)}{_joint_list(arm)}"
+            )
+        if f"{prefix}{num_joints + 1}" in header:
+            raise RecordingError(
+                f"{where}: has {prefix}{num_joints + 1}, but the arm has {num_joints} joints{_joint_list(arm)}"
+            )
+        blocks[prefix] = [header.index(name) for name in names]
+    if "t" in header:
+        blocks["t"] = [header.index("t")]
+    return blocks
+
+
+def _read_numbers(
+    path: Path, reader: CsvReader, header: list[str], blocks: dict[str, list[int]], skip_invalid: bool
+) -> tuple[dict[str, array], array, list[int]]:
+    """Prefix -> the numbers in its columns, row by row; the line of each row; the lines that are skipped."""
+    skipped: list[int] = []
+    values, lines = {prefix: array("d") for prefix in blocks}, array("q")
+    parts = [(values[prefix], columns) for prefix, columns in blocks.items()]
+    width = len(header)
+    for line, cells in reader:
+        if len(cells) != width:
+            raise RecordingError(f"{path}:{line}: has {len(cells)} cells, the header names {width} columns")
+        if len(lines) == LARGEST_COUNT:
+            raise RecordingError(f"{path}:{line}: has more than {LARGEST_COUNT} rows; cut the recording into parts")
+        if skip_invalid and not all(
+            math.isfinite(parse_or_nan(cells[column].strip(), f"{path}:{line}: {header[column]}"))
+            for _, columns in parts
+            for column in columns
+        ):
+            skipped.append(line)
+            continue
+        lines.append(line)
+        for part, columns in parts:
+            try:
+                numbers = [float(cells[column]) for column in columns]
+                is_good = math.isfinite(sum(numbers)) and not reader.has_underscore
+            except ValueError:
+                is_good = False
+            if not is_good:
+                numbers = [
+                    parse_finite(cells[column].strip(), f"{path}:{line}: {header[column]}") for column in columns
+                ]
+            part.extend(numbers)
+    return values, lines, skipped
+
+
+def column_names(prefix: str, num_joints: int) -> list[str]:
+    """The columns of q, qd, tau, or t in a CSV."""
+    return ["t"] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(num_joints)]
+
+
+def write_recording(recording: Recording, path: str | Path) -> None:
+    """Writes the CSV that `read_recording` reads, at once or not at all, with every digit of every number."""
+    columns, header = [], []
+    for prefix, block in (
+        ("t", recording.t),
+        ("q", recording.q),
+        ("qd", recording.qd),
+        ("tau", recording.tau),
+    ):
+        if block is not None:
+            columns.append(block.reshape(len(recording), -1))
+            header += column_names(prefix, recording.q.shape[1])
+    write_csv(path, header, np.hstack(columns))
+
+
+def write_csv(path: str | Path, header: list[str], values: NDArray[np.float64]) -> None:
+    """Writes a table of numbers at once or not at all; every digit is kept.
+
+    Raises:
+        DvrkDrakeError: the folder does not exist or cannot be written.
+    """
+    with atomic_write(path) as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows([repr(float(x)) for x in row] for row in values)
+
+
+def _joint_list(arm: Arm | None) -> str:
+    return f"; of {arm.name} these are {', '.join(arm.joint_names)}" if arm else ""
+
+
+def _wanted(num_joints: int) -> str:
+    return f"q1..q{num_joints} and tau1..tau{num_joints} (t and qd1..qd{num_joints} optional)"

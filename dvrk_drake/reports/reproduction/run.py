@@ -1,0 +1,74 @@
+"""Redoes what is asked for and writes a page of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.experiments.reproduction.laboratory import Extent, Laboratory
+from dvrk_drake.experiments.reproduction.recordings import PaperRecordings
+from dvrk_drake.experiments.study.executors import local_executor
+from dvrk_drake.reports.reproduction.dh_table import reproduce_table_1
+from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, reproduce_figure_6
+from dvrk_drake.reports.reproduction.page import Section, write_page
+from dvrk_drake.reports.reproduction.psm import reproduce_psm
+from dvrk_drake.reports.reproduction.step_response import reproduce_figure_7
+from dvrk_drake.reports.reproduction.torque_errors import reproduce_figure_4
+from dvrk_drake.reports.reproduction.transparency import reproduce_transparency
+
+_MAKERS: dict[str, Callable[[Laboratory], Section]] = {
+    "table1": lambda laboratory: reproduce_table_1(),
+    "fig4": lambda laboratory: reproduce_figure_4(
+        laboratory.recordings, laboratory.folder, lambda share: laboratory.progress("Fig. 4: identifying", share)
+    ),
+    "fig5": reproduce_figure_5,
+    "fig6": reproduce_figure_6,
+    "fig7": reproduce_figure_7,
+    "psm": reproduce_psm,
+    "transparency": reproduce_transparency,
+}
+#: What can be redone, in the order of the page.
+NAMES = tuple(_MAKERS)
+
+
+def reproduce(
+    names: Sequence[str],
+    folder: Path,
+    recordings: PaperRecordings,
+    progress: Callable[[str, float], None] = lambda what, share: None,
+    extent: Extent | None = None,
+    seed: int = 0,
+) -> Path:
+    """Writes figures, tables and index.md, which has what is finished at any time.
+
+    Args:
+        names: of `NAMES`.
+        folder: an existing one.
+        recordings: without them Fig. 4 is left out if other things are asked for, and Fig. 5 and 6 have another arm.
+        progress: called with what is being done and the finished share of it.
+        extent: how much is done.
+        seed: of true arms, poses and noise.
+
+    Returns:
+        The page.
+
+    Raises:
+        DvrkDrakeError: a name that is not known.
+        RecordingError: a recording cannot be read, or Fig. 4 alone is asked for and there is none.
+    """
+    if unknown := sorted(set(names) - set(NAMES)):
+        raise DvrkDrakeError(f"{', '.join(unknown)} cannot be reproduced; known: {', '.join(NAMES)}")
+    wanted = [name for name in NAMES if name in names]
+    left_out = []
+    if recordings.folder is None and "fig4" in wanted and len(wanted) > 1:
+        wanted.remove("fig4")
+        left_out.append("Fig. 4 needs the recording of the paper's poses; name its folder with --data.")
+    with local_executor() as executor:
+        laboratory = Laboratory(folder, recordings, executor, progress, extent or Extent(), seed)
+        sections: list[Section] = []
+        for name in wanted:
+            sections.append(_MAKERS[name](laboratory))
+            unfinished = [f"{later} was not finished." for later in wanted[len(sections) :]]
+            page = write_page(folder, sections, [*left_out, *unfinished])
+    return page

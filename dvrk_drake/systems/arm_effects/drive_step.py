@@ -1,0 +1,197 @@
+"""What happens in a real arm's drive once a time step: springs of dry friction give way, encoders are read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
+
+from dvrk_drake.dynamics.actuator_effects import effect_step
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
+from dvrk_drake.systems.arm_effects.motors import in_steps
+from dvrk_drake.systems.arm_effects.plant_effects import PlantEffects
+from dvrk_drake.systems.gravity_pid_step import entry_point
+
+
+class DriveStep(LeafSystem):
+    """Two things in one system, as each Python system costs 4 us a step: springs of friction, and encoders.
+
+    .. pydrake_system::
+
+        name: DriveStep
+        input_ports:
+        - plant_state
+        output_ports:
+        - desired_state
+        - state_estimated
+
+    - `plant_state`: of the plant that the sliders of `add_friction` are part of.
+    - `desired_state`: for the plant's port of that name and the arm's instance: positions, then velocities (zero) of
+      all its actuators. The position of a slider's actuator is where its spring is hooked on.
+    - `state_estimated` (2n): q, then v of the arm's joints as measured, `delay` time steps ago [rad, rad/s; m, m/s on
+      a prismatic joint].
+
+    **Friction.** A hook stands still while its spring is stretched by less than it holds, and follows at that distance
+    when it is stretched further: `effect_step` of the slider's kind. The plant takes the spring at the end of a step
+    and the hook moves after it, always to less stretch: what a slider has taken is never less than what its spring
+    holds, so friction never gives energy. At initialization all springs are slack.
+
+    **Encoders.** A position of an actuator is a whole number of counts; joints follow by the transmission. The velocity
+    is the difference of two readings over the time step h, low-passed to first order: with a = exp(-2 pi f h),
+    y[k] = a y[k-1] + (1 - a) (x[k] - x[k-1]) / h. Without an encoder, position and velocity are exact. The arm is taken
+    to have rested before it starts: where `set_at_rest` says, or where it is at initialization. With a delay, what is
+    out during initialization itself is the former.
+    """
+
+    def __init__(self, arm: Arm, parts: PlantEffects, effects: ArmEffects, q_default: NDArray[np.float64]) -> None:
+        """Of `arm`, whose plant is finalized and has the `parts`; it rested at `q_default` (n,) before it starts."""
+        super().__init__()
+        n, time_step = arm.num_joints, parts.time_step
+        encoder, delay = effects.encoder, effects.delay.measurement if effects.delay else 0
+        resolution = per_actuator(encoder.resolution if encoder else {}, arm.joint_names, 0.0)
+        decay = math.exp(-2.0 * math.pi * encoder.velocity_cut_off * time_step) if encoder else -1.0
+        self._constants = np.concatenate([resolution, [decay, time_step]])
+        self._J = arm.transmission.matrix
+        to_joints = np.ascontiguousarray(np.linalg.inv(arm.transmission.matrix))
+        exact = to_joints @ parts.to_actuators
+        whole = np.rint(exact)  # no rounding errors in what is only picked out
+        self._maps = parts.to_actuators, to_joints, np.where(np.abs(exact - whole) < 1e-12, whole, exact)
+        self._places = np.array([[s.code, s.actuator, s.position] for s in parts.sliders], dtype=int).reshape(-1, 3)
+        self._laws = np.array([[s.travel, s.fall_speed, s.side] for s in parts.sliders]).reshape(-1, 3)
+        self._measure_into = entry_point(_measure_into)
+        self.DeclareVectorInputPort(name="plant_state", size=2 * exact.shape[1])
+        self._queue_length = max(delay - 1, 0)
+        hooks = self.DeclareDiscreteState(num_state_variables=2 * parts.num_actuators)
+        self.DeclareStateOutputPort(name="desired_state", state_index=hooks)
+        out, memory = self._at_rest(q_default)
+        self.DeclareDiscreteState(out)
+        self.DeclareDiscreteState(memory)
+        if delay:
+            self.DeclareStateOutputPort(name="state_estimated", state_index=DiscreteStateIndex(_OUT))
+        else:
+            needs = {self.all_input_ports_ticket(), self.all_state_ticket()}
+            self.DeclareVectorOutputPort(
+                name="state_estimated", size=2 * n, calc=self._calc, prerequisites_of_calc=needs
+            )
+        self.DeclareInitializationDiscreteUpdateEvent(update=self._start)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_sec=time_step, offset_sec=0.0, update=self._make_update())
+
+    def _make_update(self) -> Callable[[Context, DiscreteValues], None]:
+        """The handler of the update, with all that it needs at hand: see GravityPidController."""
+        eval_vector_input, follow, measure_into = self.EvalVectorInput, entry_point(_follow), self._measure_into
+        places, laws, maps, constants = self._places, self._laws, self._maps, self._constants
+        rubs, time_step = len(places) > 0, self._constants[-1]
+
+        def update(context: Context, discrete_state: DiscreteValues) -> None:
+            state = eval_vector_input(context, 0).get_value()
+            value = discrete_state.get_mutable_value
+            if rubs:
+                follow(state, places, laws, time_step, value(_HOOKS))
+            measure_into(state, *maps, constants, value(_MEMORY), value(_OUT))
+
+        return update
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        """Without delay: what the update is about to compute."""
+        memory = context.get_discrete_state(_MEMORY).get_value().copy()
+        state = self.EvalVectorInput(context, 0).get_value()
+        self._measure_into(state, *self._maps, self._constants, memory, output.get_mutable_value())
+
+    def set_at_rest(self, context: Context, q: NDArray[np.float64]) -> None:
+        """What has been measured of an arm that rested at q (n,) until now; in this system's context."""
+        for group, value in zip((_OUT, _MEMORY), self._at_rest(q), strict=True):
+            context.SetDiscreteState(group, value)
+
+    def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
+        state = self.EvalVectorInput(context, 0).get_value()
+        hooks = discrete_state.get_mutable_value(_HOOKS)
+        hooks[self._places[:, 1]] = state[self._places[:, 2]]
+        exact = self._maps[2]
+        for group, value in zip((_OUT, _MEMORY), self._at_rest(exact @ state[: exact.shape[1]]), strict=True):
+            discrete_state.set_value(group, value)
+
+    def _at_rest(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What is out, and what is remembered."""
+        n = len(q)
+        a = self._J @ q
+        if self._constants[n] >= 0.0:
+            a = np.array([in_steps(x, step) for x, step in zip(a, self._constants[:n], strict=True)])
+            q = self._maps[1] @ a
+        still = np.zeros(n)
+        out = np.concatenate([q, still])
+        return out, np.concatenate([a, still, *[out] * self._queue_length])
+
+
+_HOOKS, _OUT, _MEMORY = 0, 1, 2  # indices of the discrete state groups
+
+
+@numba.njit("void(float64[::1], int64[:, ::1], float64[:, ::1], float64, float64[::1])", cache=True)
+def _follow(state, places, laws, time_step, hooks):
+    """Moves the hooks; see `Slider` for `places` and `laws`."""
+    num_positions = len(state) // 2
+    for i in range(len(places)):
+        code, hook, column = places[i]
+        travel, fall_speed, side = laws[i]
+        position, velocity = state[column], state[num_positions + column]
+        holds = travel
+        if fall_speed > 0.0:
+            holds *= max(math.exp(-((velocity / fall_speed) ** 2)), 1e-6)
+        stretch = side * (position - hooks[hook])
+        # A spring that starts slack and is stretched that far has the element's state.
+        z, _ = effect_step(code, 0.0, stretch, 0.0, holds)
+        if abs(stretch - z * holds) < 1e-12 * travel:
+            continue
+        stretch = z * holds
+        if holds < travel:
+            # The arm stretches it further in the step that goes on and in the one that it is for. Up to `travel`, the
+            # effort limit takes care of that.
+            stretch = math.copysign(max(abs(stretch) - 2.0 * time_step * abs(velocity), 0.0), stretch)
+        hooks[hook] = position - side * stretch
+
+
+@numba.njit(
+    "void(float64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1], float64[::1], float64[::1])",
+    cache=True,
+)
+def _measure_into(state, to_actuators, to_joints, exact, constants, memory, out):
+    """Measures `state`; the oldest measurement of the queue goes out and this one in, or out at once if it has none.
+
+    `memory` is the last reading and velocity of the actuators, then the queue; `constants` are resolutions (n), decay
+    of the low-pass, time step.
+    """
+    n, num_positions = to_actuators.shape
+    decay, time_step = constants[n], constants[n + 1]
+    queue = memory[2 * n :]
+    late = len(queue)
+    measured = out
+    if late:
+        out[:] = queue[: 2 * n]
+        for i in range(late - 2 * n):
+            queue[i] = queue[i + 2 * n]
+        measured = queue[late - 2 * n :]
+    if decay < 0.0:
+        for i in range(n):
+            q, v = 0.0, 0.0
+            for k in range(num_positions):
+                q += exact[i, k] * state[k]
+                v += exact[i, k] * state[num_positions + k]
+            measured[i], measured[n + i] = q, v
+        return
+    for i in range(n):
+        a = 0.0
+        for k in range(num_positions):
+            a += to_actuators[i, k] * state[k]
+        a = in_steps(a, constants[i])
+        memory[n + i] = decay * memory[n + i] + (1.0 - decay) * (a - memory[i]) / time_step
+        memory[i] = a
+    for i in range(n):
+        q, v = 0.0, 0.0
+        for k in range(n):
+            q += to_joints[i, k] * memory[k]
+            v += to_joints[i, k] * memory[n + k]
+        measured[i], measured[n + i] = q, v

@@ -1,0 +1,82 @@
+"""The drive of a real arm: the parts of `ArmEffects` between a plant and the ports of its station."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.systems.primitives import DiscreteTimeDelay, PassThrough
+
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect
+from dvrk_drake.systems.arm_effects.drive_force import DriveForce
+from dvrk_drake.systems.arm_effects.drive_step import DriveStep
+from dvrk_drake.systems.arm_effects.motors import EffortSensor, Motors
+from dvrk_drake.systems.arm_effects.plant_effects import PlantEffects
+from dvrk_drake.systems.ideal_drive import DrivePorts, add_true_state
+from dvrk_drake.systems.plant_joints import PlantJoints
+
+
+@dataclass(frozen=True)
+class RealDrive:
+    """What `add_real_drive` needs.
+
+    Attributes:
+        arm: that is simulated.
+        plant: finalized, of which `instance` is the arm, `joints` its joints, `parts` what was added to it.
+        effects: all of them.
+        seed: of the noise.
+        home: (n,) where the arm rests before it starts.
+    """
+
+    arm: Arm
+    plant: MultibodyPlant
+    instance: ModelInstanceIndex
+    joints: PlantJoints
+    parts: PlantEffects
+    effects: ArmEffects
+    seed: int
+    home: NDArray[np.float64]
+
+
+def add_real_drive(builder: DiagramBuilder, drive: RealDrive) -> tuple[DrivePorts, DriveStep]:
+    """Connects a finalized plant's inputs; returns the ports and the system that knows what was measured."""
+    drive.parts.finish(drive.joints)
+    plant, delay = drive.plant, drive.effects.delay or DelayEffect()
+    step = builder.AddNamedSystem("drive_step", DriveStep(drive.arm, drive.parts, drive.effects, drive.home))
+    builder.Connect(plant.get_state_output_port(), step.get_input_port())
+    if drive.parts.needs_desired_state:
+        builder.Connect(step.GetOutputPort("desired_state"), plant.get_desired_state_input_port(drive.instance))
+    state = add_true_state(builder, plant, drive.joints)
+    motors = Motors(drive.arm, drive.effects, drive.joints.effort_limits)
+    # Optional: unconnected, its output is not read.
+    commanded = builder.AddNamedSystem("effort_commanded", PassThrough(drive.arm.num_joints))
+    force = builder.AddNamedSystem("drive_force", DriveForce(drive.arm, motors, drive.parts, drive.effects))
+    at_motors = _late(builder, "command_delay", delay.command, commanded.get_output_port(), drive)
+    builder.Connect(at_motors, force.GetInputPort("effort_commanded"))
+    builder.Connect(plant.get_state_output_port(), force.GetInputPort("plant_state"))
+    builder.Connect(force.get_output_port(), plant.get_applied_generalized_force_input_port())
+    sensor = EffortSensor(drive.arm, motors, drive.effects.effort, drive.parts.time_step, drive.seed)
+    builder.AddNamedSystem("effort_sensor", sensor)
+    builder.Connect(_late(builder, "measurement_delay", delay.measurement, at_motors, drive), sensor.get_input_port())
+    ports = DrivePorts(
+        commanded.get_input_port(),
+        force.GetInputPort("effort_disturbance"),
+        sensor.get_output_port(),
+        state,
+        step.GetOutputPort("state_estimated"),
+    )
+    return ports, step
+
+
+def _late(builder: DiagramBuilder, name: str, steps: int, port: OutputPort, drive: RealDrive) -> OutputPort:
+    if steps == 0:
+        return port
+    # What goes in comes out a step later by itself: the plant steps while it is stored.
+    delay = builder.AddNamedSystem(name, DiscreteTimeDelay(drive.parts.time_step, steps - 1, drive.arm.num_joints))
+    builder.Connect(port, delay.get_input_port())
+    return delay.get_output_port()

@@ -1,1 +1,0 @@
-"""What a real arm has beside links, joints and a linkage: parts of `ArmStation`, see `models.effects_schema`."""

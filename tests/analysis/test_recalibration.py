@@ -1,0 +1,188 @@
+"""Friction of another day from a short recording: what is refitted, what stays, and what is refused."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from loaded_arm import friction, other_day
+from motions import fourier_motion, recorded, true_dynamics
+
+from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.recalibration import predict_other_phases, recalibrate
+from dvrk_drake.analysis.signals.drive_efforts import FRICTION_PARTS
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.dynamic_model import DynamicModel
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.recordings.recording import read_recording, write_recording
+
+pytestmark = pytest.mark.slow
+
+NOISE = 0.02
+
+
+def days(name, seed=0):
+    """The model of the first day, the truth of the second (friction and offsets differ), and a generator."""
+    arm, generator = load_arm(name), np.random.default_rng(seed)
+    _, q, v, vd = fourier_motion(arm, np.random.default_rng(1000), 8.0, 8.0, 1000.0)
+    bare = true_dynamics(arm, np.random.default_rng(seed), [])
+    first = DynamicModel(arm, dataclasses.replace(bare.section, effects=friction(bare, q, v, vd)))
+    section = other_day(first, q, v, vd, generator)
+    kept = [effect for effect in section.effects if effect.kind in (*FRICTION_PARTS, "offset")]
+    second = DynamicModel(arm, dataclasses.replace(section, effects=kept))
+    return dataclasses.replace(IdentifiedModel.from_arm(arm), dynamics=first.section), second, generator
+
+
+def motion(truth, generator, seconds=10.0, seed=5):
+    return recorded(
+        truth, fourier_motion(truth.arm, np.random.default_rng(seed), 8.0, seconds, 1000.0), NOISE, generator
+    )
+
+
+def errors(model, recording):
+    return np.array([actuator.relative_error for actuator in validate_motion(model, recording).actuators])
+
+
+@pytest.mark.parametrize("name", ["psm", "mtmr"])
+def test_friction_and_offsets_of_the_second_day_are_found(name):
+    model, truth, generator = days(name)
+    result = recalibrate(model, motion(truth, generator))
+    other = motion(truth, generator, seconds=16.0, seed=6)
+    before, after = errors(model, other), errors(result.model, other)
+    # The friction of the second day has the shape of the first's, so that little more than noise is left.
+    assert np.mean(before) > 2 * np.mean(after)
+    assert np.all(after < 2 * NOISE)
+    assert all(a.kept for a in result.actuators)
+    true = {(e.coordinate, e.kind): e.value for e in truth.section.effects if e.kind == "viscous"}
+    old = {(e.coordinate, e.kind): e.value for e in model.dynamics.effects if e.kind == "viscous"}
+    found = np.array([a.viscous for a in result.actuators])
+    expected = np.array(
+        [true[f"actuator.{a.name}", "viscous"] / old[f"actuator.{a.name}", "viscous"] for a in result.actuators]
+    )
+    np.testing.assert_allclose(found, expected, atol=0.1)
+
+
+def test_rigid_bodies_stay_and_offsets_count_in_motion_alone():
+    model, truth, generator = days("psm")
+    result = recalibrate(model, motion(truth, generator))
+    new, arm = result.model, model.load_arm()
+    assert new.dynamics.links == model.dynamics.links and new.dynamics.rotors == model.dynamics.rotors
+    assert new.base_parameters == model.base_parameters
+    # An offset that a motion shows is no torque that holds an arm (`IdentifiedModel.holding_effects`).
+    q = arm.sample_poses(3, np.random.default_rng(0))
+    offsets = np.array([a.offset for a in result.actuators])
+    np.testing.assert_allclose(new.holding_torque(q), model.holding_torque(q), atol=1e-12)
+    rest = np.zeros_like(q)
+    moved = new.dynamic_model.effect_effort(q[:1], rest[:1]) - model.dynamic_model.effect_effort(q[:1], rest[:1])
+    np.testing.assert_allclose(moved[0], offsets, atol=1e-12)
+
+
+def test_on_the_same_day_nothing_gets_worse():
+    model, _, generator = days("psm")
+    same = model.dynamic_model
+    result = recalibrate(model, motion(same, generator))
+    other = motion(same, generator, seconds=16.0, seed=6)
+    np.testing.assert_allclose(errors(result.model, other), errors(model, other), atol=NOISE / 10)
+    assert all(a.dry == pytest.approx(1, abs=0.1) and a.viscous == pytest.approx(1, abs=0.1) for a in result.actuators)
+
+
+def test_a_joint_that_rests_is_left_alone():
+    model, truth, generator = days("psm")
+    t, q, v, vd = fourier_motion(truth.arm, np.random.default_rng(5), 8.0, 10.0, 1000.0)
+    q[:, 0], v[:, 0], vd[:, 0] = q[0, 0], 0.0, 0.0
+    result = recalibrate(model, recorded(truth, (t, q, v, vd), NOISE, generator))
+    yaw = result.actuators[0]
+    assert (yaw.kept, yaw.reason, yaw.dry, yaw.offset) == (False, "does not move both ways", 1.0, 0.0)
+    assert all(a.kept for a in result.actuators[1:])
+    before, after = ([e for e in m.dynamics.effects if e.coordinate == "actuator.yaw"] for m in (model, result.model))
+    assert before == after
+
+
+def test_a_motion_in_one_direction_is_refused():
+    model, truth, generator = days("psm")
+    t = np.arange(10_000) / 1000.0
+    start, v = truth.arm.sample_poses(1, generator, margin=0.4)[0], truth.arm.per_joint(0.06, 0.006)
+    slow = (t, start + t[:, None] * v, np.tile(v, (len(t), 1)), np.zeros((len(t), 7)))
+    with pytest.raises(RecordingError, match="no actuator moves both ways for 10% of the time"):
+        recalibrate(model, recorded(truth, slow, 0.0, generator))
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [("psm", "mtmr"), ("mtmr", "psm")])
+def test_another_arm_is_refused(ours, theirs):
+    model, *_ = days(ours)
+    _, truth, generator = days(theirs)
+    with pytest.raises(RecordingError, match=r"is it of this arm|outside|limits"):
+        recalibrate(model, motion(truth, generator))
+
+
+def test_efforts_of_something_else_are_refused():
+    model, truth, generator = days("psm")
+    recording = motion(truth, generator)
+    noise = generator.normal(size=recording.tau.shape) * np.std(recording.tau, axis=0)
+    other = dataclasses.replace(recording, tau=noise, source="noise.csv")
+    with pytest.raises(RecordingError, match=r"noise.csv: efforts differ .* is it of this arm, in these coordinates"):
+        recalibrate(model, other)
+
+
+@pytest.mark.parametrize(("name", "seconds"), [("psm", 6.0), ("mtmr", 8.0)])
+def test_an_effort_of_the_wrong_sign_is_refused_however_short_the_recording(name, seconds):
+    model, truth, generator = days(name)
+    recording = motion(truth, generator, seconds).in_actuator_coordinates(truth.arm)
+    for j, joint in enumerate(truth.arm.joint_names):
+        tau = recording.tau.copy()
+        tau[:, j] *= -1
+        with pytest.raises(RecordingError, match=rf"efforts go against the model's \(correlation\): {joint} \(-"):
+            recalibrate(model, dataclasses.replace(recording, tau=tau))
+    assert recalibrate(model, recording).seconds > 0
+
+
+def test_the_error_after_is_of_parts_that_were_not_fitted():
+    """Friction that goes wild in one part of the motion can be fitted there, but not predicted from the other parts."""
+    model, truth, generator = days("psm")
+    recording = motion(truth, generator).in_actuator_coordinates(truth.arm)
+    tau = recording.tau.copy()
+    first = recording.t < 2.5
+    tau[first, 3] += 2 * np.std(tau[:, 3]) * np.sign(recording.qd[first, 3])
+    result = recalibrate(model, dataclasses.replace(recording, tau=tau))
+    other = motion(truth, generator, seconds=16.0, seed=6)
+    before, after = errors(model, other), errors(result.model, other)
+    assert np.all(after[[0, 1, 2, 4, 5, 6]] < before[[0, 1, 2, 4, 5, 6]] + NOISE / 10)
+    assert result.actuators[3].after > 0.3
+
+
+def test_a_refit_is_judged_on_phases_that_it_has_not_seen():
+    """Friction that differs in one half of the phases alone is no gain for the other half."""
+    model, truth, generator = days("psm")
+    recording = motion(truth, generator, seconds=16.0)
+    before, after = predict_other_phases(model, recording, 2)
+    np.testing.assert_allclose(before, errors(model, recording), atol=1e-9)
+    assert np.mean(after) < 0.5 * np.mean(before)
+    half = (np.asarray(recording.t) - 1.0) % 8.0 < 4.0  # phases are counted from where the filters end
+    old = motion(model.dynamic_model, np.random.default_rng(0), seconds=16.0)
+    mixed = dataclasses.replace(old, tau=np.where(half[:, None], recording.tau, old.tau))
+    before, after = predict_other_phases(model, mixed, 2)
+    # Each refit learns the friction that the other half does not have.
+    assert np.mean(after) > np.mean(before)
+
+
+def test_from_the_command_line(tmp_path, capsys):
+    model, truth, generator = days("psm")
+    paths = {name: str(tmp_path / name) for name in ("model.yaml", "short.csv", "new.yaml", "static.yaml")}
+    model.save(paths["model.yaml"])
+    IdentifiedModel.from_arm(load_arm("psm")).save(paths["static.yaml"])
+    write_recording(motion(truth, generator), paths["short.csv"])
+    assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], "--output", paths["new.yaml"]]) == 0
+    assert IdentifiedModel.load(paths["new.yaml"]).provenance.method.endswith(f"recalibrated on {paths['short.csv']}")
+    table = capsys.readouterr().out
+    assert all(name in table for name in ("before", "refit", "wrist_yaw", "kept", "motions like the recalibration"))
+    again = ["--output", paths["new.yaml"], "--overwrite"]
+    assert main(["recalibrate", paths["static.yaml"], paths["short.csv"], *again]) == 2
+    assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], "--output", paths["model.yaml"]]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2 and "has no dynamics" in lines[0] and "is an input" in lines[1]
+    spiked = read_recording(paths["short.csv"], load_arm("psm"))
+    spiked.tau[500, 1] = 500.0
+    write_recording(spiked, paths["short.csv"])
+    assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], *again]) == 2
+    assert "above its limit" in capsys.readouterr().out

@@ -1,0 +1,112 @@
+"""The demo as a user runs it, on fewer poses: it must find the arm that it hid, and hold it."""
+
+import io
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.inertial_parameters import link_inertias
+from dvrk_drake.experiments.demo import demo
+from dvrk_drake.experiments.demo.true_arm import make_true_arm
+from dvrk_drake.experiments.static_pose_collection import visiting_trajectory
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.recordings.recording import read_recording
+from dvrk_drake.reports import demo as demo_figures
+from dvrk_drake.reports.terminal_tables import print_demo
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    shorter = pytest.MonkeyPatch()
+    shorter.setattr(demo, "POSES", 20)
+    shorter.setattr(demo, "FRESH_POSES", 6)
+    stages, plot = [], demo_figures.plot_positions
+    shorter.setattr(
+        demo_figures, "plot_positions", lambda path, *rest: (TITLES.update({path.name: rest[-1]}), plot(path, *rest))
+    )
+    outcome = demo.run_demo(folder, progress=lambda what, share: stages.append((what, share)))
+    demo_figures.plot_demo(folder, outcome)
+    yield folder, outcome, stages
+    shorter.undo()
+
+
+#: Of the plots of positions, by the name of the file.
+TITLES: dict[str, str] = {}
+
+
+def test_demo_writes_everything(result):
+    folder, _, stages = result
+    names = {path.name for path in folder.iterdir()}
+    assert names == {
+        "arm.html",
+        "fresh_poses.csv",
+        "fresh_torque_error.png",
+        "model.yaml",
+        "poses.csv",
+        "predicted.png",
+        "release.png",
+        "step.png",
+        "torque_error.png",
+    }
+    assert "<html" in (folder / "arm.html").read_text()[:200].lower()
+    assert len(read_recording(folder / "poses.csv")) == 20
+    assert IdentifiedModel.load(folder / "model.yaml").arm == "mtml"
+    assert all(0.0 <= share <= 1.0 for _, share in stages)
+    assert len({what for what, _ in stages}) == 4
+
+
+def test_demo_beats_zero_torque_and_the_paper_on_fresh_poses(result):
+    _, outcome, _ = result
+    for ours, paper in zip(outcome.fresh.joints[1:], outcome.fresh_paper.joints[1:], strict=True):
+        assert ours.rms_error < 0.2 * ours.rms_torque, ours
+        assert ours.rms_error < paper.rms_error, (ours, paper)
+
+
+def test_demo_finds_the_springs_that_it_put_in(result):
+    _, outcome, _ = result
+    found = {(e.coordinate, e.kind): e.value for e in outcome.identification.model.effects}
+    assert found["joint.wrist_platform", "cable sine"] == pytest.approx(0.05, abs=0.01)
+    assert found["joint.wrist_pitch", "cable sine"] == pytest.approx(-0.03, abs=0.003)
+
+
+def test_demo_drifts_less_than_with_the_nominal_model_and_comes_to_rest(result):
+    _, outcome, _ = result
+    assert outcome.drift["identified"].max() < 0.3 * outcome.drift["as drawn"].max()
+    assert outcome.step_error.max() < 1e-3
+
+
+def test_drift_is_shown_as_that_of_an_arm_without_friction(result):
+    folder, outcome, _ = result
+    assert "without dry friction" in TITLES["release.png"] and demo.NO_DRY_FRICTION in TITLES["release.png"]
+    console = Console(record=True, width=120, file=io.StringIO())
+    print_demo(console, outcome, folder)
+    printed = " ".join(console.export_text().split())
+    assert all(path.name in printed for path in folder.iterdir())
+    assert demo.NO_DRY_FRICTION in printed and "without dry friction" in printed
+
+
+def test_true_arm_is_possible_and_differs():
+    arm = load_arm("mtml")
+    true_arm = make_true_arm(arm, np.random.default_rng(3))
+    plant = make_arm_plant(arm)
+    assert set(true_arm.inertias) == {link.link for link in link_inertias(arm)}
+    for name, M in true_arm.inertias.items():
+        assert M.IsPhysicallyValid(), name
+        assert M.get_mass() != plant.GetBodyByName(name).default_mass()
+
+
+def test_trajectory_rests_at_each_pose_and_stays_inside_the_limits():
+    arm = load_arm("mtml")
+    poses = arm.sample_poses(6, np.random.default_rng(0), margin=0.02)
+    trajectory, settled = visiting_trajectory(arm, poses)
+    for t, pose in zip(settled, poses, strict=True):
+        np.testing.assert_allclose(trajectory.value(t).ravel(), pose, atol=1e-12)
+        np.testing.assert_allclose(trajectory.EvalDerivative(t).ravel(), 0, atol=1e-12)
+    times = np.arange(0, trajectory.end_time(), 0.01)
+    assert not any(arm.limit_violations(trajectory.value(t).ravel(), tolerance=1e-9) for t in times)
+    speed = max(np.abs(trajectory.EvalDerivative(t)).max() for t in times)
+    assert speed < 1.7 + 1e-6

@@ -1,0 +1,133 @@
+"""Measures of runs whose motion is written down: what each must say is known without simulating."""
+
+import math
+
+import numpy as np
+import pytest
+
+from dvrk_drake.errors import StudyError
+from dvrk_drake.experiments.scenario import Scenario, Target
+from dvrk_drake.experiments.simulation import Simulation
+from dvrk_drake.experiments.study.measures import KINDS, Measure
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.recordings.recording import Recording
+
+MTM = load_arm("mtml")
+T = np.arange(0, 20.001, 0.01)
+
+
+def state(q):
+    """What is true: the recordings here are 10 mrad beside it, which must not count."""
+    return np.hstack([q, 0 * q])
+
+
+def released(**motions):
+    """Scenario and run of an MTM in mode "gravity": joints named move as said, the others rest."""
+    scenario = Scenario(arm="mtml", duration=20.0)
+    scenario.controller.mode = "gravity"
+    q = np.zeros((len(T), 7))
+    for joint, motion in motions.items():
+        q[:, MTM.joint_names.index(joint)] = motion
+    tau = np.tile(0.25 * MTM.effort_limits, (len(T), 1))
+    return scenario, Simulation(Recording(q=q + 0.01, qd=0 * q, tau=tau, t=T), state(q), None, None)
+
+
+def stepped(motion):
+    """Scenario and run of an elbow that is to be at 0.4 rad at 2 s."""
+    scenario = Scenario(arm="mtml", duration=20.0, targets=[Target(2.0, [0, 0, 0.4, 0, 0, 0, 0])])
+    q = np.zeros((len(T), 7))
+    q[:, 2] = motion
+    desired = np.zeros_like(q)
+    desired[:, 2] = 0.4 * np.clip(T / 2, 0, 1)
+    return scenario, Simulation(Recording(q=q + 0.01, qd=0 * q, tau=0 * q, t=T), state(q), None, desired)
+
+
+def test_a_joint_that_drifts_evenly_has_its_rate_and_its_way():
+    run = released(elbow_pitch=-0.002 * T)
+    assert Measure("drift_rate")(*run) == pytest.approx(0.002)
+    assert Measure("drift", time=3.0)(*run) == pytest.approx(0.006)
+    assert Measure("steady_error", time=2.0)(*run) == pytest.approx(0.002 * 19.0)
+    # 15 mrad are passed after 7.5 s, 30 mrad after 15 s.
+    assert Measure("held")(*run) is False
+    assert Measure("held", time=7.4)(*run) is True
+    assert Measure("held", band=0.0201)(*run) is True
+    assert Measure("ran_away", band=0.041)(*run) is False
+    assert Measure("ran_away", band=0.039)(*run) is True
+    assert Measure("effort_share")(*run) == pytest.approx(0.25)
+
+
+def test_only_the_joints_that_are_named_count():
+    run = released(wrist_roll=0.1 * T, wrist_yaw=0.001 * T)
+    assert Measure("drift_rate")(*run) == pytest.approx(0.1)
+    assert Measure("drift_rate", joints=["wrist_yaw"])(*run) == pytest.approx(0.001)
+    assert Measure("drift_rate", joints=["elbow_pitch"])(*run) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_what_a_hand_does_before_it_lets_go_does_not_count():
+    scenario, simulation = released(elbow_pitch=0.3 * np.minimum(T, 5.0) + 0.001 * np.maximum(T - 5.0, 0.0))
+    scenario.hand.path = [Target(0.0, [0.0] * 7), Target(5.0, [0.0] * 7)]
+    assert Measure("held")(scenario, simulation) is True
+    assert Measure("held", time=14.9)(scenario, simulation) is True
+    assert Measure("held", band=0.0099)(scenario, simulation) is False
+    assert Measure("ran_away", band=0.016)(scenario, simulation) is False
+    with pytest.raises(StudyError, match=r"allowed: 0.02..15 s"):
+        Measure("held", time=15.1).check(scenario)
+
+
+def test_a_decaying_oscillation_settles_and_overshoots_as_its_formula_says():
+    after = np.maximum(T - 2.0, 0.0)
+    ring = 0.1 * np.exp(-after) * np.sin(2 * np.pi * after)
+    run = stepped(0.4 * np.clip(T / 2, 0, 1) + ring)
+    # The first and largest peak: where the derivative of exp(-t) sin(w t) is zero, w t = atan(w).
+    peak = math.atan(2 * np.pi) / (2 * np.pi)
+    assert Measure("overshoot")(*run) == pytest.approx(0.1 * math.exp(-peak) * math.sin(2 * np.pi * peak), rel=1e-3)
+    settled = Measure("settling_time", band=1e-3)(*run)
+    assert np.all(np.abs(ring[after >= settled]) <= 1e-3)
+    assert np.abs(ring[(after > settled - 0.03) & (after < settled)]).max() > 1e-3
+    assert settled == pytest.approx(math.log(100), abs=0.5)
+    assert Measure("steady_error")(*run) == pytest.approx(0.0, abs=1e-8)
+
+
+def test_what_never_settles_is_infinite_and_a_late_disturbance_counts():
+    assert Measure("settling_time")(*stepped(0.4 * np.clip(T / 2, 0, 1) + 0.002)) == math.inf
+    bump = np.where(T[1500] == T, 0.01, 0.0)
+    assert Measure("settling_time")(*stepped(0.4 * np.clip(T / 2, 0, 1) + bump)) == pytest.approx(13.01)
+
+
+def test_arriving_early_is_settled_at_once_and_not_overshot():
+    run = stepped(0.4 * np.clip(T / 1.9, 0, 1))
+    assert Measure("settling_time")(*run) == 0.0
+    assert Measure("overshoot")(*run) == 0.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_that_failed_counts_as_the_worst(kind):
+    scenario, simulation = stepped(0.4 * np.clip(T / 2, 0, 1))
+    measure = Measure(kind)
+    measure.check(scenario)
+    assert measure.is_answer == isinstance(measure(scenario, simulation), bool)
+    worst = measure.worst
+    assert worst is {"held": False, "ran_away": True}[kind] if measure.is_answer else worst == math.inf
+
+
+@pytest.mark.parametrize(
+    ("measure", "message"),
+    [
+        (Measure("settle"), 'kind is "settle"; allowed: settling_time, overshoot'),
+        (Measure("overshoot", band=0.1), "overshoot has no band"),
+        (Measure("ran_away", time=1.0), "ran_away has no time"),
+        (Measure("held", band=-1.0), "band is -1; allowed: 1e-09..12.6 rad or m"),
+        (Measure("held", time=math.nan), "time is nan; allowed: 1e-05..3600 s"),
+        (Measure("held", time=18.5), r"time of held is 18.5 s; allowed: 0.02..18 s"),
+        (Measure("drift", time=0.001), r"time of drift is 0.001 s; allowed: 0.02..18 s"),
+        (Measure("drift", joints=["elbow"]), "unknown elbow; MTML has outer_yaw, shoulder_pitch, elbow_pitch"),
+    ],
+)
+def test_nonsense_is_refused(measure, message):
+    with pytest.raises(StudyError, match=message):
+        measure.check(stepped(T)[0])
+
+
+def test_overshoot_needs_a_target():
+    with pytest.raises(StudyError, match="overshoot needs a scenario with targets"):
+        Measure("overshoot").check(released()[0])

@@ -1,0 +1,298 @@
+"""Studies: the same table whatever runs them and whatever interrupts them. The simulation is replaced by a formula."""
+
+import csv
+import math
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy.stats import norm
+
+import dvrk_drake.experiments.study.study as study_module
+from dvrk_drake.errors import StudyError
+from dvrk_drake.experiments.simulation import Simulation
+from dvrk_drake.experiments.study.measures import Measure
+from dvrk_drake.experiments.study.study import run_study
+from dvrk_drake.experiments.study.study_file import RandomPoses, Study, Variation
+from dvrk_drake.experiments.study.summary import Quantiles, Share, summarise
+from dvrk_drake.experiments.study.table import StudyTable
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.reports.study import plot_study, print_study
+
+MTM = load_arm("mtml")
+
+
+def make_study(**changes):
+    study = Study(
+        scenario="mtml",
+        set=["duration=2", "sample_period=0.1", "controller.mode=gravity"],
+        random_poses=RandomPoses(6, seed=3),
+        seeds=[1, 2],
+        variations=[Variation("exact"), Variation("wrong, a lot", ["controller.parameter_error=0.2"])],
+        measures=[Measure("held", time=2.0), Measure("drift", time=1.0), Measure("effort_share")],
+    )
+    for name, value in changes.items():
+        setattr(study, name, value)
+    return study
+
+
+@pytest.fixture(autouse=True)
+def formula(monkeypatch):
+    """Drifts by what seed and parameter error say; every seventh seed diverges, every eleventh is lost as NaN."""
+
+    def simulate(scenario):
+        if scenario.seed % 7 == 0:
+            raise RuntimeError("the solver\nfailed, at 0.3 s")
+        t = np.arange(21) * 0.1
+        rate = (1 + scenario.controller.parameter_error) * (scenario.seed % 1000) / 5e4
+        q = np.array(scenario.start) + rate * t[:, None]
+        if scenario.seed % 11 == 0:
+            q[9:] = np.nan
+        return Simulation(Recording(q=q, qd=0 * q, tau=q / 10, t=t), np.hstack([q, 0 * q]), None, None)
+
+    monkeypatch.setattr(study_module, "simulate", simulate)
+
+
+class Backwards(ThreadPoolExecutor):
+    """Runs nothing until all is submitted, then the last case first."""
+
+    def __init__(self):
+        super().__init__(1)
+        self._calls = []
+
+    def submit(self, fn, *arguments):
+        future = Future()
+        self._calls.append((future, fn, arguments))
+        if len(self._calls) == 24:
+            for its, function, these in reversed(self._calls):
+                its.set_result(function(*these))
+        return future
+
+
+class Dying(ThreadPoolExecutor):
+    """Whose workers are killed after a number of cases."""
+
+    def __init__(self, cases):
+        super().__init__(1)
+        self._left = cases
+
+    def submit(self, fn, *arguments):
+        self._left -= 1
+        if self._left >= 0:
+            return super().submit(fn, *arguments)
+        future = Future()
+        future.set_exception(BrokenProcessPool("killed"))
+        return future
+
+
+@pytest.fixture
+def reference(tmp_path):
+    path = tmp_path / "reference.csv"
+    with ThreadPoolExecutor(1) as executor:
+        run_study(make_study(), executor, path)
+    return path.read_bytes()
+
+
+def test_the_table_has_one_row_a_case_with_all_that_repeats_it(reference):
+    rows = list(csv.DictReader(reference.decode().splitlines()))
+    assert [int(row["case"]) for row in rows] == list(range(24))
+    assert {(row["pose"], row["variation"], row["seed"]) for row in rows} == {
+        (row["pose"], v, row["seed"]) for row in rows for v in ("exact", "wrong, a lot")
+    }
+    assert len({row["seed"] for row in rows}) == 12  # its own for each pose and seed, shared by the variations
+    starts = np.array([[float(row[f"q{j}"]) for j in range(1, 8)] for row in rows])
+    np.testing.assert_array_equal(starts[::4], MTM.sample_poses(6, np.random.default_rng(3)))
+    for row in rows:
+        if int(row["seed"]) % 7 == 0:
+            assert row["error"] == "RuntimeError: the solver failed, at 0.3 s"
+            assert row["held"] == row["drift"] == ""
+        elif int(row["seed"]) % 11 == 0:
+            assert row["error"] == "diverged: not finite from 0.9 s on"
+        else:
+            rate = (1.2 if row["variation"] != "exact" else 1.0) * (int(row["seed"]) % 1000) / 5e4
+            assert float(row["drift"]) == pytest.approx(rate)
+            assert row["held"] == str(2 * rate <= 0.015).lower()
+    assert any(row["error"] for row in rows)
+
+
+@pytest.mark.parametrize("executor", [lambda: ThreadPoolExecutor(2), lambda: ThreadPoolExecutor(7), Backwards])
+def test_the_table_does_not_depend_on_workers_nor_on_order(executor, reference, tmp_path):
+    with executor() as workers:
+        run_study(make_study(), workers, tmp_path / "other.csv")
+    assert (tmp_path / "other.csv").read_bytes() == reference
+
+
+@pytest.mark.parametrize("cases", [0, 1, 23])
+def test_lost_workers_lose_no_rows(cases, reference, tmp_path):
+    path = tmp_path / "killed.csv"
+    message = rf"^{24 - cases} of 24 cases are missing: case"
+    with Dying(cases) as executor, pytest.raises(StudyError, match=message) as loss:
+        run_study(make_study(), executor, path)
+    assert isinstance(loss.value.__cause__, BrokenProcessPool)
+    counts = []
+    with Dying(24 - cases) as executor:  # as many as are missing, and no more
+        rows = run_study(make_study(), executor, path, lambda done, all_cases: counts.append((done, all_cases)))
+    assert counts == [(done, 24) for done in range(cases, 25)]
+    assert sorted(rows) == list(range(24))
+    assert path.read_bytes() == reference
+
+
+def test_a_table_cut_at_any_byte_goes_on_to_the_same(reference, tmp_path):
+    path = tmp_path / "cut.csv"
+    for cut in [0, 3, reference.index(b"\n"), *np.random.default_rng(0).integers(0, len(reference), 20)]:
+        path.write_bytes(reference[:cut])
+        with ThreadPoolExecutor(2) as executor:
+            run_study(make_study(), executor, path)
+        assert path.read_bytes() == reference
+
+
+def test_a_finished_study_runs_nothing(reference, tmp_path):
+    path = tmp_path / "done.csv"
+    path.write_bytes(reference)
+    with Dying(0) as executor:
+        run_study(make_study(), executor, path)
+    assert path.read_bytes() == reference
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"set": ["duration=2.5", "sample_period=0.1", "controller.mode=gravity"]},
+        {"set": ["duration=2", "sample_period=0.1", "controller.mode=gravity", "gravity=[0,0,-9.80]"]},
+        {"random_poses": RandomPoses(6, seed=4)},
+        {"random_poses": RandomPoses(7, seed=3)},
+        {"seeds": [1, 3]},
+        {"variations": [Variation("exact"), Variation("wrong, a lot", ["controller.parameter_error=0.3"])]},
+        {"measures": [Measure("held", time=1.0), Measure("drift", time=1.0), Measure("effort_share")]},
+        {"measures": [Measure("held", time=2.0)]},
+    ],
+)
+def test_going_on_with_another_study_is_refused_and_changes_nothing(change, reference, tmp_path):
+    path = tmp_path / "begun.csv"
+    begun = reference[: len(reference) // 2]
+    path.write_bytes(begun)
+    with ThreadPoolExecutor(1) as executor, pytest.raises(StudyError, match="was begun with another study"):
+        run_study(make_study(**change), executor, path)
+    assert path.read_bytes() == begun
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: b"hello", "is no table of a study"),
+        (lambda text: b"t,q1,q2\n1,2,3\n", "is no table of a study"),
+        (lambda text: b"\xff\xfe\n", "is no table of a study"),
+        (lambda text: text + text.splitlines(keepends=True)[5], ":26: has case 4 again"),
+        (lambda text: text.replace(b',3,"wrong', b',300,"wrong'), ":5: was changed by hand"),
+        (lambda text: text.replace(b",false,", b",nearly,", 1), "was changed by hand: could not convert"),
+    ],
+)
+def test_what_is_no_table_of_it_is_refused_and_left_alone(change, message, reference, tmp_path):
+    path = tmp_path / "foreign.csv"
+    path.write_bytes(change(reference))
+    with ThreadPoolExecutor(1) as executor, pytest.raises(StudyError, match=message):
+        run_study(make_study(), executor, path)
+    assert path.read_bytes() == change(reference)
+
+
+def test_two_studies_do_not_write_one_file(tmp_path):
+    path = tmp_path / "both.csv"
+    with (
+        StudyTable(path, make_study()),
+        ThreadPoolExecutor(1) as executor,
+        pytest.raises(StudyError, match="another study is writing it"),
+    ):
+        run_study(make_study(), executor, path)
+
+
+def test_an_interrupted_study_keeps_its_rows_and_cancels_the_rest(reference, tmp_path):
+    path = tmp_path / "interrupted.csv"
+
+    def interrupt(done, all_cases):
+        if done == 5:
+            raise KeyboardInterrupt
+
+    with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt):
+        run_study(make_study(), executor, path, interrupt)
+    assert len(path.read_bytes().splitlines()) == 6
+    with ThreadPoolExecutor(1) as executor:
+        run_study(make_study(), executor, path)
+    assert path.read_bytes() == reference
+
+
+def test_parquet_holds_what_the_csv_holds(reference, tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra parquet")
+    path = tmp_path / "results.parquet"
+    with Dying(9) as executor, pytest.raises(StudyError):
+        run_study(make_study(), executor, path)
+    assert not path.exists()
+    assert len((tmp_path / "results.parquet.rows.csv").read_bytes().splitlines()) == 10
+    for most in (15, 0):  # the rest, and then nothing more
+        with Dying(most) as executor:
+            run_study(make_study(), executor, path)
+        assert {p.name for p in tmp_path.iterdir()} == {"reference.csv", "results.parquet"}
+    table = parquet.read_table(path)
+    assert table.schema.field("held").type == "bool"
+    for ours, theirs in zip(table.to_pylist(), csv.DictReader(reference.decode().splitlines()), strict=True):
+        texts = {name: "" if value is None else str(value) for name, value in ours.items()}
+        assert texts | {"held": texts["held"].lower()} == theirs
+    with Dying(0) as executor, pytest.raises(StudyError, match="was made by another study"):
+        run_study(make_study(seeds=[5]), executor, path)
+
+
+def test_shares_have_wilsons_interval_and_failed_runs_count_as_the_worst(tmp_path):
+    study = make_study(random_poses=RandomPoses(60, seed=1))
+    with ThreadPoolExecutor(1) as executor:
+        rows = run_study(study, executor, tmp_path / "r.csv")
+    (exact, wrong) = summarise(study, rows)
+    assert exact.runs == wrong.runs == 120
+    assert exact.failed == wrong.failed > 0  # the same seeds
+    held = exact.measures["held"]
+    assert isinstance(held, Share)
+    assert held.yes > wrong.measures["held"].yes > 0
+    # Wilson: the shares p at which the observed one is just 1.96 standard errors away.
+    for p in (held.lower, held.upper):
+        assert abs(held.yes / 120 - p) == pytest.approx(norm.ppf(0.975) * math.sqrt(p * (1 - p) / 120))
+    drift = exact.measures["drift"]
+    assert isinstance(drift, Quantiles)
+    values = sorted(rows[c.index].values.get("drift", math.inf) for c in study.cases if c.variation == "exact")
+    assert (drift.median, drift.percentile_95, drift.largest) == (values[59], values[113], values[119])
+    assert drift.largest == math.inf
+
+
+def test_the_report_names_each_measure_and_each_error(tmp_path):
+    study = make_study()
+    with ThreadPoolExecutor(1) as executor:
+        rows = run_study(study, executor, tmp_path / "r.csv")
+    console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    print_study(console, study, rows)
+    text = console.export_text()
+    for word in ("exact: 12 runs", "wrong, a lot: 12 runs", "held", "drift", "RuntimeError: the solver failed"):
+        assert word in text
+    plot_study(tmp_path / "study.png", study, rows)
+    assert (tmp_path / "study.png").stat().st_size > 10_000
+
+
+def test_a_case_repeats_as_a_scenario():
+    study = make_study()
+    for case in study.cases:
+        scenario = study.scenario_of(case)
+        scenario.check()
+        assert tuple(scenario.start) == case.start
+        assert not MTM.limit_violations(case.start)
+    assert [c.index for c in study.cases] == list(range(24))
+    assert make_study().fingerprint == study.fingerprint
+
+
+def test_the_parameter_error_is_drawn_by_the_seed_within_its_bounds():
+    study = make_study()
+    exact, wrong, _, other = (study.scenario_of(case).model for case in study.cases[:4])
+    some = exact.theta != 0
+    ratios = [m.theta[some] / exact.theta[some] for m in (wrong, other)]
+    assert all(np.all((r >= 0.8) & (r <= 1.2)) for r in ratios)
+    assert np.ptp(ratios[0]) > 0.1
+    assert not np.any(ratios[0] == ratios[1])
+    np.testing.assert_array_equal(study.scenario_of(study.cases[1]).model.theta, wrong.theta)

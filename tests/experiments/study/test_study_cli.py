@@ -1,0 +1,139 @@
+"""`dvrk-drake study` as a user meets it: what is refused, in one line, before anything runs."""
+
+import numpy as np
+import pytest
+from repository import ROOT
+
+from dvrk_drake.cli import main
+from dvrk_drake.experiments.study.study_file import load_study
+from dvrk_drake.models.arm import load_arm
+
+STUDY = """
+scenario: psm
+set: [duration=1, controller.mode=gravity]
+random_poses: {count: 3, seed: 1}
+measures: [{kind: drift, time: 1}]
+"""
+
+
+@pytest.fixture
+def study(tmp_path):
+    path = tmp_path / "study.yaml"
+    path.write_text(STUDY)
+    return path
+
+
+def refusal(capsys, path, *options):
+    output = path.parent / "results.csv"
+    assert main(["study", str(path), "--output", str(output), *options]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("dvrk-drake: error: ")
+    assert error.count("\n") == 1, error
+    assert not output.exists()
+    return error
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("scenario: psm", "scenario: psm9"), 'unknown arm "psm9"; known arms: mtml, mtmr, psm'),
+        (("scenario: psm", "scenario: nothing.yaml"), "nothing.yaml: no such file"),
+        (("scenario: psm", "seeds: [1]"), "scenario is missing"),
+        (("scenario: psm", "scenario: psm\nposes: [[0, 0, 0.1, 0, 0, 0]]"), "poses[0] has 6 numbers; PSM has 7 joints"),
+        (("scenario: psm", "scenario: psm\nposes: [[9, 0, 0.1, 0, 0, 0, 0]]"), "poses[0]: yaw = 9 is outside"),
+        (("scenario: psm", "scenario: psm\nposes: [[0, 0, 0.1, 0, 0, 0, 0]]"), "poses and random_poses: give one"),
+        (
+            ("scenario: psm", "scenarios: psm"),
+            'key "scenarios" is unknown; did you mean "scenario"? allowed in a study: scenario, set, poses',
+        ),
+        (("scenario: psm", "scenario: psm\nseeds: [1, 1]"), "seeds must be different whole numbers from 0; got [1, 1]"),
+        (("scenario: psm", "scenario: psm\nseeds: [-1]"), "seeds[0] is -1; allowed: 0..9223372036854775807"),
+        (("scenario: psm", "scenario: psm\nseeds: [a]"), 'seeds[0] is "a"; allowed: a whole number'),
+        (("scenario: psm", "scenario: psm\nseeds: []"), "seeds, variations and measures must not be empty"),
+        (
+            ("scenario: psm", "scenario: psm\nvariations: [{name: a}, {name: a}]"),
+            "variations must have different names",
+        ),
+        (("scenario: psm", "scenario: psm\nvariations: [{name: a}, {name: b, set: [arm=mtml]}]"), "the same joints"),
+        (("scenario: psm", "scenario: psm\nvariations: [{name: a, set: [length=2]}]"), "length"),
+        (("duration=1", "duration=long"), 'duration is "long"; allowed: a number'),
+        (("duration=1", "controller.parameter_error=2"), "controller.parameter_error is 2; allowed: 0..1"),
+        (("count: 3", "count: 0"), "random_poses.count is 0; allowed: 1..1000000"),
+        (("seed: 1", "margin: 0.5"), "random_poses.margin is 0.5; allowed: 0..0.49"),
+        (
+            ("seed: 1", "sed: 1"),
+            'random_poses: key "sed" is unknown; did you mean "seed"? allowed in random_poses: count, seed',
+        ),
+        (("kind: drift", "kind: drif"), 'measures[0].kind is "drif"; allowed: settling_time'),
+        (("kind: drift", "kind: drift, joints: [elbow]"), "measures[0].joints of drift: unknown elbow; PSM has yaw"),
+        (("kind: drift", "kind: drift, name: seed"), '"seed" cannot be a column'),
+        (("kind: drift", 'kind: drift, name: "a,b"'), '"a,b" cannot be a column'),
+        (("}]", "}, {kind: drift, time: 0.5}]"), "measures must have different names"),
+        (("time: 1", "time: 2"), "measures[0].time of drift is 2 s; allowed: 0.02..1 s"),
+        (("measures:", "measures: ["), "study.yaml"),
+        ((STUDY, "[1, 2]"), "study.yaml"),
+        ((STUDY, ""), "study.yaml"),
+    ],
+)
+def test_nonsense_is_refused_in_one_line(change, message, study, capsys):
+    study.write_text(STUDY.replace(*change))
+    assert message in refusal(capsys, study)
+
+
+def test_files_and_places_that_do_not_work_are_refused(study, tmp_path, capsys):
+    assert "no such file" in refusal(capsys, tmp_path / "other.yaml")
+    assert "--set duration: must be key=value" in refusal(capsys, study, "--set", "duration")
+    assert "cannot be made a folder" in refusal(capsys, study, "--plots", str(study))
+    (tmp_path / "folder.csv").mkdir()
+    for output, message in (
+        (tmp_path / "none" / "r.csv", "cannot be written: "),
+        (tmp_path / "folder.csv", "is not a regular file"),
+        (tmp_path / "r.txt", "must end in .csv or .parquet"),
+    ):
+        assert main(["study", str(study), "--output", str(output)]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+    assert study.read_text() == STUDY
+
+
+def test_numbers_of_workers_that_are_none_are_refused(study, capsys):
+    for workers in ("0", "-1", "many"):
+        with pytest.raises(SystemExit) as end:
+            main(["study", str(study), "--output", "r.csv", "--workers", workers])
+        assert end.value.code == 2
+        assert "is not a number of processes" in capsys.readouterr().err
+
+
+def test_schedulers_that_are_none_are_refused(study, capsys, monkeypatch):
+    monkeypatch.setattr("dvrk_drake.experiments.study.executors.PATIENCE", 0.3)
+    pytest.importorskip("distributed", reason="needs the extra dask")
+    assert "is no address of a scheduler; allowed: tcp://HOST:PORT" in refusal(capsys, study, "--scheduler", "here")
+    assert "no Dask scheduler answers there" in refusal(capsys, study, "--scheduler", "tcp://127.0.0.1:1")
+
+
+def test_the_example_is_a_study():
+    study = load_study(ROOT / "examples" / "release_study.yaml")
+    assert len(study.cases) == 60
+
+
+def test_settings_of_the_command_line_come_after_the_files(study):
+    load = load_study(study, ["duration=1.5"])
+    assert [scenario.duration for scenario in load.scenarios.values()] == [1.5]
+    assert load.fingerprint != load_study(study).fingerprint
+
+
+def test_without_poses_the_scenarios_own_start_is_taken(study):
+    study.write_text(STUDY.replace("random_poses: {count: 3, seed: 1}", ""))
+    (case,) = load_study(study).cases
+    psm = load_arm("psm")
+    assert case.start == tuple(np.clip(0.0, psm.position_lower, psm.position_upper))
+
+
+def test_files_that_a_study_names_may_be_relative(study, tmp_path, monkeypatch):
+    (tmp_path / "scenario.yaml").write_text("arm: psm\nduration: 1\n")
+    study.write_text(STUDY.replace("scenario: psm", "scenario: scenario.yaml"))
+    monkeypatch.chdir(tmp_path)
+    before = load_study("study.yaml").fingerprint
+    (tmp_path / "scenario.yaml").write_text("arm: psm\nduration: 1\neffort_noise: 0.01\n")
+    assert load_study("study.yaml").fingerprint != before

@@ -1,0 +1,152 @@
+"""Studies on processes and on a Dask cluster, killed in the middle: nothing lost, and the same as undisturbed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import formula_study
+import pytest
+from patience import PATIENCE, wait_until
+
+import dvrk_drake.experiments.study.study as study_module
+from dvrk_drake.experiments.study.executors import dask_executor
+from dvrk_drake.experiments.study.study import run_study
+from dvrk_drake.experiments.study.study_file import load_study
+
+pytestmark = pytest.mark.slow
+
+STUDY = """
+scenario: mtml
+set: [duration=1, controller.mode=gravity, "real_arm=[all]"]
+random_poses: {count: 5, seed: 1, margin: 0.1}
+variations: [{name: nominal}, {name: wrong, set: [controller.parameter_error=0.2]}]
+measures: [{kind: held, time: 1}, {kind: drift, time: 0.5}, {kind: effort_share}]
+"""
+#: The command line with a formula in place of the simulation, which workers would compile for seconds.
+FORMULA = Path(formula_study.__file__)
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    path = tmp_path_factory.mktemp("study") / "study.yaml"
+    path.write_text(STUDY)
+    return path
+
+
+def undisturbed(study):
+    """The table as one thread of this process makes it."""
+    path = study.parent / "undisturbed.csv"
+    path.unlink(missing_ok=True)
+    with ThreadPoolExecutor(1) as executor:
+        rows = run_study(load_study(study), executor, path)
+    assert len(rows) == 10
+    assert not any(row.error for row in rows.values())
+    return path.read_bytes()
+
+
+@pytest.fixture
+def started():
+    """Starts processes, and leaves none behind."""
+    processes = []
+
+    def start(*arguments):
+        command = [sys.executable, *map(str, arguments)]
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        processes.append(process)
+        return process
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def sell(tmp_path, monkeypatch):
+    """Lets so many more simulations of the formula finish; without this fixture none waits."""
+    folder = tmp_path / "tickets"
+    folder.mkdir()
+    monkeypatch.setenv(formula_study.TICKETS, str(folder))
+
+    def sell(count):
+        for _ in range(count):
+            tempfile.mkstemp(dir=folder)
+
+    return sell
+
+
+def rows_in(path):
+    return len(path.read_bytes().splitlines()) - 1 if path.exists() else 0
+
+
+def children_of(process):
+    """Process ids of the workers, without multiprocessing's resource tracker."""
+    ids = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return [int(i) for i in ids if "spawn_main" in Path(f"/proc/{i}/cmdline").read_text()]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds workers in /proc")
+def test_a_killed_study_goes_on_and_a_killed_worker_costs_nothing(study, started, sell, tmp_path, monkeypatch):
+    monkeypatch.setattr(study_module, "simulate", formula_study.simulate)
+    path = tmp_path / "killed.csv"
+    command = [FORMULA, "study", study, "--output", path, "--workers", 2]
+    sell(3)
+    first = started(*command)
+    wait_until(lambda: rows_in(path) == 3, "three rows", first)
+    workers = children_of(first)
+    first.kill()
+    first.wait()
+    wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), "end of the workers")
+    assert rows_in(path) == 3
+
+    sell(1)
+    second = started(*command)
+    wait_until(lambda: rows_in(path) == 4, "a fourth row", second)
+    os.kill(children_of(second)[0], signal.SIGKILL)
+    sell(20)
+    output, error = second.communicate(timeout=PATIENCE)
+    assert (second.returncode, error) == (0, "")
+    assert "nominal: 5 runs" in output
+    monkeypatch.delenv(formula_study.TICKETS)
+    assert path.read_bytes() == undisturbed(study)
+
+
+def test_a_dask_cluster_that_loses_a_worker_gives_the_same(study, started, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="needs the extra dask")
+    path, address = tmp_path / "dask.csv", tmp_path / "scheduler.json"
+    options = ["--no-dashboard", "--scheduler-file", address]
+    scheduler = started("-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 0, *options)
+    wait_until(lambda: address.exists() and address.stat().st_size, "the scheduler's address", scheduler)
+    worker = ["-m", "distributed.cli.dask_worker", "--nthreads", 1, "--no-nanny", *options]
+    workers = [started(*worker), started(*worker)]
+
+    def kill_one(done, all_cases):
+        if done == 2:
+            workers[0].kill()
+
+    url = json.loads(address.read_text())["address"]
+    with distributed.Client(url, timeout=PATIENCE, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=PATIENCE)
+    with dask_executor(url) as executor:
+        run_study(load_study(study), executor, path, kill_one)
+    assert workers[0].wait(PATIENCE) == -signal.SIGKILL
+    assert path.read_bytes() == undisturbed(study)
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds workers in /proc")
+def test_ctrl_c_ends_in_one_line_and_leaves_no_worker(study, started, sell, tmp_path):
+    path = tmp_path / "interrupted.csv"
+    sell(1)
+    run = started(FORMULA, "study", study, "--output", path, "--workers", 2)
+    wait_until(lambda: rows_in(path) == 1, "a row", run)
+    workers = children_of(run)
+    run.send_signal(signal.SIGINT)
+    _, error = run.communicate(timeout=PATIENCE)
+    assert (run.returncode, error) == (130, "dvrk-drake: interrupted\n")
+    assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
+    assert rows_in(path) == 1

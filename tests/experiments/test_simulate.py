@@ -1,0 +1,220 @@
+"""Scenarios and `dvrk-drake simulate`: one scenario, one result; and what is refused, in one line."""
+
+import numpy as np
+import pytest
+from repository import ROOT
+
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ScenarioError
+from dvrk_drake.experiments.scenario import Scenario, Target
+from dvrk_drake.experiments.scenario_file import load_scenario
+from dvrk_drake.experiments.simulation import simulate
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
+from dvrk_drake.recordings.recording import read_recording
+
+EXAMPLE = ROOT / "examples" / "psm_reach.yaml"
+PSM = load_arm("psm")
+ZERO = "[0,0,0.1,0,0,0,0]"
+
+
+def test_reaches_its_targets_at_their_times_and_rests_there():
+    scenario = load_scenario(str(EXAMPLE), ["effort_noise=0"])
+    simulation = simulate(scenario)
+    recording = simulation.recording
+    recording.check_fits(PSM)
+    assert len(recording) == 601
+    np.testing.assert_allclose(simulation.time, np.arange(601) * 0.01, atol=1e-12)
+    np.testing.assert_allclose(recording.q[0], scenario.start, atol=1e-12)
+    for target in scenario.targets:
+        row = round(target.time / 0.01)
+        np.testing.assert_allclose(simulation.desired[row], target.pose, atol=1e-9)
+        assert np.all(np.abs(recording.q[row] - target.pose) < PSM.per_joint(5e-3, 1e-3))
+    # A second after the last: at rest there, with the cable's pull on the insertion held by the integrator.
+    goal = np.array(scenario.targets[-1].pose)
+    assert np.all(np.abs(recording.q[-1] - goal) < PSM.per_joint(1e-3, 1e-4))
+    assert np.abs(recording.qd[-1]).max() < 1e-3
+    gravity = IdentifiedModel.from_arm(PSM).holding_torque(recording.q[-1])
+    assert recording.tau[-1, 2] - gravity[2] == pytest.approx(0.8, abs=0.02)
+
+
+@pytest.mark.slow
+def test_the_led_handle_arrives_while_joint_4_sticks():
+    """What examples/real_arm.yaml says of joint 4: the handle's pose is six numbers, and joints 6 and 7 do its part."""
+    example = str(ROOT / "examples" / "real_arm.yaml")
+    with_friction, without = (
+        simulate(load_scenario(example, ["duration=3", *settings])).state_true[-1, :7]
+        for settings in ([], ["real_arm=[cables, springs, stops, saturation, encoder, effort, delay]"])
+    )
+    arm = load_arm("mtml")
+    led = np.array(load_scenario(example, []).hand.path[-1].pose)
+    assert abs(led[3]) == 0.3 and abs(with_friction[3]) < 0.01
+    # Without friction joint 4 moves: the handle does not determine it.
+    assert abs(without[3]) > 0.05
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    poses = []
+    for q in (led, with_friction):
+        set_arm_positions(plant, context, arm, q)
+        poses.append(plant.GetFrameByName("dh_7").CalcPoseInWorld(context))
+    apart = poses[0].inverse() @ poses[1]
+    assert np.linalg.norm(apart.translation()) < 2e-3 and apart.rotation().ToAngleAxis().angle() < 0.02
+    # Joint 4 where it was led, and the others where they are, is another pose of the handle.
+    assert np.abs(with_friction - led)[4:].max() > 0.1
+
+
+def test_same_scenario_same_bytes_and_the_seed_is_of_the_noise(tmp_path):
+    files = []
+    for i, seed in enumerate((1, 1, 2)):
+        path = tmp_path / f"{i}.csv"
+        assert (
+            main(["simulate", str(EXAMPLE), "--set", "duration=5", "--set", f"seed={seed}", "--output", str(path)]) == 0
+        )
+        files.append(path.read_bytes())
+    assert files[0] == files[1] != files[2]
+    first, other = (read_recording(tmp_path / name, PSM) for name in ("0.csv", "2.csv"))
+    np.testing.assert_allclose(first.q, other.q, atol=1e-12)
+    noise = (first.tau - other.tau) / PSM.effort_limits / np.sqrt(2)
+    np.testing.assert_allclose(noise.std(axis=0), 0.01, rtol=0.15, atol=0)
+
+
+@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+@pytest.mark.parametrize("mode", ["hold", "gravity"])
+def test_every_arm_holds_where_it_starts(name, mode):
+    simulation = simulate(load_scenario(name, ["duration=0.5", f"controller.mode={mode}"]))
+    q = simulation.recording.q
+    arm = load_arm(name)
+    np.testing.assert_allclose(q[0], np.clip(0, arm.position_lower, arm.position_upper), atol=1e-12)
+    assert np.abs(q - q[0]).max() < 1e-5
+    assert (simulation.desired is None) == (mode == "gravity")
+
+
+def test_another_mounting_is_held_by_its_own_model_and_not_by_the_files(tmp_path):
+    model = tmp_path / "upright.yaml"
+    IdentifiedModel.from_arm(PSM).save(model)
+    settings = ["duration=0.5", "controller.mode=gravity", "gravity=[0,-9.81,0]", f"start={ZERO}"]
+    moved = []
+    for more in ([], [f"controller.model={model}"]):
+        q = simulate(load_scenario("psm", [*settings, *more])).recording.q
+        moved.append(np.abs(q[-1] - q[0]).max())
+    assert moved[0] < 1e-5
+    assert moved[1] > 0.05
+
+
+def test_gains_of_the_scenario_are_used():
+    limp = "controller.gains={kp: [0.02,0.02,0.5,0.01,0.01,0.01,0.01], kd: [0,0,0,0,0,0,0], ki: [0,0,0,0,0,0,0]}"
+    target = "targets=[{time: 0.5, pose: [0.1,0,0.1,0,0,0,0]}]"
+    moved = []
+    for more in ([], [limp]):
+        q = simulate(load_scenario("psm", ["duration=1", f"start={ZERO}", target, *more])).recording.q
+        moved.append(q[-1, 0])
+    assert moved[0] == pytest.approx(0.1, abs=2e-3)
+    assert abs(moved[1]) < 0.02
+
+
+def test_a_recording_of_it_is_read_by_the_other_verbs(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")  # headings on one line
+    model, recording, errors = (str(tmp_path / name) for name in ("model.yaml", "held.csv", "errors.json"))
+    IdentifiedModel.from_arm(PSM).save(model)
+    start = "start=[0.5,0.4,0.1,0.3,0.2,-0.3,0.4]"
+    command = [
+        "simulate",
+        "psm",
+        "--set",
+        start,
+        "--set",
+        "duration=1",
+        "--output",
+        recording,
+        "--plots",
+        str(tmp_path),
+    ]
+    assert main(command) == 0
+    assert (tmp_path / "positions.png").stat().st_size > 10_000
+    assert "error at the end" in capsys.readouterr().out
+    assert main(["validate", model, recording, "--json", errors]) == 0
+    held = read_recording(recording, PSM)
+    np.testing.assert_allclose(held.tau, IdentifiedModel.load(model).holding_torque(held.q), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        (
+            "durations=2",
+            'psm: key "durations" is unknown; did you mean "duration"? allowed in a scenario: arm, closure',
+        ),
+        ("controller.kp=2", 'controller: key "kp" is unknown; allowed in controller: mode, model'),
+        ("targets=[{tim: 1}]", 'targets[0]: key "tim" is unknown; did you mean "time"? allowed in targets: time, pose'),
+        ("duration=long", 'psm: duration is "long"; allowed: a number'),
+        ("controller.parameter_error=abc", 'psm: controller.parameter_error is "abc"; allowed: a number'),
+        ("controler.mode=hold", 'key "controler" is unknown; did you mean "controller"? allowed in a scenario'),
+        ("real_arm=all", 'psm: real_arm is "all"; allowed: a list of texts, e.g. [all]'),
+        ("real_arm=[al]", "unknown effect al; allowed: all, friction"),
+        ("targets=3", "targets is 3; allowed: a list of tables with the keys time, pose"),
+        ("seed=1.5", "seed is 1.5; allowed: a whole number"),
+        ("stretch.yaw.stiffness=soft", 'stretch.yaw.stiffness is "soft"; allowed: a number'),
+        ("controller.gains.kp=[1, a]", 'controller.gains.kp[1] is "a"; allowed: a number'),
+        ("duration=", "duration is empty; allowed: a number"),
+        ("duration.x=1", "duration is {'x': 1}; allowed: a number"),
+        ("duration=.nan", "duration is nan; allowed: a finite number"),
+        ("time_step=0.1", "time_step is 0.1; allowed: 1e-05..0.01"),
+        ("closure=weld", 'closure is "weld"; allowed: mimic, ball'),
+        ("controller.mode=float", 'controller.mode is "float"; allowed: hold, gravity'),
+        ("controller.model=nothing.yaml", "nothing.yaml: no such file"),
+        ("gravity=[0, 0, 981]", "gravity[2] is 981; allowed: -30..30 m/s^2"),
+        ("start=[0, 0, 0.1, 0, 0, 0]", "start has 6 numbers; PSM has 7 joints: yaw, pitch, insertion"),
+        ("start=[0, 0, 100, 0, 0, 0, 0]", "insertion = 100 is outside 0..0.24 [rad, m] of PSM; is insertion in mm?"),
+        ("start=[3, 0, 0.1, 0, 0, 0, 0]", "yaw = 3 is outside -1.588..1.588 [rad, m] of PSM"),
+        ("start=[0, .nan, 0.1, 0, 0, 0, 0]", "start[1] is nan; allowed: a finite number"),
+        ("targets=[{time: 1, pose: [0, 0]}]", "targets[0].pose has 2 numbers"),
+        (
+            f"targets=[{{time: 9, pose: {ZERO}}}]",
+            "targets[0].time = 9 s must be after 0 s and at most the duration, 5 s",
+        ),
+        (f"targets=[{{time: .nan, pose: {ZERO}}}]", "targets[0].time is nan; allowed: a finite number"),
+        ("effects=[{coordinate: elbow, kind: offset}]", 'effects[0].coordinate is "elbow"; allowed: actuator.yaw'),
+        ("effects=[{coordinate: joint.yaw, kind: viscous}]", 'effects[0].kind is "viscous"; allowed: offset, spring'),
+        ("seed=-1", "seed is -1"),
+        ("arm=psm9", 'unknown arm "psm9"; known arms: mtml, mtmr, psm'),
+        ("duration", "--set duration: must be key=value"),
+        ("start=[0,", "--set start=[0,: not YAML"),
+    ],
+)
+def test_nonsense_is_refused_in_one_line(setting, message, capsys, tmp_path):
+    output = tmp_path / "out.csv"
+    assert main(["simulate", "psm", "--set", setting, "--output", str(output)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert message in error
+    assert not output.exists()
+
+
+def test_files_that_are_no_scenarios_are_refused(tmp_path):
+    path = tmp_path / "scenario.yaml"
+    with pytest.raises(ScenarioError, match="no such file"):
+        load_scenario(str(path))
+    for text, message in (
+        ("[1, 2]", "must be keys and values"),
+        ("arm: [", "not YAML"),
+        ("duration: 2", "arm is missing"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ScenarioError, match=message):
+            load_scenario(str(path))
+
+
+def test_an_unknown_instrument_is_named(tmp_path):
+    arm, scenario = tmp_path / "psm9.yaml", tmp_path / "scenario.yaml"
+    arm.write_text("name: PSM9\nmechanism: psm\ninstrument: scissors\nposition_limits: {}\n")
+    scenario.write_text(f"arm: {arm}\n")
+    assert main(["simulate", str(scenario)]) == 2
+
+
+def test_targets_need_a_controller_that_follows_them():
+    scenario = Scenario(arm="psm", targets=[Target(1.0, [0, 0, 0.1, 0, 0, 0, 0])])
+    scenario.check()
+    scenario.controller.mode = "gravity"
+    with pytest.raises(ScenarioError, match=r'targets need controller\.mode "hold"'):
+        scenario.check()

@@ -1,0 +1,118 @@
+"""What a hand feels: identities of the measurement, and the order that physics demands."""
+
+import csv
+
+import numpy as np
+import pytest
+from pydrake.trajectories import PiecewisePolynomial
+
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.arm_frame import handle_frame
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ScenarioError
+from dvrk_drake.experiments.transparency import Compensation, feel, rambling_path, recorded_path
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.recordings.recording import Recording
+
+ARM = load_arm("mtml")
+MODEL = IdentifiedModel.from_arm(ARM)
+REST = np.array([0.1, 0.3, -0.1, 0.4, 0.3, 0.1, 0.2])
+
+
+def resting(seconds):
+    return PiecewisePolynomial.ZeroOrderHold([0.0, seconds], np.array([REST, REST]).T)
+
+
+def test_a_hand_that_holds_a_compensated_arm_still_feels_nothing():
+    felt = feel(ARM, resting(1.5), Compensation("gravity", MODEL))
+    assert felt.rms_force < 1e-6 and felt.rms_torque < 1e-6
+    assert felt.deviation.max() < 1e-6
+
+
+def test_a_hand_that_holds_a_limp_arm_still_does_the_work_of_lifting_it():
+    """At rest J' F = holding torque: where the arm came to rest in the hand's grip."""
+    felt = feel(ARM, resting(3.0), Compensation("nothing"))
+    assert felt.rms_force > 1.0
+    # The handle sags until spring times way is the force, of the stiffness that Grip states.
+    late = felt.time > 2.9
+    np.testing.assert_allclose(
+        np.linalg.norm(felt.force[late], axis=1), 600.0 * felt.deviation[late], rtol=0.02, atol=0
+    )
+
+
+@pytest.mark.slow
+def test_each_compensation_takes_more_off_the_hand():
+    path = rambling_path(ARM, poses=3)
+    friction = ARM.effects.only(["friction", "encoder", "delay"])
+    listed = [Compensation("nothing"), Compensation("gravity", MODEL), Compensation("friction", MODEL, 0.6)]
+    limp, gravity, both = (feel(ARM, path, one, effects=friction) for one in listed)
+    assert limp.rms_force > 2 * gravity.rms_force
+    assert gravity.rms_force > 1.3 * both.rms_force
+    assert gravity.rms_torque > both.rms_torque
+
+
+def test_the_path_of_a_recording_keeps_inside_the_limits_and_has_its_speed():
+    t = np.linspace(3.0, 5.0, 50)
+    middle, half = (ARM.position_upper + ARM.position_lower) / 2, (ARM.position_upper - ARM.position_lower) / 2
+    middle[1:3], half[1:3] = 0.1, 0.0  # within what the parallelogram allows
+    q = middle + (half + 0.05) * np.sin(t)[:, None]
+    path = recorded_path(ARM, Recording(q=q, t=t, tau=np.zeros_like(q)), speed=0.5)
+    assert path.start_time() == 0 and path.end_time() == pytest.approx(4.0)
+    values = np.array([path.value(x).ravel() for x in np.linspace(0, 4, 500)])
+    assert np.all(values <= ARM.position_upper + 1e-12) and np.all(values >= ARM.position_lower - 1e-12)
+    expected = np.clip(middle + (half + 0.05) * np.sin(4.0), ARM.position_lower, ARM.position_upper)
+    np.testing.assert_allclose(path.value(2.0).ravel(), expected, atol=2e-3)
+    with pytest.raises(ScenarioError, match="leaves the limits of MTML"):
+        recorded_path(ARM, Recording(q=middle + (half + 0.2) * np.sin(t)[:, None], t=t, tau=np.zeros_like(q)))
+    with pytest.raises(ScenarioError, match="speed is 0"):
+        recorded_path(ARM, Recording(q=q, t=t, tau=np.zeros_like(q)), speed=0)
+    with pytest.raises(ScenarioError, match="no times"):
+        recorded_path(ARM, Recording(q=q, tau=np.zeros_like(q)))
+    with pytest.raises(ScenarioError, match="has 2 different times"):
+        recorded_path(ARM, Recording(q=q[:2], t=t[:2]))
+    with pytest.raises(ScenarioError, match="parallelogram leaves the limits of MTML"):
+        recorded_path(ARM, Recording(q=q + 0.6 * np.array([0, 1, 1, 0, 0, 0, 0]), t=t))
+    moved = Recording(q=q, t=t).in_actuator_coordinates(ARM)
+    np.testing.assert_allclose(recorded_path(ARM, moved, 0.5).value(2.0), path.value(2.0), atol=1e-12)
+
+
+def test_a_psm_is_led_at_its_instrument():
+    psm = load_arm("psm")
+    assert (handle_frame(ARM), handle_frame(psm)) == ("dh_7", "dh_6")
+    pose = np.clip(0.1, psm.position_lower, psm.position_upper)
+    path = PiecewisePolynomial.ZeroOrderHold([0.0, 1.1], np.array([pose, pose]).T)
+    assert (
+        feel(psm, path, Compensation("SDF", IdentifiedModel.from_arm(psm))).rms_force < 1e-4
+    )  # the loops' pins give a little
+    assert feel(psm, path, Compensation("nothing")).rms_force > 0.5
+
+
+def test_the_verb_writes_its_table(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("dvrk_drake.experiments.transparency.rambling_path", lambda arm: resting(1.2))
+    model = tmp_path / "model.yaml"
+    MODEL.save(model)
+    arguments = ["transparency", "--arm", "mtml", "--model", f"ours={model}", "--real-arm", "friction"]
+    assert main([*arguments, "--output", str(tmp_path / "out")]) == 0
+    with open(tmp_path / "out" / "transparency.csv") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["compensation"] for row in rows] == ["nothing", "ours", "ours, friction 0.5"]
+    assert float(rows[0]["rms_force"]) > 1.0 > float(rows[1]["rms_force"])
+    assert (tmp_path / "out" / "transparency.png").stat().st_size > 10_000
+    assert "what a hand feels" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--friction-ratio", "1"], "between 0 and 0.6"),
+        (["--model", "nothing.yaml"], "must be NAME=MODEL.yaml"),
+        (["--real-arm", "wings"], "unknown effect wings; allowed: all, friction"),
+        (["--frame", "dh_9"], 'MTML: its SDF has no frame "dh_9"; it has dh_0, dh_1'),
+        (["--speed", "2"], "--speed is that of a recorded motion; name one with --path"),
+        (["--path", "nowhere.csv"], "nowhere.csv"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(arguments, said, capsys):
+    assert main(["transparency", "--arm", "mtml", *arguments]) == 2
+    line = capsys.readouterr().err
+    assert said in line and line.count("\n") == 1

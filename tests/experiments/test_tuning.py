@@ -1,0 +1,413 @@
+"""Gains: what is found on a joint whose equations are known, and what the files and the verb refuse."""
+
+import dataclasses
+import io
+from functools import partial
+
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy.optimize import brentq
+
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ControllerError
+from dvrk_drake.experiments.scenario_file import load_scenario
+from dvrk_drake.experiments.study.executors import local_executor
+from dvrk_drake.experiments.tuning.bench import Bench, JointOnBench, Response
+from dvrk_drake.experiments.tuning.model_based import (
+    GAIN_MARGIN,
+    PHASE_MARGIN,
+    SHAKE,
+    JointFacts,
+    design_arm,
+    design_joint,
+    mass_matrices,
+    sampling_of,
+)
+from dvrk_drake.experiments.tuning.procedure import RELEASE, find_ultimate_gain, judge_oscillation, tune_joint
+from dvrk_drake.experiments.tuning.sampled_loop import SampledLoop, Sampling, place
+from dvrk_drake.experiments.tuning.settings import band, published_gains, step_size
+from dvrk_drake.experiments.tuning.tuning import (
+    CONDITIONS,
+    DURATION,
+    REST,
+    Comparison,
+    StepMeasures,
+    measure_step,
+    tune_arm,
+)
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, DriveEffect
+from dvrk_drake.models.gains_file import load_gains, save_gains
+from dvrk_drake.processes.arm_controller import ArmController
+from dvrk_drake.reports.tuning import plot_steps, print_tuning
+
+#: The lags of the sampling make a loop of second order only far below 1 / (9 ms).
+FAR_BELOW = 15.0
+
+
+class LinearJoint:
+    """A JointUnderTest without friction but viscous, from the equations alone."""
+
+    step, count, band, effort_limit = 0.05, 1e-6, 1e-3, 2.0
+
+    def __init__(self, M, sampling, viscous):
+        self.loop, self.sampling = SampledLoop(M, sampling, viscous), sampling
+
+    def respond(self, kp, kd, ki, duration):
+        A = self.loop.closed_loop(Gains([kp], [kd], [ki]))
+        x, error = self.loop.at_rest(self.step), []
+        for _ in range(round(duration / self.sampling.period) + 1):
+            error.append(x[0])
+            x = A @ x
+        return self.sampling.period * np.arange(len(error)), np.array(error)
+
+
+def single(kp, kd, ki=0.0):
+    return Gains([kp], [kd], [ki])
+
+
+def analytic_ultimate(M, b, lag):
+    """K and the period of M s^2 + b s + K exp(-s lag) = 0 at s = j w."""
+    w = brentq(lambda w: np.tan(w * lag) * M * w - b, 1e-6, 0.499 * np.pi / lag)
+    return M * w**2 / np.cos(w * lag), 2 * np.pi / w
+
+
+@pytest.mark.parametrize(("M", "b", "ticks"), [(0.1, 0.08, 2), (0.1, 0.3, 2), (0.02, 0.08, 3), (0.3, 0.15, 1)])
+def test_ultimate_gain_and_period_are_the_analytic_ones(M, b, ticks):
+    sampling = Sampling(ticks=ticks)
+    gain, period = analytic_ultimate(M, b, (ticks + 0.5) * sampling.period)
+    found = find_ultimate_gain(LinearJoint(M, sampling, b))
+    assert found.sustained
+    assert found.gain == pytest.approx(gain, rel=0.03)
+    assert found.period == pytest.approx(period, rel=0.03)
+    assert found.growth == pytest.approx(1.0, abs=0.01)
+
+
+def test_without_friction_every_gain_swings_up():
+    # A double integrator with delay has no stable proportional gain at all: what is found is the least one with which
+    # a release is watched for the four swings, two periods, that it takes to tell.
+    M = 0.05
+    assert find_ultimate_gain(LinearJoint(M, Sampling(), 0.0)).gain == pytest.approx(
+        M * (2 * np.pi * 2 / RELEASE) ** 2, rel=0.06
+    )
+
+
+def test_a_joint_that_never_swings_is_said_to():
+    found = find_ultimate_gain(LinearJoint(0.02, Sampling(), 50.0))
+    assert not found.sustained
+    assert found.gain == 20.0 * LinearJoint.effort_limit / LinearJoint.step
+
+
+def test_the_procedure_damps_a_linear_joint():
+    sampling = Sampling()
+    result = tune_joint(LinearJoint(0.1, sampling, 0.2))
+    assert result.damped
+    assert result.kp == pytest.approx(result.ultimate.gain * result.kp_lowered)
+    t, error = LinearJoint(0.1, sampling, 0.2).respond(result.kp, result.kd, result.ki, 2.0)
+    assert -error.min() < 0.05 * LinearJoint.step + LinearJoint.count
+    assert np.abs(error[t > 1.6]).max() < LinearJoint.band
+    assert result.ki == 0.0  # nothing pulls at it: there is no offset
+
+
+@pytest.mark.parametrize("ratio", [0.02, 0.1, -0.05])
+def test_growth_and_period_of_a_known_oscillation(ratio):
+    w = 40.0
+    t = 1e-3 * np.arange(1501)
+    x = 0.3 + 0.05 * np.exp(-ratio * w * t) * np.cos(w * np.sqrt(1 - ratio**2) * t)
+    found = judge_oscillation(t, x, 1e-5)
+    assert found.growth == pytest.approx(np.exp(-np.pi * ratio / np.sqrt(1 - ratio**2)), rel=1e-3)
+    assert found.period == pytest.approx(2 * np.pi / w / np.sqrt(1 - ratio**2), rel=0.01)
+    assert found.sustained == (ratio < 0)
+
+
+def test_what_sticks_or_creeps_does_not_oscillate():
+    t = 1e-3 * np.arange(1000)
+    assert judge_oscillation(t, np.full(1000, 0.05), 1e-4).growth == 0.0
+    assert judge_oscillation(t, 0.05 * np.exp(-5 * t), 1e-4).growth == 0.0
+    # Counts of an encoder are no swings.
+    assert judge_oscillation(t, 3e-3 * np.round(np.sin(60 * t)), 6.1e-3).swings == 0
+
+
+def poles(loop, gains, sampling):
+    """Poles of the closed loop in s [rad/s], the slowest to decay first; those of a delay are at -infinity."""
+    z = np.linalg.eigvals(loop.closed_loop(gains)).astype(complex)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = np.log(z) / sampling.period
+    return s[np.argsort(-s.real)]
+
+
+@pytest.mark.parametrize("viscous", [0.0, 0.5])
+@pytest.mark.parametrize("ratio", [0.5, 0.8, 1.0])
+@pytest.mark.parametrize("ticks", [1, 2, 3])
+def test_placed_gains_have_the_wanted_damping(ratio, ticks, viscous):
+    sampling = Sampling(ticks=ticks)
+    M = 0.2
+    kp, kd = place(M, FAR_BELOW, ratio, sampling, viscous)
+    slowest = poles(SampledLoop(M, sampling, viscous), single(kp, kd), sampling)
+    slowest = slowest[np.abs(slowest) > 1e-6][:2]
+    polynomial = np.real(np.poly(slowest))  # s^2 + 2 z w s + w^2
+    w = np.sqrt(polynomial[2])
+    assert w == pytest.approx(FAR_BELOW, rel=0.04)
+    assert polynomial[1] / (2 * w) == pytest.approx(ratio, rel=0.04)
+
+
+def test_ignoring_the_lags_would_not():
+    # So that the test above can fail: the textbook's kp = M w^2, kd = 2 z M w are off by more than it allows.
+    sampling, M, z = Sampling(ticks=3), 0.2, 0.8
+    slowest = poles(SampledLoop(M, sampling), single(M * FAR_BELOW**2, 2 * z * M * FAR_BELOW), sampling)
+    polynomial = np.real(np.poly(slowest[np.abs(slowest) > 1e-6][:2]))
+    assert abs(polynomial[1] / (2 * np.sqrt(polynomial[2])) / z - 1) > 0.08
+
+
+def test_margins_are_where_the_loop_becomes_unstable():
+    sampling, M = Sampling(), 0.1
+    kp, kd = place(M, 40.0, 0.8, sampling)
+    ki = 4.0 * kp
+    margins = SampledLoop(M, sampling).margins(single(kp, kd, ki))
+    for factor, stable in ((0.99 * margins.gain, True), (1.01 * margins.gain, False)):
+        assert SampledLoop(M, sampling).is_stable(single(factor * kp, factor * kd, factor * ki)) == stable
+    # A delay turns the phase by w T: the margin is a time.
+    spare = margins.phase / margins.crossover / sampling.period
+    for ticks, stable in ((int(spare), True), (int(spare) + 1, False)):
+        later = Sampling(sampling.period, sampling.ticks + ticks, sampling.cut_off)
+        assert SampledLoop(M, later).is_stable(single(kp, kd, ki)) == stable
+
+
+def test_only_the_joint_that_takes_part_most_is_slowed_down():
+    arm = load_arm("mtml")
+    sampling, design = sampling_of(arm), design_arm(arm)
+    alone = [design_joint(fact, sampling) for fact in design.facts]
+    slowed = [joint.limited_by == "other joints" for joint in design.joints]
+    assert any(slowed) and not all(slowed)
+    assert [a == b for a, b in zip(alone, design.joints, strict=True)] == [not slow for slow in slowed]
+    # Alone they are not stable together, with a tick more and less inertia; as designed they are, at other poses too.
+    harder = Sampling(sampling.period, sampling.ticks + 1, sampling.cut_off)
+    loops = [SampledLoop(0.8 * M, harder) for M in mass_matrices(arm, arm.sample_poses(20, np.random.default_rng(9)))]
+    together = Gains(*([getattr(joint, name) for joint in alone] for name in ("kp", "kd", "ki")))
+    assert not all(loop.is_stable(together) for loop in loops)
+    assert all(loop.is_stable(design.gains) for loop in loops)
+
+
+def test_the_least_damped_mode_names_its_joint():
+    sampling = Sampling()
+    loop = SampledLoop(np.diag([0.1, 0.01]), sampling)
+    for kd, joint in (([0.0, 0.2], 0), ([2.0, 0.0], 1)):
+        growth, shares = loop.least_damped_mode(Gains([10.0, 1.0], kd, [0.0, 0.0]))
+        assert growth > 1.0  # a double integrator with delay and no damping
+        np.testing.assert_allclose(shares, np.eye(2)[joint], atol=1e-9)
+
+
+def test_an_unstable_loop_has_no_margins():
+    assert SampledLoop(0.1, Sampling()).margins(single(100.0, 0.0)).phase == 0.0
+
+
+def test_joints_together_are_the_joints_alone_if_nothing_couples_them():
+    sampling, gains = Sampling(), Gains([20.0, 3.0], [2.0, 0.2], [30.0, 1.0])
+    together = SampledLoop(np.diag([0.1, 0.01]), sampling).closed_loop(gains)
+    alone = [
+        SampledLoop(M, sampling).closed_loop(Gains([gains.kp[j]], [gains.kd[j]], [gains.ki[j]]))
+        for j, M in enumerate((0.1, 0.01))
+    ]
+    found = np.sort(np.abs(np.linalg.eigvals(together)))
+    expected = np.sort(np.abs(np.concatenate([np.linalg.eigvals(A) for A in alone])))
+    np.testing.assert_allclose(found[-8:], expected[-8:], atol=1e-9)
+
+
+def test_a_design_keeps_its_margins_and_says_what_limits_it():
+    sampling = Sampling()
+    fact = JointFacts((0.05, 0.2), dry_friction=0.1, viscous=0.0, gravity=0.5, count=3e-5, band=1e-3, effort_limit=2.0)
+    design = design_joint(fact, sampling)
+    assert design.limited_by == "phase margin"
+    assert min(margins.phase for margins in design.margins) == pytest.approx(PHASE_MARGIN, abs=0.02)
+    assert min(margins.gain for margins in design.margins) > GAIN_MARGIN
+    # What sticks at the edge of its band is moved by the integral after a quarter of a second, or Ki is at its bound.
+    assert design.ki <= (0.1 + 0.2 * 0.5) / (1e-3 * 0.25) + 1e-9
+    coarse = dataclasses.replace(fact, count=1e-3, dry_friction=0.0)
+    design = design_joint(coarse, sampling)
+    assert design.limited_by == "encoder count"
+    assert (
+        coarse.count * (design.kp + design.kd * (1 - sampling.decay) / sampling.period) <= SHAKE * coarse.effort_limit
+    )
+    with pytest.raises(ControllerError, match="limited by: encoder count"):
+        design_joint(dataclasses.replace(coarse, count=1.0), sampling)
+    later = design_joint(fact, Sampling(ticks=4))
+    assert later.frequency < 0.8 * design_joint(fact, sampling).frequency
+
+
+def test_the_mass_matrix_has_linkage_and_rotors():
+    # Along a motion of the independent joints the kinetic energy of the whole tree is v' M v / 2.
+    from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
+
+    arm = load_arm("mtml")
+    generator = np.random.default_rng(4)
+    q, v = arm.sample_poses(1, generator)[0], generator.normal(size=7)
+    (M,) = mass_matrices(arm, [q])
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    set_arm_positions(plant, context, arm, q)
+    v_plant = np.zeros(plant.num_velocities())
+    v_plant[tree_selector(plant, arm)] = arm.linkage.matrix @ v
+    plant.SetVelocities(context, v_plant)
+    assert 0.5 * v @ M @ v == pytest.approx(plant.CalcKineticEnergy(context), rel=1e-9)
+
+
+def test_measures_of_a_known_step():
+    arm = load_arm("psm")
+    n, t = arm.num_joints, 1e-3 * np.arange(round(1e3 * DURATION) + 1)
+    q = np.zeros((len(t), n))
+    goal, w = step_size(arm), 10.0
+    q[:] = goal * (1 - np.exp(-w * t))[:, None]
+    q[:, 1] = goal[1] * (1 - np.exp(-w * t) * (np.cos(3 * w * t) + np.sin(3 * w * t) / 3))  # no speed at first
+    q[:, 2] = 0.5 * goal[2]
+    q[:, 3] = goal[3] * (1 + 0.1 * np.sin(50 * t)) - goal[3] * (t == 0)
+    effort = np.zeros((len(t), n))
+    effort[:, 4] = 0.1 * arm.effort_limits[4] * np.sin(50 * t)
+    effort[t < DURATION - REST, 5] = arm.effort_limits[5]  # the motor works on the way and rests at the end
+    measured = measure_step(arm, Response(t, q, q, effort, goal))
+    assert measured.settling[0] == pytest.approx(np.log(goal[0] / band(arm)[0]) / w, abs=2e-3)
+    assert measured.overshoot[0] == 0.0
+    # Its speed is 10/3 w exp(-w t) sin(3 w t): the first and largest peak is at 3 w t = pi.
+    assert measured.overshoot[1] == pytest.approx(np.exp(-np.pi / 3), rel=1e-3)
+    assert np.isinf(measured.settling[2])
+    assert measured.steady_error[2] == pytest.approx(0.5 * goal[2])
+    assert np.isinf(measured.settling[3])  # it comes into the band again and again and never stays
+    assert measured.overshoot[3] == pytest.approx(0.1, rel=1e-2)
+    np.testing.assert_allclose(measured.unrest, [0, 0, 0, 0, 0.2, 0, 0], rtol=1e-2, atol=1e-12)
+
+
+def test_best_gains_settle_most_often_and_then_fastest():
+    arm = load_arm("psm")
+    never, rest = np.full(7, np.inf), np.zeros(7)
+    settling = {
+        "fails": np.r_[np.inf, np.full(6, 0.1)],
+        "slow": np.full(7, 0.9),
+        "fast": np.full(7, 0.8),
+        "never": never,
+    }
+    measures = {name: [[StepMeasures(times, rest, rest, rest)]] for name, times in settling.items()}
+    comparison = Comparison(arm, {}, CONDITIONS[:1], np.zeros((1, 7)), measures, {})
+    assert comparison.best(settling) == "fast"
+    assert comparison.best(["never", "fails", "slow"]) == "slow"
+    assert comparison.best(["never", "fails"]) == "fails"
+
+
+def test_published_gains_are_per_second_and_of_an_mtm():
+    gains = published_gains(load_arm("mtmr"))
+    # One sample of 10 ms with the error 1 adds Ki to the effort.
+    assert gains.ki[3] * 0.01 == pytest.approx(4e-4)
+    assert published_gains(load_arm("psm")) is None
+
+
+def test_gains_go_through_a_file_into_a_scenario(tmp_path):
+    arm = load_arm("mtml")
+    gains = Gains([round(1.1 * k, 4) for k in arm.gains.kp], arm.gains.kd, arm.gains.ki)
+    path = tmp_path / "gains.yaml"
+    save_gains(gains, path, "a remark")
+    assert load_gains(path) == gains
+    assert load_scenario("mtml", [f"controller.gains={path}"]).controller.gains == gains
+    scenario = tmp_path / "scenario.yaml"
+    scenario.write_text(f"arm: mtml\ncontroller: {{gains: {path}}}\n")
+    assert load_scenario(str(scenario)).controller.gains == gains
+
+
+def test_gains_of_a_file_are_what_an_arm_is_held_with(tmp_path):
+    arm, error = load_arm("mtml"), 0.01
+    n, sender_commands = arm.num_joints, []
+    status = lcmt_dvrk_status()
+    status.arm_name, status.num_joints = arm.name, n
+    status.position, status.velocity, status.effort_measured = [0.1] * n, [0.0] * n, [0.0] * n
+    status.guard_state = lcmt_dvrk_status.STATE_EFFORT
+    for factor in (1.0, 3.0):
+        path = tmp_path / "gains.yaml"
+        save_gains(Gains([factor * 0.1] * n, [0.0] * n, [0.0] * n), path, "no integral")
+        controller = ArmController(arm, IdentifiedModel.from_arm(arm), "hold", 1e-3, gains=load_gains(path))
+        status.command_sender_id = controller.sender_id
+        desired = np.concatenate([np.full(n, 0.1 + error), np.zeros(n)])
+        answers = [controller.answer(status, 1e-3 * k, desired) for k in range(1200)]  # the ramp takes a second
+        assert controller.ramped
+        sender_commands.append(np.array(answers[-1].effort))
+    np.testing.assert_allclose(sender_commands[1] - sender_commands[0], 2 * 0.1 * error, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("kp: [1]\nkd: [1]\n", "ki is missing"),
+        (
+            "kp: [1]\nkd: [1]\nkI: [1]\n",
+            'key "kI" is unknown; did you mean "ki"\\? allowed in a file of gains: kp, kd, ki',
+        ),
+        ("kp: fast\n", 'kp is "fast"; allowed: a list of numbers'),
+        ("kp: [1, fast]\n", r'kp\[1\] is "fast"; allowed: a number'),
+        ("kp: [1, 0]\nkd: [1, 1]\nki: [0, 0]\n", r"kp\[1\] is 0; allowed: 1e-05\.\."),
+        ("kp: [1]\nkd: [-0.1]\nki: [0]\n", r"kd\[0\] is -0\.1; allowed: 0 or "),
+        ("kp: [1]\nkd: [1]\nki: [-3]\n", r"ki\[0\] is -3; allowed: 0 or "),
+        ("- 1\n", "must be keys and values, not .*; allowed in a file of gains: kp, kd, ki"),
+    ],
+)
+def test_what_is_no_file_of_gains_is_refused(tmp_path, text, said):
+    path = tmp_path / "gains.yaml"
+    path.write_text(text)
+    with pytest.raises(ControllerError, match=said):
+        load_gains(path)
+
+
+def refused(capsys, *arguments):
+    """The one line that the verb says before it ends with 2."""
+    try:
+        code = main(arguments)
+    except SystemExit as error:
+        code = error.code
+    assert code == 2
+    return capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def test_the_verbs_refuse_bad_options(tmp_path, capsys):
+    assert 'unknown arm "mtm"' in refused(capsys, "tune", "--arm", "mtm")
+    assert "invalid choice: 'guess'" in refused(capsys, "tune", "--arm", "psm", "--method", "guess")
+    assert "its folder does not exist" in refused(
+        capsys, "tune", "--arm", "psm", "--output", str(tmp_path / "no" / "g")
+    )
+    assert "no such file" in refused(capsys, "simulate", "mtml", "--set", "controller.gains=none.yaml")
+    few = tmp_path / "few.yaml"
+    save_gains(Gains([1.0], [1.0], [1.0]), few, "of one joint")
+    assert "gains.kp has 1 number; allowed: 7" in refused(
+        capsys, "simulate", "mtml", "--set", f"controller.gains={few}"
+    )
+    assert "for --mode hold" in refused(capsys, "run", "--arm", "mtml", "--gains", str(few))
+
+
+@pytest.mark.slow
+def test_the_insertion_of_a_psm_swings_up_where_the_equations_say():
+    """Viscous friction and delay alone. Drake steps with the velocity at a step's end: only the ticks are a lag."""
+    b, arm = 2.0, load_arm("psm")
+    effects = ArmEffects(
+        friction=[DriveEffect("actuator.insertion", "viscous", coefficient=b)], delay=DelayEffect(measurement=1)
+    )
+    arm = dataclasses.replace(arm, effects=effects)
+    assert sampling_of(arm).ticks == 2
+    found = find_ultimate_gain(JointOnBench(Bench(arm), 2))
+    M = mass_matrices(arm, arm.sample_poses(1, np.random.default_rng(0)))[0, 2, 2]
+    gain, period = analytic_ultimate(M, b, 2e-3)
+    assert found.gain == pytest.approx(gain, rel=0.05)
+    assert found.period == pytest.approx(period, rel=0.05)
+
+
+@pytest.mark.slow
+def test_the_designed_gains_settle_every_joint_of_a_psm(tmp_path, monkeypatch):
+    # One process beside this one: each more compiles the arm again.
+    monkeypatch.setattr("dvrk_drake.experiments.tuning.tuning.local_executor", partial(local_executor, 1))
+    tuning = tune_arm("psm", ["model"], conditions=CONDITIONS[:1], poses=1)
+    settling = tuning.comparison.table("model", "settling")
+    assert np.all(np.isfinite(settling))
+    assert tuning.found == {"model": tuning.design.gains}
+    console = Console(record=True, width=120, file=io.StringIO())
+    print_tuning(console, tuning)
+    said = console.export_text()
+    assert all(name in said for name in (*tuning.arm.joint_names, "the arm's own", "[s]", "[kg m^2; kg]"))
+    plot_steps(tmp_path / "steps.png", tuning.comparison)
+    assert (tmp_path / "steps.png").stat().st_size > 10_000

@@ -1,0 +1,323 @@
+"""The dVRK controller's gravity-compensation file: ours against its formula, written here a second time."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ModelError
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
+    CompensationOptions,
+    compensation_from_model,
+    controller_torque,
+    dry_friction,
+    largest_differences,
+    unclipped_torque,
+)
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.reports.export import plot_compensation
+
+pytestmark = pytest.mark.slow
+
+#: Gravity [m/s^2] of an arm whose base leans by 2.3 degrees.
+LEANING = [0.01, -0.39, -9.80]
+
+
+def dvrk_controller(path, q, qd):
+    """tau (7) as the dVRK computes it from the file's text: one pose, plain numbers, nothing of ours."""
+    content = json.loads(Path(path).read_text())
+    assert content["version"] == "2.0"
+    gc = content["GC_controller"]
+    g = 9.81
+    s, c = [None] + [math.sin(x) for x in q], [None] + [math.cos(x) for x in q]
+    S, C = math.sin(q[1] + q[2]), math.cos(q[1] + q[2])
+    shoulder = [
+        g * s[2],
+        g * c[2],
+        g * C,
+        -g * S,
+        g * C * c[4],
+        -g * C * s[4],
+        -g * (S * c[5] + C * c[4] * s[5]),
+        g * (C * c[4] * c[5] - S * s[5]),
+        g * (C * s[4] * s[6] + S * c[6] * s[5] - C * c[4] * c[5] * c[6]),
+        g * (C * c[6] * s[4] - S * s[5] * s[6] + C * c[4] * c[5] * s[6]),
+    ]
+    rows = [
+        [],
+        shoulder,
+        [0, 0, *shoulder[2:]],
+        [
+            *[0] * 4,
+            -g * S * s[4],
+            -g * S * c[4],
+            g * S * s[4] * s[5],
+            -g * S * c[5] * s[4],
+            g * S * (c[4] * s[6] + c[5] * c[6] * s[4]),
+            g * S * (c[4] * c[6] - c[5] * s[4] * s[6]),
+        ],
+        [
+            *[0] * 6,
+            -g * (C * s[5] + S * c[4] * c[5]),
+            g * (C * c[5] - S * c[4] * s[5]),
+            g * (-C * c[5] * c[6] + S * c[4] * c[6] * s[5]),
+            g * (C * c[5] * s[6] - S * c[4] * s[5] * s[6]),
+        ],
+        [
+            *[0] * 8,
+            g * (S * c[6] * s[4] + C * s[5] * s[6] + S * c[4] * c[5] * s[6]),
+            g * (C * c[6] * s[5] - S * s[4] * s[6] + S * c[4] * c[5] * c[6]),
+        ],
+        [],
+    ]
+    tau = []
+    for i in range(7):
+        ratio, db, sat = gc["fric_comp_ratio_vec"][i], gc["db_vel_vec"][i], gc["sat_vec_vec"][i]
+        speed = abs(qd[i])
+        blend = 0.0 if speed <= db else 1.0 if speed >= sat else (speed - db) / (sat - db)
+        alpha = 0.5 + math.copysign(0.5 * ratio * blend, qd[i])
+        both = []
+        for key in ("gc_dynamic_params_pos", "gc_dynamic_params_neg"):
+            p = gc[key]
+            value = sum(a * b for a, b in zip(rows[i], p, strict=False))
+            if i < 6:
+                value += sum(p[10 + 5 * i + k] * q[i] ** k for k in range(5))
+            both.append(value)
+        value = alpha * both[0] + (1 - alpha) * both[1]
+        tau.append(min(max(value, gc["safe_lower_torque_limit"][i]), gc["safe_upper_torque_limit"][i]))
+    return tau
+
+
+def balanced(name="mtml"):
+    """A model the file can hold: the last link's centre of mass on its axis; its parameters are not the SDF's."""
+    model = IdentifiedModel.from_arm(load_arm(name))
+    generator = np.random.default_rng(3)
+    for p in model.base_parameters:
+        p.value = 0.0 if p.name.startswith("m7 c7") else p.value * (1 + 0.2 * generator.normal())
+    return model
+
+
+@pytest.mark.parametrize("name", ["mtml", "mtmr"])
+def test_the_controller_computes_the_models_torque_from_the_file(name, tmp_path):
+    model = balanced(name)
+    model.effects = [
+        ActuatorEffectEstimate("joint.outer_yaw", "offset", 0.0, 0.03),
+        ActuatorEffectEstimate("joint.shoulder_pitch", "cable sine", 1.0, -0.1),
+        ActuatorEffectEstimate("joint.shoulder_pitch", "cable cosine", 1.0, 0.04),
+        ActuatorEffectEstimate("actuator.wrist_platform", "offset", 0.0, -0.01),
+        ActuatorEffectEstimate("joint.wrist_pitch", "spring", 4.0, 0.02),
+    ]
+    arm = model.load_arm()
+    path = tmp_path / "gc.json"
+    compensation_from_model(model).save(path, arm.name, "test")
+    q = arm.sample_poses(300, np.random.default_rng(11))
+    expected = model.holding_torque(q)
+    assert np.ptp(expected, axis=0)[1:6].min() > 0.01  # there is something to compare
+    actual = np.array([dvrk_controller(path, pose, np.zeros(7)) for pose in q])
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-10)
+
+
+def test_our_reading_of_a_file_is_the_controllers_with_velocity_and_clip(tmp_path):
+    generator = np.random.default_rng(4)
+    file = GravityCompensationFile(
+        positive=generator.normal(0, 0.1, 40),
+        negative=generator.normal(0, 0.1, 40),
+        torque_lower=np.full(7, -0.3),
+        torque_upper=np.array([0.4, 0.5, 0.3, 0.2, 0.1, 0.1, 0.0]),
+        dead_band=np.full(7, 0.02),
+        saturation=np.full(7, 0.4),
+        friction_ratio=generator.uniform(0, 1, 7),
+    )
+    path = tmp_path / "gc.json"
+    file.save(path, "MTML", "test")
+    file = GravityCompensationFile.load(path)
+    q, v = generator.uniform(-1, 1, (300, 7)), generator.uniform(-0.6, 0.6, (300, 7))
+    v[:100] *= 0.03  # many inside the dead band
+    expected = np.array([dvrk_controller(path, *row) for row in zip(q, v, strict=True)])
+    np.testing.assert_allclose(controller_torque(file, q, v), expected, rtol=0, atol=1e-12)
+    assert np.abs(unclipped_torque(file, q, v) - expected).max() > 0.1  # the clip acts
+
+
+def test_friction_is_half_of_what_separates_the_two_directions(tmp_path):
+    coulomb = (0.05, 0.06, 0.04, 0.02, 0.01, 0.005, 0.0)
+    file = compensation_from_model(balanced(), CompensationOptions(coulomb=coulomb, friction_ratio=(1.0,) * 7))
+    path = tmp_path / "gc.json"
+    file.save(path, "MTML", "test")
+    q = [0.1, 0.3, -0.1, 0.2, 0.5, 0.1, 0.4]
+    up, rest, down = (np.array(dvrk_controller(path, q, [v] * 7)) for v in (1.0, 0.0, -1.0))
+    np.testing.assert_allclose(up - rest, coulomb, atol=1e-12)
+    np.testing.assert_allclose(rest - down, coulomb, atol=1e-12)
+
+
+def test_friction_of_a_models_dynamics_is_what_a_joint_feels_that_moves_alone():
+    model = balanced()
+    with pytest.raises(ModelError, match="no dynamics"):
+        dry_friction(model)
+    model.dynamics = DynamicSection(
+        effects=[
+            ActuatorEffectEstimate("actuator.outer_yaw", "coulomb", 0.1, 0.05),
+            ActuatorEffectEstimate("actuator.outer_yaw", "presliding", 0.01, 0.02),
+            ActuatorEffectEstimate("actuator.outer_yaw", "viscous", 0.0, 9.0),
+            ActuatorEffectEstimate("actuator.wrist_platform", "coulomb", 0.1, 0.01),  # turned by joints 3 and 4
+        ]
+    )
+    np.testing.assert_allclose(dry_friction(model), [0.07, 0, 0.006697, 0.01, 0, 0, 0], rtol=0, atol=1e-12)
+
+
+def test_limits_hold_what_is_needed_and_what_the_motors_have():
+    model = balanced()
+    arm = model.load_arm()
+    file = compensation_from_model(model)
+    tau = model.holding_torque(arm.sample_poses(100000, np.random.default_rng(12)))
+    assert np.all((tau >= file.torque_lower) & (tau <= file.torque_upper))
+    assert np.all(np.abs([file.torque_lower, file.torque_upper]) <= arm.effort_limits)
+    # A tenth on both sides; the extremes of two samples differ by a few hundredths.
+    assert np.all(np.ptp([file.torque_lower, file.torque_upper], axis=0) <= 1.25 * np.ptp(tau, axis=0) + 1e-9)
+    for p in model.base_parameters:
+        p.value *= 8  # more than the motors can hold
+    file = compensation_from_model(model)
+    assert file.torque_upper[1] == arm.effort_limits[1]
+
+
+def test_what_the_file_cannot_hold_is_refused_and_named():
+    eccentric = IdentifiedModel.from_arm(load_arm("mtml"))
+    with pytest.raises(ModelError, match=r"wrist_roll 0\.0021 N m\..*gravity 0\.00.*--gc-tolerance 0\.00"):
+        compensation_from_model(eccentric)
+    with pytest.raises(ModelError, match=r"masses are estimates of the SDF.*dvrk-drake identify") as refusal:
+        compensation_from_model(eccentric)
+    assert "leans" not in str(refusal.value) and "trust" not in str(refusal.value)
+    # The line names a tolerance that is enough.
+    compensation_from_model(eccentric, CompensationOptions(tolerance=0.0025))
+    spring = balanced()
+    spring.effects = [ActuatorEffectEstimate("joint.wrist_pitch", "cable sine", 1.0, 0.05)]
+    with pytest.raises(ModelError, match=r"up to wrist_pitch 0\.0\d+ N m\. Of that: effects 0\.0\d+ \(it knows"):
+        compensation_from_model(spring)
+    # A quartic over +-2.44 rad misses 0.05 sin(q) by a few hundredths of it, not more.
+    compensation_from_model(spring, CompensationOptions(tolerance=0.05 * 0.08))
+    for change in ({"trust": 0.5}, {"gravity": LEANING}):
+        model = balanced()
+        if "trust" in change:
+            model.joints[4].trust = change["trust"]
+        else:
+            model.gravity = change["gravity"]
+            model.base_parameters = IdentifiedModel.from_arm(model.load_arm()).base_parameters
+        with pytest.raises(ModelError, match="cannot hold"):
+            compensation_from_model(model)
+    with pytest.raises(ModelError, match="one of an MTM"):
+        compensation_from_model(IdentifiedModel.from_arm(load_arm("psm")))
+    with pytest.raises(ModelError, match="dead_band must be 7 numbers"):
+        compensation_from_model(balanced(), CompensationOptions(dead_band=(0.1,)))
+    with pytest.raises(ModelError, match=r"fric_comp_ratio_vec\[\d\] is .*; allowed: 0\.\.1"):
+        compensation_from_model(balanced(), CompensationOptions(friction_ratio=(2.0,) * 7))
+
+
+@pytest.mark.parametrize("tolerance", ["nan", "inf", "-1"])
+@pytest.mark.parametrize(("arm", "option"), [("mtml", "--dvrk-gc"), ("psm", "--dvrk-kinematic-gc")])
+def test_a_tolerance_that_is_no_number_accepts_nothing(arm, option, tolerance, tmp_path, capsys):
+    path = tmp_path / "gc.json"
+    assert main(["export", arm, option, str(path), f"--gc-tolerance={tolerance}"]) == 2
+    assert f"--gc-tolerance is {tolerance}; allowed: a number of N m from 0" in capsys.readouterr().err
+    assert not path.exists()
+
+
+def test_a_leaning_base_is_refused_by_default_and_held_as_well_as_the_file_can(tmp_path, capsys):
+    model = balanced()
+    model.gravity = LEANING
+    model.base_parameters = IdentifiedModel.from_arm(model.load_arm()).base_parameters
+    given, out = tmp_path / "model.yaml", tmp_path / "gc.json"
+    model.save(given)
+    assert main(["export", str(given), "--dvrk-gc", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "leans by 2.3 deg" in error and not out.exists()
+    # The line names the option that accepts it, and the file is then as close as the line says.
+    tolerance = error.split("--gc-tolerance ")[1].strip()
+    assert main(["export", str(given), "--dvrk-gc", str(out), "--gc-tolerance", tolerance]) == 0
+    printed = capsys.readouterr().out
+    q = model.load_arm().sample_poses(300, np.random.default_rng(5))
+    controller = np.array([dvrk_controller(out, pose, np.zeros(7)) for pose in q])
+    off = np.abs(controller - model.holding_torque(q)).max(axis=0)
+    stated = largest_differences(GravityCompensationFile.load(out), model)
+    assert np.all(off <= 1.1 * stated + 1e-9) and off.max() < 1.1 * float(tolerance)
+    assert all(f"{x:.1e}" in printed for x in stated)
+    # Without a polynomial the outer yaw, which an upright arm leaves alone, would be off by all that leaning adds.
+    assert stated[0] < 0.6 * np.abs(model.holding_torque(q)[:, 0]).max()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda gc: gc.pop("sat_vec_vec"), "lacks sat_vec_vec"),
+        (lambda gc: gc["gc_dynamic_params_pos"].pop(), "gc_dynamic_params_pos must be 40 finite numbers"),
+        (lambda gc: gc["db_vel_vec"].__setitem__(0, "x"), "db_vel_vec must be 7 finite numbers"),
+        (lambda gc: gc["db_vel_vec"].__setitem__(0, 5.0), "below sat_vec_vec"),
+        (lambda gc: gc["safe_lower_torque_limit"].__setitem__(1, 9.0), "must not exceed"),
+    ],
+)
+def test_a_broken_file_is_one_line(change, message, tmp_path, capsys):
+    path = tmp_path / "gc.json"
+    compensation_from_model(balanced()).save(path, "MTML", "test")
+    content = json.loads(path.read_text())
+    change(content["GC_controller"])
+    path.write_text(json.dumps(content))
+    assert main(["compare-gc", str(path), "--model", "mtml"]) == 2
+    error = capsys.readouterr().err
+    assert message in error and str(path) in error and error.count("\n") == 1
+
+
+def test_a_runaway_polynomial_a_tight_clip_and_a_wrong_sign_are_found(tmp_path):
+    model = balanced()
+    file = compensation_from_model(model)
+    clean = compare_compensation(file, model)
+    assert all(j.clipped == j.opposed == j.runaway == 0 for j in clean.joints)
+    assert max(j.rms_outside for j in clean.joints) < 1e-12
+
+    spoilt = dataclasses.replace(file)
+    for which in (spoilt.positive, spoilt.negative):
+        which[10 + 5 + 4] = 20.0  # 20 q2^4 N m: 33 N m at the upper limit
+    spoilt.torque_upper[2] = np.median(clean.model_torque[:, 2])
+    found = compare_compensation(spoilt, model)
+    assert found.joints[1].runaway > 0.3 and found.joints[1].polynomial == pytest.approx(20 * 1.13446**4, rel=0.01)
+    assert found.joints[2].clipped == pytest.approx(0.5, abs=0.01)
+    mirrored = dataclasses.replace(
+        file,
+        positive=-file.positive,
+        negative=-file.negative,
+        torque_lower=-file.torque_upper,
+        torque_upper=-file.torque_lower,
+    )
+    opposed = compare_compensation(mirrored, model).joints
+    assert opposed[1].opposed > 0.8 and opposed[4].opposed > 0.5
+    path = tmp_path / "plot.png"
+    plot_compensation(path, found, "test")
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_command_line(tmp_path, capsys):
+    model, out = tmp_path / "model.yaml", tmp_path / "gc.json"
+    balanced().save(model)
+    assert main(["export", str(model), "--dvrk-gc", str(out), "--coulomb", *["0.01"] * 7]) == 0
+    assert "shoulder_pitch" in capsys.readouterr().out
+    report = tmp_path / "report.json"
+    assert main(["compare-gc", str(out), "--model", str(model), "--json", str(report)]) == 0
+    joints = json.loads(report.read_text())["joints"]
+    assert [j["clipped"] for j in joints] == [0.0] * 7 and joints[0]["rms_inside"] is None
+    out.unlink()
+    assert main(["export", "mtml", "--dvrk-gc", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and not out.exists()
+    # What the line tells to type is accepted.
+    asked = error.split("repeat the command with ")[1].split()
+    assert main(["export", "mtml", "--dvrk-gc", str(out), *asked]) == 0 and out.exists()
+    capsys.readouterr()
+    assert main(["export", str(model)]) == 2
+    assert "--dvrk-gc" in capsys.readouterr().err
+    assert main(["export", str(model), "--dvrk-gc", str(model)]) == 2
+    assert "is an input" in capsys.readouterr().err

@@ -1,0 +1,131 @@
+"""The dVRK controller's gravity file of a PSM: evaluated in another way, it is our gravity torque."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ModelError
+from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation
+from dvrk_drake.models.arm import load_arm
+
+pytestmark = pytest.mark.slow
+
+
+def dvrk_controller(path, q, gravity):
+    """[yaw, pitch, insertion]: Newton-Euler from the last link to the first of the file's chain, standing still."""
+    joints = json.loads(path.read_text())["DH"]["joints"]
+    positions = [q[0], 0, q[1], -q[1], q[1], q[2] / 2, q[2] / 2]
+    poses = []
+    for joint, position in zip(joints, positions, strict=True):
+        slide = joint["type"] == "prismatic"
+        turn = RigidTransform(RollPitchYaw(0, 0, joint["theta"] + (0 if slide else position)), np.zeros(3))
+        poses.append(
+            RigidTransform(RollPitchYaw(joint["alpha"], 0, 0), np.zeros(3))
+            @ RigidTransform(np.array([joint["A"], 0, 0]))
+            @ turn
+            @ RigidTransform(np.array([0, 0, joint["D"] + (position if slide else 0)]))
+        )
+    down = [poses[0].rotation().inverse() @ np.asarray(gravity)]
+    for X in poses[1:]:
+        down.append(X.rotation().inverse() @ down[-1])
+    force, torque, t = np.zeros(3), np.zeros(3), []
+    for i in reversed(range(7)):
+        joint = joints[i]
+        weight = -joint["mass"] * down[i]
+        center = np.array([joint["cx"], joint["cy"], joint["cz"]])
+        if i < 6:  # what holds link i + 1, in link i
+            X = poses[i + 1]
+            force, torque = X.rotation() @ force, X.rotation() @ torque
+            torque = torque + np.cross(X.translation(), force)
+        force, torque = force + weight, torque + np.cross(center, weight)
+        t.append(force[2] if joint["type"] == "prismatic" else torque[2])
+    t = t[::-1]
+    return np.array([t[0], t[2] - t[3] + t[4], t[6]])
+
+
+def other_psm():
+    model = IdentifiedModel.from_arm(load_arm("psm"))
+    generator = np.random.default_rng(7)
+    for p in model.base_parameters:
+        p.value *= 1 + 0.3 * generator.normal()
+    return model
+
+
+@pytest.mark.parametrize("gravity", [None, [0.0, -4.0, -9.0]])
+def test_the_controller_computes_the_models_torque_from_the_file(gravity, tmp_path):
+    model = other_psm()
+    if gravity is not None:
+        model.gravity = gravity
+        model.base_parameters = IdentifiedModel.from_arm(model.load_arm()).base_parameters
+    path = tmp_path / "psm.json"
+    file = kinematic_compensation(model)
+    file.save(path)
+    arm = model.load_arm()
+    q = arm.sample_poses(200, np.random.default_rng(8))
+    q[:, 3:] = 0.0
+    expected = model.holding_torque(q)[:, :3]
+    actual = np.array([dvrk_controller(path, pose[:3], arm.gravity) for pose in q])
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9)
+    assert np.ptp(expected, axis=0).min() > 0.01
+    assert np.all(file.mass >= 0) and np.abs(file.center).max() < 1.0
+
+
+def test_the_chain_is_the_arm(tmp_path):
+    """Its points are those of the linkage, and its last frame the dVRK's frame 3."""
+    path = tmp_path / "psm.json"
+    kinematic_compensation(other_psm()).save(path)
+    joints = json.loads(path.read_text())["DH"]["joints"]
+    assert [j["type"] for j in joints] == ["revolute"] * 5 + ["prismatic"] * 2
+    # AO, AB, BE and the distance of E from the shaft (psm.sdf says where they are from).
+    np.testing.assert_allclose([joints[i]["A"] for i in (2, 3, 4, 5)], [0.516, 0.15, 0.516, 0.042998], atol=1e-6)
+    assert joints[6]["D"] == pytest.approx(0.143705 - 0.4318, abs=1e-9)
+
+
+def test_what_the_file_cannot_hold_is_refused():
+    model = other_psm()
+    model.effects = [ActuatorEffectEstimate("joint.pitch", "offset", 0.0, 0.1)]
+    with pytest.raises(
+        ModelError, match=r"off by up to pitch 0\.1 .*: joint.pitch offset 0\.1\. .*--gc-tolerance 0\.1"
+    ):
+        kinematic_compensation(model)
+    heavy = other_psm()
+    (net,) = (p for p in heavy.base_parameters if "- m_counterweight" in p.name and p.name.startswith("(m3"))
+    net.value = -0.2
+    with pytest.raises(ModelError, match=r"outweighs what the insertion carries by 0\.2 kg"):
+        kinematic_compensation(heavy)
+    with pytest.raises(ModelError, match="one of a PSM"):
+        kinematic_compensation(IdentifiedModel.from_arm(load_arm("mtml")))
+
+
+def test_command_line(tmp_path, capsys):
+    out = tmp_path / "psm.json"
+    assert main(["export", "psm", "--dvrk-kinematic-gc", str(out)]) == 0
+    assert "pitch" in capsys.readouterr().out and out.is_file()
+    assert main(["export", "mtml", "--dvrk-kinematic-gc", str(tmp_path / "mtml.json")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_an_export_that_is_refused_leaves_no_other_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    model = other_psm()
+    model.effects = [ActuatorEffectEstimate("joint.pitch", "offset", 0.0, 0.1)]
+    model.save("model.yaml")
+    arguments = ["export", "model.yaml", "--sdf", "model.sdf", "--dvrk-kinematic-gc", "gc.json"]
+    assert main([*arguments, "--gc-tolerance", "1e-9"]) == 2
+    assert "cannot hold this model" in capsys.readouterr().err
+    assert os.listdir() == ["model.yaml"]
+    assert main([*arguments, "--gc-tolerance", "10"]) == 0
+    assert {"model.sdf", "gc.json"} < set(os.listdir())
+
+
+def test_an_sdf_without_the_links_of_a_psm_is_refused(monkeypatch):
+    bodies = {0: ("turret_link",), 2: ("back_crank_link",)}
+    monkeypatch.setattr("dvrk_drake.export.dvrk_psm_gravity_compensation._BODIES", bodies)
+    with pytest.raises(ModelError, match="the SDF has no link turret_link"):
+        kinematic_compensation(IdentifiedModel.from_arm(load_arm("psm")))

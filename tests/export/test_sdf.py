@@ -1,0 +1,242 @@
+"""SDF written from inertial parameters: any reader gets the same arm, and the same equations of motion."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation, MultibodyPlant
+from pydrake.multibody.tree import MultibodyForces
+from pydrake.systems.framework import DiagramBuilder
+
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.gravity_regressor import derive_gravity
+from dvrk_drake.dynamics.inertial_parameters import (
+    LinkInertia,
+    link_inertias,
+    parameters_from_pseudo_inertia,
+)
+from dvrk_drake.dynamics.model_links import nearest_links
+from dvrk_drake.errors import ArmError, ModelError
+from dvrk_drake.export.sdf import changed_links, sdf_difference, write_sdf
+from dvrk_drake.export.urdf import to_urdf, write_urdf
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
+
+
+def perturbed(arm: Arm, seed: int = 0) -> tuple[LinkInertia, ...]:
+    """Other bodies: each pseudo-inertia stretched by a random linear map, which keeps it positive definite."""
+    generator = np.random.default_rng(seed)
+    links = []
+    for link in link_inertias(arm):
+        X = np.eye(4) + 0.1 * generator.normal(size=(4, 4))
+        links.append(LinkInertia(link.link, parameters_from_pseudo_inertia(X @ link.pseudo_inertia() @ X.T)))
+    return tuple(links)
+
+
+def inverse_dynamics(plant: MultibodyPlant, arm: Arm, motion) -> np.ndarray:
+    """tau (m, n) of Drake itself, projected through the linkage."""
+    context = plant.CreateDefaultContext()
+    index = tree_selector(plant, arm)
+    tau = []
+    for q, v, vd in zip(*motion, strict=True):
+        set_arm_positions(plant, context, arm, q)
+        v_tree, vd_tree = np.zeros((2, plant.num_velocities()))
+        v_tree[index], vd_tree[index] = arm.linkage.velocity(v), arm.linkage.velocity(vd)
+        plant.SetVelocities(context, v_tree)
+        forces = plant.CalcGravityGeneralizedForces(context)
+        tau_tree = plant.CalcInverseDynamics(context, vd_tree, MultibodyForces(plant)) - forces
+        tau.append(arm.linkage.pull_back_effort(tau_tree[index]))
+    return np.array(tau)
+
+
+def motion_of(arm: Arm, count: int = 50):
+    generator = np.random.default_rng(1)
+    q = arm.sample_poses(count, generator)
+    return q, generator.normal(size=q.shape), 5 * generator.normal(size=q.shape)
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_the_written_arm_moves_by_the_parameters_it_was_given(name, tmp_path):
+    arm, path = load_arm(name), tmp_path / "identified.sdf"
+    links = perturbed(arm)
+    write_sdf(arm, links, path, "a test")
+    written = dataclasses.replace(arm, sdf=(str(path),))
+    motion = motion_of(arm)
+    actual = inverse_dynamics(make_arm_plant(written), written, motion)
+    # The same from our own regressor, which never saw the file.
+    regressor = DynamicRegressor(arm)
+    parameters = regressor.values.copy()
+    by_name = {link.link: link.parameters for link in links}
+    for i, link in enumerate(regressor.links):
+        parameters[10 * i : 10 * i + 10] = by_name[link.link]
+    expected = regressor.torque(*motion, parameters)
+    scale = np.abs(expected).max(axis=0)
+    assert np.abs((actual - expected) / scale).max() < 1e-12
+    assert np.abs((expected - regressor.torque(*motion, regressor.values)) / scale).max() > 0.05
+    for before, after in zip(links, link_inertias(written), strict=True):
+        assert before.link == after.link
+        np.testing.assert_allclose(after.parameters, before.parameters, rtol=0, atol=1e-13)
+
+
+def parse(path):
+    """A plant and scene graph of one model file, by a parser that knows no packages and lets nothing pass."""
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
+    parser = Parser(plant)
+    parser.SetStrictParsing()
+    (instance,) = parser.AddModels(str(path))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link", instance))
+    plant.Finalize()
+    return plant, scene_graph, instance
+
+
+@pytest.mark.parametrize("name", ["mtmr", "psm"])
+def test_a_bare_parser_loads_it_from_anywhere_with_its_meshes(name, tmp_path):
+    arm = load_arm(name)
+    (tmp_path / "first").mkdir()
+    write_sdf(arm, perturbed(arm), tmp_path / "first" / "arm.sdf", "a test")
+    path = (tmp_path / "first").rename(tmp_path / "moved") / "arm.sdf"
+    plant, scene_graph, instance = parse(path)
+    assert plant.num_positions() == make_arm_plant(arm).num_positions()
+    inspector = scene_graph.model_inspector()
+    shapes = [
+        inspector.GetShape(geometry)
+        for body in plant.GetBodyIndices(instance)
+        for geometry in plant.GetVisualGeometriesForBody(plant.get_body(body))
+    ]
+    meshes = [shape.source().path() for shape in shapes]
+    assert len(meshes) >= 10
+    assert all(mesh.is_relative_to(path.parent) and mesh.is_file() for mesh in meshes)
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_urdf_has_the_equations_of_motion_of_the_sdf(name, tmp_path):
+    arm, path = load_arm(name), tmp_path / "arm.urdf"
+    links = perturbed(arm)
+    write_urdf(arm, links, path, "a test")
+    write_sdf(arm, links, tmp_path / "arm.sdf", "a test")
+    written = dataclasses.replace(arm, sdf=(str(tmp_path / "arm.sdf"),))
+    sdf_plant, (urdf_plant, scene_graph, _) = make_arm_plant(written), parse(path)
+    motion = motion_of(arm)
+    expected = inverse_dynamics(sdf_plant, arm, motion)
+    actual = inverse_dynamics(urdf_plant, arm, motion)
+    assert np.abs((actual - expected) / np.abs(expected).max(axis=0)).max() < 1e-12
+    # The linkage is coupled, and limits, motors, frames and shapes are there.
+    assert urdf_plant.num_constraints() == sdf_plant.num_constraints() > 0
+    assert urdf_plant.num_actuators() == sdf_plant.num_actuators() == arm.num_joints
+    contexts = [plant.CreateDefaultContext() for plant in (sdf_plant, urdf_plant)]
+    for plant, context in zip((sdf_plant, urdf_plant), contexts, strict=True):
+        set_arm_positions(plant, context, arm, motion[0][0])
+    for i, joint_name in enumerate(arm.joint_names):
+        joint = urdf_plant.GetJointByName(joint_name)
+        assert (joint.position_lower_limits()[0], joint.position_upper_limits()[0]) == pytest.approx(
+            (arm.position_lower[i], arm.position_upper[i]), abs=1e-12
+        )
+        assert urdf_plant.GetJointActuatorByName(joint_name).effort_limit() == arm.effort_limits[i]
+    root = compose_sdf(arm.sdf, arm.mirrored_links)
+    names = [part.get("name") for tag in ("link", "frame") for part in root.iterfind(f"model/{tag}")]
+    assert "dh_1" in names
+    for frame in names:
+        poses = [
+            plant.GetFrameByName(frame).CalcPoseInWorld(context).GetAsMatrix4()
+            for plant, context in zip((sdf_plant, urdf_plant), contexts, strict=True)
+        ]
+        np.testing.assert_allclose(poses[1], poses[0], rtol=0, atol=1e-12)
+    inspector = scene_graph.model_inspector()
+    assert len(inspector.GetCollisionCandidates()) == 0  # the arm's links are filtered as in the SDF
+
+
+def test_what_urdf_cannot_say_is_refused(tmp_path):
+    sdf = tmp_path / "arm.sdf"
+    arm = load_arm("mtml")
+    write_sdf(arm, [], sdf, "a test")
+    text = sdf.read_text()
+    for old, new, message in (
+        ("<axis>", "<pose>0 0 1 0 0 0</pose><axis>", "joint outer_yaw has a <pose>"),
+        ("<cylinder>", "<plane/><cylinder>", "URDF has no shape like plane"),
+    ):
+        sdf.write_text(text.replace(old, new, 1))
+        with pytest.raises(ModelError, match=message):
+            to_urdf(compose_sdf([str(sdf)]), arm)
+
+
+def test_only_what_changed_is_written_anew(tmp_path):
+    arm = load_arm("mtml")
+    links = link_inertias(arm)
+    assert changed_links(arm, links) == [] and sdf_difference(arm, links) == ""
+    heavier = [
+        LinkInertia(link.link, link.parameters * (2.0 if link.link == "forearm_link" else 1.0)) for link in links
+    ]
+    assert [c.link for c in changed_links(arm, heavier)] == ["forearm_link"]
+    lines = sdf_difference(arm, heavier).splitlines()
+    changed = [line for line in lines if line[:1] in "+-" and line[:3] not in ("+++", "---")]
+    before = next(link for link in links if link.link == "forearm_link").parameters[0]
+    assert f"-        <mass>{before:g}</mass>" in changed and f"+        <mass>{2 * before:g}</mass>" in changed
+    assert all(re.match(r"[-+] +</?(mass|inertia|i[xyz]{2})>", line) for line in changed) and len(changed) <= 18
+
+
+def test_meshes_that_cannot_be_copied_are_one_line_and_no_model(tmp_path, capsys):
+    (tmp_path / "arm_meshes").write_text("in the way")
+    assert main(["export", "mtml", "--sdf", str(tmp_path / "arm.sdf")]) == 2
+    assert "arm_meshes" in capsys.readouterr().err and not (tmp_path / "arm.sdf").exists()
+    write_sdf(load_arm("mtml"), [], tmp_path / "other.sdf", "a test")
+    (tmp_path / "other_meshes" / "mtm" / "base_link.gltf").unlink()
+    incomplete = dataclasses.replace(load_arm("mtml"), sdf=(str(tmp_path / "other.sdf"),))
+    with pytest.raises(ArmError, match=r"base_link.gltf: no such mesh"):
+        write_sdf(incomplete, [], tmp_path / "again.sdf", "a test")
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_an_arm_file_can_name_the_written_sdf(name, tmp_path, capsys):
+    """The recipe of docs/export.md."""
+    arm = load_arm(name)
+    # What `export --sdf` writes of a static model.
+    links = nearest_links(arm, 1.1 * derive_gravity(arm).base_values)
+    write_sdf(arm, links, tmp_path / "identified.sdf", "a test")
+    text = (MODELS_FOLDER / "arms" / f"{name}.yaml").read_text()
+    for kind, part, sdf in (("mechanism", name[:3], "sdf: identified.sdf"), ("instrument", "large_needle_driver", "")):
+        if f"{kind}: {part}" in text:
+            copied = (MODELS_FOLDER / f"{kind}s" / f"{part}.yaml").read_text()
+            (tmp_path / f"{kind}.yaml").write_text(re.sub("^sdf: .*$", sdf, copied, flags=re.MULTILINE))
+            text = text.replace(f"{kind}: {part}", f"{kind}: {kind}.yaml")
+    (tmp_path / "arm.yaml").write_text(text)
+    own = load_arm(str(tmp_path / "arm.yaml"))
+    assert main(["export", str(tmp_path / "arm.yaml"), "--sdf", str(tmp_path / "again.sdf")]) == 0
+    assert "All links are as in the arm's own SDF" in capsys.readouterr().out
+    assert own.joint_names == arm.joint_names and own.sdf == (str(tmp_path / "identified.sdf"),)
+    np.testing.assert_allclose(own.transmission.matrix, arm.transmission.matrix, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(derive_gravity(own).base_values, 1.1 * derive_gravity(arm).base_values, atol=1e-12)
+
+
+def test_rotor_inertia_is_what_it_adds_to_the_mass_matrix(tmp_path):
+    arm, path = load_arm("mtml"), tmp_path / "arm.sdf"
+    rotors = {"outer_yaw": 0.011, "wrist_platform": 0.003}  # the second has none in the SDF
+    write_sdf(arm, [], path, "a test", rotors)
+    written = dataclasses.replace(arm, sdf=(str(path),))
+    M_before, M_after = (
+        DynamicRegressor(a).mass_matrix(np.zeros((1, 7)), DynamicRegressor(a).values)[0] for a in (arm, written)
+    )
+    expected = np.zeros((7, 7))
+    expected[0, 0], expected[3, 3] = 0.011 - 1e-6 * 63.41**2, 0.003
+    np.testing.assert_allclose(M_after - M_before, expected, rtol=0, atol=1e-12)
+
+
+def test_what_no_body_has_is_refused(tmp_path):
+    arm, path = load_arm("mtml"), tmp_path / "arm.sdf"
+    link = link_inertias(arm)[0]
+    for parameters, message in (
+        (link.parameters * np.r_[-1, np.ones(9)], "no body has this inertia"),
+        (link.parameters * np.r_[1, np.ones(3), 0.01, np.ones(5)], "no body has this inertia"),
+    ):
+        with pytest.raises(ModelError, match=message):
+            write_sdf(arm, [LinkInertia(link.link, parameters)], path, "a test")
+    with pytest.raises(ModelError, match="no moving link tail"):
+        write_sdf(arm, [LinkInertia("tail", link.parameters)], path, "a test")
+    with pytest.raises(ModelError, match="rotor inertia -1 must not be negative"):
+        write_sdf(arm, [], path, "a test", {"outer_yaw": -1.0})
+    assert list(tmp_path.iterdir()) == []

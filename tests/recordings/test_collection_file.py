@@ -1,0 +1,112 @@
+"""The file of a collection grows by whole rows, and is gone on with whatever ended it."""
+
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from sticky_arm import random_poses
+
+from dvrk_drake.errors import CollectionError, RecordingError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.recordings.collection_file import CollectionFile
+from dvrk_drake.recordings.recording import read_recording
+
+ARMS = ("mtml", "psm")
+
+
+def append_all(path, arm, poses, both_sides=True):
+    file = CollectionFile(path, arm, both_sides)
+    for pose in poses:
+        friction = (0.1 * pose,) if both_sides else ()
+        file.append(pose, pose + 1e-3, 2 * pose, *friction)
+    file.close()
+
+
+@pytest.mark.parametrize("both_sides", [True, False])
+@pytest.mark.parametrize("name", ARMS)
+def test_a_collection_is_a_recording_and_goes_on(name, both_sides, tmp_path):
+    arm, path = load_arm(name), tmp_path / "o.csv"
+    poses = random_poses(arm, 6)
+    append_all(path, arm, poses[:2], both_sides)
+    again = CollectionFile(path, arm, both_sides)
+    assert again.finished(poses).tolist() == [True, True, False, False, False, False]
+    again.append(poses[4], poses[4], poses[4], *((poses[4],) if both_sides else ()))
+    again.close()
+    assert CollectionFile(path, arm, both_sides).finished(poses).tolist() == [True, True, False, False, True, False]
+    recording = read_recording(path, arm)
+    np.testing.assert_array_equal(recording.q, np.vstack([poses[:2] + 1e-3, poses[4]]))
+    np.testing.assert_array_equal(recording.tau, np.vstack([2 * poses[:2], poses[4]]))
+
+
+@pytest.mark.parametrize("cut", [1, 50, 10_000])
+def test_a_row_that_a_power_failure_cut_is_measured_again(cut, tmp_path):
+    arm, path = load_arm("mtml"), tmp_path / "o.csv"
+    poses = random_poses(arm, 3)
+    append_all(path, arm, poses)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: max(len(whole) - cut, 20)])
+    left = [True, True, False] if cut < 10_000 else [False] * 3
+    again = CollectionFile(path, arm, True)
+    assert again.finished(poses).tolist() == left
+    for pose in poses[~np.array(left)]:
+        again.append(pose, pose + 1e-3, 2 * pose, 0.1 * pose)
+    again.close()
+    rows = [line.rsplit(",", 8)[0] for line in path.read_text().splitlines()]  # without utime and friction
+    assert rows == [line.rsplit(",", 8)[0] for line in whole.decode().splitlines()]
+
+
+def test_an_output_of_something_else_is_refused_and_stays(tmp_path):
+    arm, path = load_arm("mtml"), tmp_path / "o.csv"
+    poses = random_poses(arm, 3)
+    append_all(path, arm, poses)
+    before = path.read_bytes()
+    with pytest.raises(CollectionError, match=r"o.csv:2: was collected for a pose that is none of these"):
+        CollectionFile(path, arm, True).finished(poses[1:])
+    with pytest.raises(CollectionError, match=r"o.csv:2: is of MTML, not of MTMR"):
+        CollectionFile(path, load_arm("mtmr"), True)
+    with pytest.raises(CollectionError, match=r"was collected from both sides \(--both-sides\)"):
+        CollectionFile(path, arm, False)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines, lines[-1] + ",1"]) + "\n")
+    with pytest.raises(RecordingError, match=r"o.csv:5: has 31 cells, the header names 30"):
+        CollectionFile(path, arm, True)
+    path.write_text("q1,tau1\n1,2\n")
+    with pytest.raises(CollectionError, match="was not collected from MTML; name another output"):
+        CollectionFile(path, arm, True)
+    path.write_bytes(before)
+
+
+def test_all_that_was_written_survives_kill(tmp_path):
+    """A process that appends until it is killed: whole rows, in order, no gap."""
+    code = (
+        "import sys\nfrom dvrk_drake.recordings.growing_file import GrowingFile\n"
+        "file, k = GrowingFile(sys.argv[1], sync=True), 0\n"
+        "while True:\n    file.append(b'%d,%s\\n' % (k, b'x' * 4000)); k += 1\n    print(k, flush=True)\n"
+    )
+    path = tmp_path / "f.csv"
+    process = subprocess.Popen([sys.executable, "-c", code, path], stdout=subprocess.PIPE, text=True)
+    told = [int(process.stdout.readline()) for _ in range(50)][-1]
+    process.send_signal(signal.SIGKILL)
+    told = max([told, *map(int, process.stdout.read().split())])
+    process.wait()
+    rows = path.read_text().split("\n")
+    assert rows.pop() == ""
+    assert [int(row.split(",")[0]) for row in rows] == list(range(len(rows)))
+    assert {len(row.split(",")[1]) for row in rows} == {4000}
+    assert len(rows) >= told
+
+
+def test_a_full_disk_leaves_whole_rows(tmp_path):
+    code = (
+        "import resource, signal, sys\nfrom dvrk_drake.recordings.growing_file import GrowingFile\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1050, 1050))\n"
+        "file = GrowingFile(sys.argv[1], sync=True)\n"
+        "while True:\n    file.append(b'x' * 99 + b'\\n')\n"
+    )
+    path = tmp_path / "f.csv"
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=False)
+    assert "RecordingError: " in done.stderr and "cannot be written any more: no space left" in done.stderr
+    assert path.read_bytes() == 10 * (b"x" * 99 + b"\n")

@@ -1,0 +1,289 @@
+"""LCM logs as recordings: the numbers, what is left out and said, and every damage that a log can have."""
+
+import resource
+
+import lcm
+import numpy as np
+import pytest
+from rests import motion_with_rests
+from status_logs import ARM, START, N, log_bytes, statuses
+
+from dvrk_drake.cli import main
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.recordings.conversion import convert
+from dvrk_drake.recordings.lcm_log_reader import LcmLogReader
+from dvrk_drake.recordings.lcm_status_log import StatusStream
+from dvrk_drake.recordings.recording import read_recording
+from dvrk_drake.recordings.recording_stream import check_stream_output, open_recording_file
+
+
+def write_log(path, *parts):
+    path.write_bytes(b"".join(part if isinstance(part, bytes) else log_bytes(part) for part in parts))
+    return path
+
+
+def assert_same_numbers(recording, expected):
+    np.testing.assert_array_equal(recording.q, [s.position for s in expected])
+    np.testing.assert_array_equal(recording.qd, [s.velocity for s in expected])
+    np.testing.assert_array_equal(recording.tau, [s.effort_measured for s in expected])
+    np.testing.assert_allclose(recording.t, [1e-6 * (s.utime - expected[0].utime) for s in expected], atol=1e-12)
+
+
+# Our reader and LCM's own are of the same mind.
+
+
+def test_reads_what_lcm_writes(tmp_path):
+    log = lcm.EventLog(str(tmp_path / "lcm.log"), "w")
+    for status in statuses():
+        log.write_event(status.utime + 300, "OTHER", b"noise")
+        log.write_event(status.utime + 400, "DVRK_STATUS_MTML", status.encode())
+    log.close()
+    recording = read_recording(tmp_path / "lcm.log", ARM)
+    assert_same_numbers(recording, statuses())
+    assert recording.notes == ()
+    assert recording.coordinates == "joint"
+    assert recording.where(3) == f"{tmp_path}/lcm.log:7"
+    assert_same_numbers(read_recording(tmp_path / "lcm.log"), statuses())
+
+
+def test_lcm_reads_what_we_write(tmp_path):
+    path = write_log(tmp_path / "ours.log", statuses())
+    events = list(lcm.EventLog(str(path)))
+    ours = list(LcmLogReader(path))
+    assert [(e.eventnum, e.timestamp, e.channel, e.data) for e in events] == [tuple(e) for e in ours]
+    assert [e.data for e in events] == [s.encode() for s in statuses()]
+
+
+# Damage.
+
+
+def test_a_log_cut_anywhere_is_read_up_to_there(tmp_path):
+    whole = log_bytes(statuses(4))
+    size = len(whole) // 4
+    for length in range(2 * size, 4 * size):
+        recording = read_recording(write_log(tmp_path / "cut.log", whole[:length]), ARM)
+        assert_same_numbers(recording, statuses(4)[: length // size])
+        assert len(recording.notes) == (length % size > 0)
+        assert all("as after a kill: read up to there" in note for note in recording.notes)
+
+
+@pytest.mark.parametrize(
+    ("begin", "replaced", "inserted"),
+    [
+        (30, 40, b""),
+        (20, 4, b"\x7f\xff\xff\xff"),
+        (24, 4, b"\x7f\xff\xff\xff"),
+        (24, 4, b"\xff\xff\xff\xfb"),
+        (0, 4, b"oops"),
+    ],
+    ids=["bytes missing", "long channel", "long data", "negative length", "no magic"],
+)
+def test_a_damaged_event_is_left_out_and_the_rest_is_read(tmp_path, begin, replaced, inserted):
+    whole = log_bytes(statuses(10))
+    at = 5 * len(whole) // 10 + begin
+    recording = read_recording(write_log(tmp_path / "a.log", whole[:at], inserted, whole[at + replaced :]), ARM)
+    # An event is only trusted if another one follows: where the magic is gone, the one before goes with it.
+    kept = [k for k in range(10) if k != 5 and not (begin == 0 and k == 4)]
+    assert_same_numbers(recording, [statuses(10)[k] for k in kept])
+    assert "are damaged and are left out" in recording.notes[0]
+    assert recording.notes[1] == f"messages lost on the way, missing in the sequence: {10 - len(kept)}"
+
+
+def test_no_damage_stops_the_reader_or_lets_wrong_numbers_through_unseen(tmp_path):
+    """Bytes of a number may change unseen, an LCM log has no checksum; but rows stay in order and of one arm."""
+    whole = log_bytes(statuses(12))
+    generator, read = np.random.default_rng(3), 0
+    for _ in range(300):
+        content = bytearray(whole)
+        for at in generator.integers(4, len(content), 5):
+            content[at] = generator.integers(256)
+        if generator.random() < 0.5:
+            del content[generator.integers(4, len(content)) :]
+        path = write_log(tmp_path / "fuzz.log", bytes(content))
+        try:
+            recording = read_recording(path, ARM)
+        except RecordingError as error:
+            assert str(error).startswith(str(path))
+            continue
+        read += 1
+        assert np.all(np.diff(recording.t) > 0)
+        assert recording.q.shape == recording.qd.shape == recording.tau.shape == (len(recording.t), N)
+        assert np.all(np.isfinite(recording.q))
+    assert read > 100
+
+
+# What is left out is said.
+
+
+def changed(k, **changes):
+    """Statuses of which the k-th is changed."""
+    result = statuses()
+    for name, value in changes.items():
+        setattr(result[k], name, value)
+    return result
+
+
+@pytest.mark.parametrize(
+    ("messages", "note"),
+    [
+        (changed(7, arm_name="MTMR"), "messages left out, of another arm or number of joints: 1"),
+        ([*statuses()[:7], b"garbage", *statuses()[8:]], "messages left out, no lcmt_dvrk_status, or one of another"),
+        (changed(7, utime=START + 2000), "messages left out, not later than the one before: 1"),
+        (changed(7, position=[float("nan")] * N), "messages left out, with a measurement that is not finite: 1"),
+        (
+            changed(7, guard_state=Status.STATE_OFF),
+            "messages left out, with the motors off, whose efforts hold nothing: 1",
+        ),
+        ([*statuses()[:7], *statuses()[8:]], "messages lost on the way, missing in the sequence: 1"),
+    ],
+)
+def test_what_cannot_be_used_is_left_out_and_noted(tmp_path, messages, note):
+    recording = read_recording(write_log(tmp_path / "a.log", messages), ARM)
+    assert_same_numbers(recording, [*statuses()[:7], *statuses()[8:]])
+    assert any(n.startswith(note) for n in recording.notes), recording.notes
+
+
+def test_a_restart_is_noted_and_two_arms_of_one_name_are_refused(tmp_path):
+    first, second = statuses(20), statuses(20, session_id=78)
+    recording = read_recording(write_log(tmp_path / "restart.log", [*first[:9], *second[12:]]), ARM)
+    assert_same_numbers(recording, [*first[:9], *second[12:]])
+    assert recording.notes == ("restarts of MTML in between: 1",)
+    mixed = [(first, second)[k % 2][k - k % 2] for k in range(20)]  # the second is always a little late
+    with pytest.raises(RecordingError, match=r"a\.log: event 2: two arms called MTML send at the same time"):
+        read_recording(write_log(tmp_path / "a.log", mixed), ARM)
+
+
+def test_the_arm_is_chosen_among_several(tmp_path):
+    other = log_bytes(statuses(5, arm_name="MTMR"), "DVRK_STATUS_MTMR")
+    path = write_log(tmp_path / "both.log", other, statuses(), other)
+    assert_same_numbers(read_recording(path, ARM), statuses())
+    assert len(read_recording(path, load_arm("mtmr"))) == 5
+    with pytest.raises(RecordingError, match="statuses of several arms, DVRK_STATUS_MTML, DVRK_STATUS_MTMR: name one"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ([log_bytes([b"x"] * 3, "POSE")], r"has no status of MTML \(channel DVRK_STATUS_MTML\); it has POSE \(3\)"),
+        ([log_bytes([b"x"])[:20]], "it has nothing that can be read"),
+        ([[b"x"] * 3], "none of its 3 messages on channel DVRK_STATUS_MTML can be used: .*no lcmt_dvrk_status.*: 3"),
+        ([statuses(guard_state=Status.STATE_OFF)], "none of its 20 messages .* with the motors off, .*: 20"),
+        ([b""], "is empty"),
+    ],
+)
+def test_a_log_without_the_arm_says_what_it_has(tmp_path, parts, message):
+    with pytest.raises(RecordingError, match=message):
+        read_recording(write_log(tmp_path / "a.log", *parts), ARM)
+
+
+def test_a_log_is_in_joint_coordinates(tmp_path):
+    with pytest.raises(RecordingError, match="an LCM log is in joint coordinates, not actuator"):
+        read_recording(write_log(tmp_path / "a.log", statuses()), ARM, "actuator")
+
+
+# Every command that reads a recording.
+
+
+def test_commands_read_a_log_as_they_read_a_csv(tmp_path, capsys):
+    """One status a pose, a second apart: a log of poses at rest."""
+    truth = IdentifiedModel.from_arm(ARM)
+    messages = statuses(40)
+    for k, status in enumerate(messages):
+        status.utime = START + 1_000_000 * k
+        status.velocity = [0.0] * N
+        status.effort_measured = truth.holding_torque(np.array(status.position)).tolist()
+    log = write_log(tmp_path / "poses.log", messages, b"\xed\xa1\xda\x01half an event")
+    csv = tmp_path / "poses.csv"
+    assert main(["convert", str(log), str(csv), "--arm", "mtml"]) == 0
+    assert "as after a kill" in capsys.readouterr().out
+    assert_same_numbers(read_recording(csv, ARM), messages)
+    predicted = []
+    for recording in (log, csv):
+        model, output = tmp_path / f"{recording.suffix}.yaml", tmp_path / f"{recording.suffix}.predicted.csv"
+        assert main(["identify", str(recording), "--arm", "mtml", "--output", str(model)]) == 0
+        assert main(["validate", str(model), str(recording)]) == 0
+        assert main(["predict", str(model), str(recording), "--output", str(output)]) == 0
+        assert ("note: " in capsys.readouterr().err) == (recording == log)
+        predicted.append(np.loadtxt(output, delimiter=",", skiprows=1))
+    np.testing.assert_allclose(*predicted, atol=1e-12)
+    assert main(["identify", str(log), "--arm", "psm", "--output", str(tmp_path / "x.yaml")]) == 2
+    assert "has no status of PSM (channel DVRK_STATUS_PSM); it has DVRK_STATUS_MTML (40)" in capsys.readouterr().err
+
+
+def test_a_log_of_a_moving_arm_identifies_it_by_its_rests(tmp_path, capsys):
+    """At 1 kHz from pose to pose, with a friction on the way that would spoil a model."""
+    generator = np.random.default_rng(5)
+    recording = motion_with_rests(ARM, ARM.sample_poses(16, generator, margin=0.05), generator, 1.0, 1.0, 1000.0)
+    messages = []
+    for k, (q, qd, tau) in enumerate(zip(recording.q, recording.qd, recording.tau, strict=True)):
+        (status,) = statuses(1, utime=START + 1000 * k, sequence=k)
+        status.position, status.velocity, status.effort_measured = q.tolist(), qd.tolist(), tau.tolist()
+        messages.append(status)
+    log = write_log(tmp_path / "moving.log", messages)
+    assert main(["identify", str(log), "--arm", "mtml", "--output", str(tmp_path / "model.yaml")]) == 0
+    assert f"16 poses at which the arm rests are taken; {len(messages)} rows" in capsys.readouterr().out
+    fresh = ARM.sample_poses(100, generator)
+    truth = IdentifiedModel.from_arm(ARM).holding_torque(fresh)
+    error = IdentifiedModel.load(tmp_path / "model.yaml").holding_torque(fresh) - truth
+    assert np.all(
+        np.sqrt(np.mean(error**2, axis=0)) < 0.02 * np.sqrt(np.mean(truth**2, axis=0)) + 1e-3 * ARM.effort_limits
+    )
+
+
+def test_convert_refuses_options_of_other_formats(tmp_path):
+    path = write_log(tmp_path / "a.log", statuses())
+    with pytest.raises(RecordingError, match="do not apply to an LCM log"):
+        convert(path, tmp_path / "a.csv", rate=100.0)
+    (tmp_path / "b.csv").write_text("0,1\n")
+    with pytest.raises(RecordingError, match="is not an LCM log"):
+        convert(tmp_path / "b.csv", tmp_path / "a.csv", format="lcm-log")
+
+
+# Files that grow.
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".log"])
+def test_a_growing_file_is_whole_after_every_message(tmp_path, suffix):
+    stream = StatusStream("MTML", N)
+    path = tmp_path / f"a{suffix}"
+    file = open_recording_file(path, ARM, stream)
+    messages = changed(7, guard_state=Status.STATE_OFF)
+    for k, message in enumerate(messages):
+        data = message.encode()
+        file.write(data, message.utime + 500, stream.take(data))
+        assert_same_numbers(read_recording(path, ARM), [m for m in messages[: k + 1] if m.guard_state])
+    file.close()
+    with pytest.raises(RecordingError, match=r"nowhere\.csv: cannot be written: "):
+        check_stream_output("/proc/self/nowhere.csv")  # a folder in which nobody can write
+    with pytest.raises(RecordingError, match="exists already, and a recording is not overwritten"):
+        open_recording_file(path, ARM, stream)
+
+
+def test_a_recording_is_refused_where_it_cannot_be(tmp_path):
+    for name, message in {"a.txt": r"must end in \.csv or \.log", "no/a.csv": "its folder does not exist"}.items():
+        with pytest.raises(RecordingError, match=message):
+            open_recording_file(tmp_path / name, ARM, StatusStream("MTML", N))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".log"])
+def test_a_full_disk_ends_the_file_with_a_whole_row(tmp_path, suffix):
+    stream = StatusStream("MTML", N)
+    path = tmp_path / f"a{suffix}"
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    file = open_recording_file(path, ARM, stream)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limits[1]))
+    try:
+        with pytest.raises(RecordingError, match="cannot be written any more: "):
+            for message in statuses(40):
+                file.write(message.encode(), message.utime, stream.take(message.encode()))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    file.close()
+    recording = read_recording(path, ARM)
+    assert 5 < len(recording) < 40
+    assert recording.notes == ()
+    assert_same_numbers(recording, statuses(40)[: len(recording)])

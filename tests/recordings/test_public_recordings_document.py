@@ -1,0 +1,53 @@
+"""The lines of Python that docs/public_recordings.md offers."""
+
+from __future__ import annotations
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from repository import ROOT
+
+from dvrk_drake.recordings.recording import read_recording
+
+DOCUMENT = ROOT / "docs" / "public_recordings.md"
+
+
+def document_functions() -> dict[str, object]:
+    namespace: dict[str, object] = {}
+    for block in re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL):
+        exec(block, namespace)
+    return namespace
+
+
+def test_the_document_writes_measured_js_as_a_recording_that_reads_back(tmp_path):
+    q, qd, tau = np.random.default_rng(4).normal(size=(3, 6, 8))
+    messages = [
+        SimpleNamespace(
+            header=SimpleNamespace(stamp=SimpleNamespace(sec=100, nanosec=10_000_000 * i)),
+            position=q[i],
+            velocity=qd[i],
+            effort=tau[i],
+        )
+        for i in range(6)
+    ]
+    document_functions()["write_measured_js"](messages, tmp_path / "ros.csv")
+    recording = read_recording(tmp_path / "ros.csv")
+    np.testing.assert_array_equal(recording.q, q[:, :7])
+    np.testing.assert_array_equal(recording.qd, qd[:, :7])
+    np.testing.assert_array_equal(recording.tau, tau[:, :7])
+    np.testing.assert_allclose(recording.t, np.arange(6) / 100, atol=1e-9)
+
+
+@pytest.mark.parametrize("average", [False, True])
+def test_the_document_writes_the_2017_pairs_as_a_recording_that_reads_back(tmp_path, average):
+    position, effort = np.random.default_rng(5).normal(size=(2, 8, 10, 4))
+    effort[:, :, 3] = 0
+    document_functions()["write_2017"](position, effort, tmp_path / "poses.csv", average)
+    recording = read_recording(tmp_path / "poses.csv")
+    assert len(recording) == (3 if average else 30)
+    if average:
+        np.testing.assert_allclose(recording.q[2], position[:7, :, 2].mean(axis=1), atol=1e-12)
+    else:
+        np.testing.assert_array_equal(recording.tau[13], effort[:7, 3, 1])

@@ -1,0 +1,113 @@
+"""Writing at once or not at all, and reading back exactly what was written."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+
+import numpy as np
+import pytest
+from recordings import random_recording, write_text
+from unprivileged import public_folder, run_unprivileged
+
+from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.models.files import atomic_write
+from dvrk_drake.recordings.recording import read_recording, write_csv, write_recording
+
+
+@pytest.mark.parametrize("absent", [(), ("t",), ("qd",), ("tau",), ("t", "qd", "tau")])
+def test_what_is_written_reads_back_exactly(tmp_path, absent):
+    recording = random_recording(**dict.fromkeys(absent))
+    recording.q[0, :4] = [5e-324, 1.7976931348623157e308, -0.0, 0.1 + 0.2]
+    write_recording(recording, tmp_path / "out.csv")
+    again = read_recording(tmp_path / "out.csv")
+    for name in ("t", "q", "qd", "tau"):
+        if name in absent:
+            assert getattr(again, name) is None
+        else:
+            assert getattr(again, name).tobytes() == np.ascontiguousarray(getattr(recording, name)).tobytes()
+    assert (tmp_path / "out.csv").read_bytes().count(b"\r") == 0
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "out.csv"
+    write_csv(path, ["a"], np.ones((1, 1)))
+    before = path.read_bytes()
+
+    def rows():
+        yield [1.0]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_csv(path, ["a"], rows())
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_write_that_fails_makes_no_file(tmp_path):
+    with pytest.raises(ZeroDivisionError), atomic_write(tmp_path / "out.csv") as stream:
+        stream.write("half")
+        stream.flush()
+        assert not (tmp_path / "out.csv").exists()
+        _ = 1 / 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_places_that_cannot_be_written(tmp_path):
+    for path, match in (
+        (tmp_path / "no" / "out.csv", r"no/out\.csv: cannot be written: No such file or directory"),
+        (tmp_path, "is not a regular file"),
+        (os.devnull, "/dev/null: is not a regular file, so it cannot be replaced; name a file"),
+    ):
+        with pytest.raises(DvrkDrakeError, match=match), atomic_write(path) as stream:
+            stream.write("x")
+    assert list(tmp_path.iterdir()) == []
+    assert stat.S_ISCHR(os.stat(os.devnull).st_mode)
+
+
+def test_a_full_disk_is_an_error_of_ours(tmp_path):
+    match = r"out\.csv: cannot be written: No space left"
+    with pytest.raises(DvrkDrakeError, match=match), atomic_write(tmp_path / "out.csv"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_errors_of_the_caller_stay_what_they_are(tmp_path):
+    with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "out.csv"):
+        (tmp_path / "absent").read_text()
+
+
+def test_a_read_only_file_is_not_replaced():
+    with public_folder() as folder:
+        path = write_text(folder, "old")
+        path.chmod(0o444)
+
+        def check():
+            with pytest.raises(DvrkDrakeError, match="cannot be written: it is read-only"), atomic_write(path):
+                pass
+
+        run_unprivileged(check)
+        assert path.read_text() == "old"
+
+
+def test_links_and_permissions_survive(tmp_path):
+    path, link = write_text(tmp_path, "old"), tmp_path / "link.csv"
+    path.chmod(0o640)
+    link.symlink_to(path)
+    with atomic_write(link) as stream:
+        stream.write("new\r\n")
+    assert link.is_symlink()
+    assert path.read_bytes() == b"new\r\n"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+
+
+def test_a_new_file_has_the_permissions_that_the_user_wants(tmp_path):
+    old = os.umask(0o027)
+    try:
+        with atomic_write(tmp_path / "out.bin", "wb") as stream:
+            stream.write(b"\x00\xff")
+    finally:
+        os.umask(old)
+    assert (tmp_path / "out.bin").read_bytes() == b"\x00\xff"
+    assert stat.S_IMODE((tmp_path / "out.bin").stat().st_mode) == 0o640

@@ -1,0 +1,41 @@
+"""Tables in terminals of any width: no digit is lost, and nothing is wider than it must be."""
+
+import pytest
+
+from dvrk_drake.reports.terminal_tables import TABLE_WIDTH, make_console, make_table
+
+NAME = "L4 (m4+...+m7) + m3 c3z + m4 c4y + m_crank c_crank_y"
+CELLS = (NAME, "-0.0371 .. +0.0514", "+0.01277", "0.00303", "kg m^2")
+
+
+def printed(capsys, monkeypatch, columns):
+    if columns is None:
+        monkeypatch.delenv("COLUMNS", raising=False)
+    else:
+        monkeypatch.setenv("COLUMNS", str(columns))
+    table = make_table("What is known", "", "clip [N m]", "dead band [rad/s]", "standard error", "saturation [rad/s]")
+    table.add_row(*CELLS)
+    make_console().print(table)
+    return capsys.readouterr().out.splitlines()
+
+
+@pytest.mark.parametrize("columns", [64, 80, 100, 120, None])
+def test_it_fits_and_every_number_is_whole(columns, capsys, monkeypatch):
+    lines = printed(capsys, monkeypatch, columns)
+    assert max(map(len, lines)) <= (columns or TABLE_WIDTH)
+    text = "\n".join(lines)
+    assert all(cell in text for cell in CELLS[1:])
+    assert "[N m]" in text and "[rad/s]" in text and "…" not in text
+    name = " ".join(line[: line.find("  ")].strip() if "  " in line else line for line in lines if line[:1].strip())
+    assert "m_crank c_crank_y" in name
+
+
+def test_a_terminal_that_is_too_narrow_for_the_numbers_still_gets_them(capsys, monkeypatch):
+    text = "\n".join(printed(capsys, monkeypatch, 30))
+    assert all(cell in text for cell in CELLS[1:])
+
+
+def test_a_wide_terminal_keeps_headings_on_one_line(capsys, monkeypatch):
+    title, heading, row = printed(capsys, monkeypatch, 140)
+    assert title.strip() == "What is known" and row.startswith(NAME)
+    assert heading.split("  ")[-1].strip() == "saturation [rad/s]"

@@ -1,0 +1,188 @@
+"""The real arm as a whole: parts that can be switched, scenarios, and what is refused."""
+
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from real_arm import ARMS
+
+from dvrk_drake.dynamics.arm_frame import ArmFrame
+from dvrk_drake.errors import ArmError, ScenarioError, StationError
+from dvrk_drake.experiments.scenario import HandScenario
+from dvrk_drake.experiments.scenario_file import load_scenario
+from dvrk_drake.experiments.simulation import simulate
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.effects_schema import EFFECT_NAMES, ArmEffects, FrictionEffect
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
+from dvrk_drake.systems.arm_station import ArmStation
+
+
+def scenario(arm, *settings):
+    parts = ["duration=0.3", "real_arm=[all]", "sample_period=0.001"]
+    return load_scenario(arm, [*parts, *settings])
+
+
+@pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
+def test_a_seed_gives_the_same_bits(name):
+    one, two, other = (simulate(scenario(name, f"seed={seed}")).recording for seed in (5, 5, 6))
+    for field in ("q", "qd", "tau"):
+        np.testing.assert_array_equal(getattr(one, field), getattr(two, field))
+    assert np.any(one.tau != other.tau)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ARMS)
+def test_a_controller_that_knows_only_gravity_holds_the_real_arm(name):
+    arm = load_arm(name)
+    path = simulate(load_scenario(name, ["duration=2", "real_arm=[all]"])).recording.q
+    # Cables and springs, which it does not know, pull it by their torque over its gain until its integral has grown.
+    assert np.abs(path - path[0]).max() < 0.1
+    rest = [part for part in EFFECT_NAMES if part not in ("cables", "springs")]
+    recording = simulate(load_scenario(name, ["duration=2", f"real_arm={rest}"])).recording
+    resolution = np.array([arm.effects.encoder.resolution[joint] for joint in arm.joint_names])
+    counts = arm.transmission.position(recording.q - recording.q[0]) / resolution
+    # Presliding alone is some counts of the fine encoders: 3 mrad under its load.
+    assert np.all(np.abs(counts * resolution) < np.maximum(2 * resolution, 0.003))
+    assert np.all(np.abs(recording.tau) <= 1.1 * arm.effort_limits)
+
+
+def test_every_part_can_be_switched():
+    arm = load_arm("mtml")
+    for name in EFFECT_NAMES:
+        assert getattr(arm.effects, name) or name == "stretch"
+        alone, rest = arm.effects.only([name]), arm.effects.without(name)
+        for other in EFFECT_NAMES:
+            kept, dropped = (alone, rest) if other == name else (rest, alone)
+            assert getattr(kept, other) == getattr(arm.effects, other)
+            assert getattr(dropped, other) == getattr(ArmEffects(), other)
+    with pytest.raises(ArmError, match="unknown effect frction; allowed: all, friction"):
+        arm.effects.only(["frction"])
+
+
+def test_a_typo_is_an_error(tmp_path):
+    with pytest.raises(ScenarioError, match="simulated arm: unknown effect frction"):
+        load_scenario("mtml", ["real_arm=[frction]"])
+    text = (MODELS_FOLDER / "mechanisms" / "mtm.yaml").read_text()
+    arm_text = (MODELS_FOLDER / "arms" / "mtml.yaml").read_text().replace("mechanism: mtm", "mechanism: m.yaml")
+    (tmp_path / "a.yaml").write_text(arm_text)
+    for old, new, message in (
+        ("stops: true", "stopps: true", "stopps"),
+        ("outer_yaw: 1.861", "outer_jaw: 1.861", "effects.saturation: unknown actuator outer_jaw"),
+        (
+            "outer_yaw: 1.861",
+            "outer_yaw: -1.861",
+            "effects.saturation.outer_yaw is -1.861; allowed: 0.001..2000 N m or N",
+        ),
+        ("measurement: 1", "measurement: -1", "effects.delay.measurement is -1; allowed: 0..100 time steps"),
+        ("presliding, scale: 0.015", "stiction, scale: 0.015", 'effects.friction: kind "stiction"; allowed'),
+        ("scale: 0.015", "scale: 0.0", "has scale 0"),
+        ("coefficient: 0.0011", "coefficient: -0.0011", "has coefficient -0.0011"),
+    ):
+        assert old in text
+        (tmp_path / "m.yaml").write_text(text.replace(old, new))
+        load_arm.__globals__["_load_arm"].cache_clear()
+        with pytest.raises(ArmError, match=message):
+            load_arm(str(tmp_path / "a.yaml"))
+
+
+def test_a_coordinate_that_is_none_is_refused():
+    arm = load_arm("mtml")
+    nowhere = ArmEffects(friction=[FrictionEffect("actuator.elbow", "presliding", 0.01, 0.1)])
+    with pytest.raises(StationError, match=r'coordinate is "actuator\.elbow"; allowed: actuator\.outer_yaw'):
+        ArmStation(arm, effects=nowhere)
+    with pytest.raises(StationError, match="effects are of a simulation"):
+        ArmStation(arm, hardware=True, effects=arm.effects)
+
+
+def test_no_sdf_has_friction_tags():
+    """Drake drops them without a word: friction is stated in the YAML files."""
+    paths = {path.name: path for path in (MODELS_FOLDER / "sdf").glob("*.sdf")}
+    assert {"mtm.sdf", "psm.sdf"} <= set(paths)
+    for name, path in paths.items():
+        assert not list(ElementTree.parse(path).iter("friction")), name
+
+
+TWO_POSES = [[0.0, 0.2, -0.2, 0.0, 0.5, 0.0, 0.0], [0.3, 0.35, -0.1, 0.3, 0.8, 0.2, 0.4]]
+HAND = [
+    f"hand.path=[{{time: 0.1, pose: {TWO_POSES[0]}}}, {{time: 0.7, pose: {TWO_POSES[1]}}}]",
+    f"start={TWO_POSES[0]}",
+]
+
+
+@pytest.mark.slow
+def test_a_hand_moves_the_arm_and_lets_go():
+    settings = ["duration=2.2", "controller.mode=gravity", "real_arm=[all]", *HAND]
+    simulation = simulate(load_scenario("mtml", settings))
+    frame = ArmFrame(load_arm("mtml"), "dh_7")
+    force = np.linalg.norm(simulation.hand[:, 3:], axis=1)
+    gripped = (simulation.time >= 0.1) & (simulation.time <= 0.7)
+    assert np.all(force[~gripped] == 0.0)
+    assert 0.5 < force[gripped].max() <= HandScenario().max_force
+    way = [np.linalg.norm(frame.pose(q).translation() - frame.pose(TWO_POSES[1]).translation()) for q in TWO_POSES]
+    k = np.flatnonzero(gripped)[-1]
+    reached = frame.pose(simulation.state_true[k, :7]).translation() - frame.pose(TWO_POSES[1]).translation()
+    assert np.linalg.norm(reached) < 0.2 * way[0]
+    # Friction stops it where the hand left it; what goes on is to and fro in the friction's springs.
+    assert np.ptp(simulation.state_true[-50:, :7], axis=0).max() < 5e-3
+
+
+@pytest.mark.slow
+def test_a_controller_that_knows_cables_and_springs_holds_them_exactly():
+    """Gravity compensation alone, without friction: nothing is left that moves the arm."""
+    parts = ["real_arm=[cables, springs]", "duration=1", "controller.mode=gravity", f"start={TWO_POSES[1]}"]
+    moved = {}
+    for knows in ("[]", "[cables, springs]"):
+        path = simulate(load_scenario("mtml", [*parts, f"controller.knows={knows}"])).state_true
+        moved[knows] = np.abs(path[:, :7] - path[0, :7]).max()
+    assert moved["[cables, springs]"] < 1e-3
+    assert moved["[]"] > 0.05
+
+
+def test_saturation_shows_what_motors_cannot_follow():
+    """From 0.05 to 0.9 rad in 0.25 s: more than the shoulder's motor has, though not than the joint's limit."""
+    arm = load_arm("mtml")
+    low, high = [0, 0.05, 0, 0, 0, 0, 0], [0, 0.6, -0.5, 0, 0, 0, 0]
+    settings = [f"start={low}", f"targets=[{{time: 0.2, pose: {high}}}]", "duration=0.4"]
+    error, effort = {}, {}
+    for parts in ("[]", "[saturation]"):
+        simulation = simulate(load_scenario("mtml", [*settings, f"real_arm={parts}"]))
+        error[parts] = np.abs(simulation.recording.q - simulation.desired).max()
+        effort[parts] = np.abs(arm.transmission.inverse().pull_back_effort(simulation.recording.tau)).max(axis=0)
+    limit = np.array([arm.effects.saturation[joint] for joint in arm.joint_names])
+    assert np.any(effort["[]"] > 1.1 * limit)
+    assert np.all(effort["[saturation]"] <= limit * (1 + 1e-9))
+    assert error["[saturation]"] > 1.2 * error["[]"]
+
+
+def test_a_cable_of_a_scenario_stretches():
+    """At rest it carries what the motor gives, but for the friction at the motor."""
+    arm, start = load_arm("mtml"), "start=[0.0, 0.4, -0.2, 0.0, 0.5, 0.0, 0.0]"
+    friction = sum(e.coefficient for e in arm.effects.friction if e.coordinate == "actuator.shoulder_pitch")
+    stretch, load = {}, {}
+    for stiffness in (50.0, 200.0):
+        cable = f"stretch.shoulder_pitch={{stiffness: {stiffness}, damping: 1.0}}"
+        settings = ["duration=1", "controller.mode=gravity", "real_arm=[friction]", start, cable]
+        simulation = simulate(load_scenario("mtml", settings))
+        assert np.abs(simulation.state_true[-1, 7:]).max() < 0.02
+        stretch[stiffness] = (simulation.recording.q - simulation.state_true[:, :7])[-1, 1]
+        load[stiffness] = arm.transmission.inverse().pull_back_effort(simulation.recording.tau[-1])[1]
+        assert stretch[stiffness] == pytest.approx(load[stiffness] / stiffness, abs=friction / stiffness)
+        assert abs(load[stiffness]) > 2 * friction
+    assert abs(stretch[50.0]) > 2 * abs(stretch[200.0])
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("stretch.elbow={stiffness: 100.0}", "simulated arm: stretch: unknown actuator elbow"),
+        ("stretch.outer_yaw={stiffness: -1.0}", "stretch.outer_yaw.stiffness is -1; allowed: "),
+        ("hand.path=[{time: 0.1, pose: [0, 0, 0, 0, 0, 0, 0]}]", "hand.path needs two poses or more"),
+        ("hand.path=[{time: 0.1, pose: [0, 0, 0]}]", r"hand.path\[0\].pose has 3 numbers"),
+        ("hand.grip=1", "allowed"),
+        ("controller.knows=[friction]", 'controller.knows is "friction"; allowed: cables, springs'),
+        ("controller.friction_ratio=0.5", 'controller.friction_ratio needs mode "gravity"'),
+    ],
+)
+def test_a_scenario_of_a_real_arm_that_makes_no_sense_is_refused(setting, message):
+    with pytest.raises(ScenarioError, match=message):
+        load_scenario("mtml", [setting])

@@ -1,0 +1,75 @@
+"""Packages import in one direction: descriptions of arms at the bottom, the command line on top."""
+
+import ast
+
+import pytest
+from repository import ROOT
+
+#: What each package may import beside itself and `COMMON`; the picture is in docs/packages.md.
+ALLOWED = {
+    "models": set(),
+    "recordings": {"models"},
+    "dynamics": {"models", "recordings"},
+    "export": {"models", "recordings", "dynamics"},
+    "systems": {"models", "recordings", "dynamics"},
+    "analysis": {"models", "recordings", "dynamics"},
+    "processes": {"models", "recordings", "dynamics", "systems"},
+    "experiments": {"models", "recordings", "dynamics", "export", "systems", "analysis"},
+}
+ALLOWED["reports"] = ALLOWED.keys() - {"reports"}
+ALLOWED["cli"] = ALLOWED.keys() - {"cli"}
+#: What every package may import, and what imports no package: errors, generated messages, memory of processes.
+COMMON = {"errors", "lcmtypes", "allocation"}
+PACKAGE = ROOT / "dvrk_drake"
+MODULES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in PACKAGE.rglob("*.py")
+}
+
+
+def imports_of(source: str) -> set[str]:
+    """Names of all modules that a source imports anywhere: at its top, in functions, under TYPE_CHECKING."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0 or "lcm-gen" in source, "relative imports are not used"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name for name in found if name.startswith("dvrk_drake.")}
+
+
+def package_of(module: str) -> str:
+    """`models` of `dvrk_drake.models.arm`; "" of `dvrk_drake` itself."""
+    return module.partition(".")[2].partition(".")[0]
+
+
+def test_every_package_has_its_place():
+    packages = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
+    modules = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"}
+    assert packages | modules == ALLOWED.keys() | COMMON
+
+
+@pytest.mark.parametrize("package", sorted(ALLOWED.keys() | COMMON))
+def test_package_imports_only_what_is_below_it(package):
+    allowed = {package} if package in COMMON else {package, *ALLOWED[package], *COMMON}
+    wrong = [
+        f"{module} imports {name}"
+        for module, path in MODULES.items()
+        if package_of(module) == package
+        for name in imports_of(path.read_text())
+        if package_of(name) not in allowed
+    ]
+    assert not wrong, "\n".join(sorted(wrong))
+
+
+def test_imports_are_found_wherever_they_are():
+    source = """
+import numpy, dvrk_drake.models.arm
+from dvrk_drake.cli import main
+if TYPE_CHECKING:
+    from dvrk_drake.reports.figures import save_figure as save
+def late():
+    from dvrk_drake import errors
+"""
+    assert {package_of(name) for name in imports_of(source)} == {"models", "cli", "reports", "errors"}
