@@ -44,6 +44,9 @@ USES = {
     "teleoperation, hand at 0.3 rad/s": ("mtml", "teleoperation", 0.3, 0.2, True, 4),
 }
 
+#: Part of the effort limits that poses of a collection may need to be held; a wrist pitch needs more than its limit at some.
+STRENGTH = 0.7
+
 
 def interference(guard):
     """Returns the reason of a fault or a watchdog hold, or ""."""
@@ -76,9 +79,11 @@ def step(arm, seconds, also=lambda: "", until=lambda: False):
 
 
 def collect(arm, seconds):
-    """A collection of random poses."""
+    """A collection of random poses, those that the motors can hold."""
     simulated = FaultyArm(arm.name.lower(), "effort")
-    poses = arm.sample_poses(200, np.random.default_rng(1), margin=0.1)
+    poses = arm.sample_poses(400, np.random.default_rng(1), margin=0.1)
+    needed = np.abs(simulated.model.holding_torque(poses)) + arm.dry_friction()
+    poses = poses[(needed < STRENGTH * arm.effort_limits).all(axis=1)]
     with tempfile.TemporaryDirectory() as folder:
         collector = Collector(
             poses,

@@ -106,6 +106,7 @@ class FaultyArm:
 
     Attributes:
         sensors: whose measurements can be made to fail.
+        model: the true one.
         desired: time -> desired state (2n) of the arm under "effort" and "position".
         lead: status, time -> the same for `ArmController.answer`.
         controller: the ArmController, or None.
@@ -122,7 +123,7 @@ class FaultyArm:
         """
         self.arm = arm = load_arm(name)
         known = arm.effects.cables + arm.effects.springs if effects else []
-        model = IdentifiedModel.from_arm(arm, known)
+        self.model = model = IdentifiedModel.from_arm(arm, known)
         builder = DiagramBuilder()
         effects = arm.effects if effects else None
         self.station = builder.AddSystem(ArmStation(arm, effects=effects, seed=seed))

@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.systems.guard.command_expiry import CommandExpiry
 from dvrk_drake.systems.guard.command_stream import (
     FOREIGN,
     OUT_OF_STREAM,
     CommandInForce,
     CommandStream,
     GuardCounts,
-    WallClock,
     content_refusal,
     foreign_refusal,
 )
@@ -70,9 +70,7 @@ class CommandGuard:
         any --fault--> FAULT --HOLD with reset_fault, changed from false to true--> HOLD
 
     **Expiry**: a command is obeyed until `expiry` after the measurement that it answers (its `status_utime`), whenever
-    it came; who answers one measurement again and again gains no time. The age of the measurement is the larger one of
-    two: by the arm's clock, and by the wall clock if there is one. So a command expires also if the arm's clock is late
-    or was stopped. Then the arm holds.
+    it came; who answers one measurement again and again gains no time. Then the arm holds. See `CommandExpiry`.
 
     **Measurements** are checked: numbers, age, and plausibility (`Plausibility`). One that is not finite or too old
     ends commands; while the arm holds, some in a row are tolerated, and more are a fault. The first one must have a
@@ -155,11 +153,10 @@ class CommandGuard:
         self.refusal_code = self.ignored_code = lcmt_dvrk_status.REFUSAL_NONE
         self.counts = GuardCounts()
         self._modes = tuple(_ACTIVE) if modes is None else modes
-        self._expiry = round(1e6 * self.settings.expiry)
-        self._wall = None if wall_clock is None else WallClock(wall_clock)
+        self._expiry = CommandExpiry(round(1e6 * self.settings.expiry), wall_clock)
         self._stepped = 0
         self._stream = CommandStream(
-            self._expiry, round(1e6 * self.settings.clock_tolerance), self.settings.sequence_jump
+            self._expiry.expiry, round(1e6 * self.settings.clock_tolerance), self.settings.sequence_jump
         )
         self._force = CommandInForce()
         self._powered = True
@@ -272,12 +269,12 @@ class CommandGuard:
             effort: what the motors applied (n,) [N m, N].
         """
         dt, problem = self._measured.advance(utime)
-        if self._wall is not None:
-            if dt < 0:
-                self._wall.forget()
-            self._wall.note(measured_utime, utime - measured_utime)
         if dt < 0:
             self._stream.forget()
+        if (wall := self._expiry.wall) is not None:
+            if dt < 0:
+                wall.forget()
+            wall.note(measured_utime, utime - measured_utime)
         if problem:
             self.report_fault(problem, lcmt_dvrk_status.FAULT_CLOCK)
         self._measure(measured_utime, q, v, effort)
@@ -343,8 +340,8 @@ class CommandGuard:
             self.report_fault(fault, lcmt_dvrk_status.FAULT_IMPLAUSIBLE)
 
     def _watch_period(self, dt: float) -> None:
-        if self._wall is not None:
-            now = self._wall.now()
+        if self._expiry.wall is not None:
+            now = self._expiry.wall.now()
             dt, self._stepped = 1e-6 * (now - self._stepped) if self._stepped else 0.0, now
         if self._period.add(dt) and self._is_watched_or_in_force():
             self._take_over(self._period.fault)
@@ -359,15 +356,9 @@ class CommandGuard:
     def _expire(self, utime: int) -> None:
         if not self._is_watched_or_in_force():
             return
-        age, clock = utime - self._force.status_utime, "the arm's clock"
-        if self._wall is not None and (by_wall := self._wall.now() - self._force.wall_utime) > age:
-            age, clock = by_wall, "the wall clock"
-        if age <= self._expiry:
-            return
-        self.counts.expired += self.state != lcmt_dvrk_status.STATE_STARTING
-        self._take_over(
-            f"the last command expired: {1e-3 * age:.1f} ms old by {clock}, {1e-3 * self._expiry:g} ms are allowed"
-        )
+        if reason := self._expiry.fault(utime - self._force.status_utime, self._force.wall_utime):
+            self.counts.expired += self.state != lcmt_dvrk_status.STATE_STARTING
+            self._take_over(reason)
 
     def _take_over(self, reason: str) -> None:
         """Goes to HOLD, until an operator resumes if commands acted; has no effect in OFF and in FAULT.
@@ -388,7 +379,7 @@ class CommandGuard:
             return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
         if (code := content_refusal(command)) != lcmt_dvrk_status.REFUSAL_NONE:
             return code
-        if self._measured.utime is None or not 0 <= utime - command.status_utime <= self._expiry:
+        if self._measured.utime is None or not 0 <= utime - command.status_utime <= self._expiry.expiry:
             return lcmt_dvrk_status.REFUSAL_STALE
         if command.control_mode == lcmt_dvrk_command.OFF and lcmt_dvrk_command.OFF not in self._modes:
             return lcmt_dvrk_status.REFUSAL_BAD_MODE
@@ -413,8 +404,7 @@ class CommandGuard:
         mode, force = command.control_mode, self._force
         goes_on = self.state == lcmt_dvrk_status.STATE_STARTING and mode == force.command.control_mode
         force.take(command)
-        if self._wall is not None:
-            force.wall_utime = self._wall.time_of(command.status_utime, utime - command.status_utime)
+        force.wall_utime = self._expiry.wall_time(command.status_utime, utime - command.status_utime)
         if mode == lcmt_dvrk_command.OFF:
             self.state, self._powered = lcmt_dvrk_status.STATE_OFF, False
         elif mode == lcmt_dvrk_command.HOLD:

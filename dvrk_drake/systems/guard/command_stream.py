@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,9 +11,6 @@ from dvrk_drake.systems.guard.limits import Vector
 
 #: No joint is there, that fast or that strong [rad, m, rad/s, m/s, N m, N].
 ABSURD = 1e6
-
-#: The longest expiry, 1 s, has so many measurements at 2 kHz.
-_MOST_MEASUREMENTS = 2000
 
 #: Refusals of messages that do not belong to the session or to the sender in command. They are counted separately.
 FOREIGN = frozenset(
@@ -92,33 +87,6 @@ class GuardCounts:
     refused: int = 0
     ignored: int = 0
     expired: int = 0
-
-
-class WallClock:
-    """Time of measurements by a clock that goes on while the process and with it the arm's clock stands still.
-
-    Copies of a guard share it: it notes what happened outside of them.
-    """
-
-    def __init__(self, clock: Callable[[], int]) -> None:
-        """By `clock`, monotonic [us]."""
-        self.now = clock
-        self._times: OrderedDict[int, int] = OrderedDict()
-
-    def note(self, measured_utime: int, age: int) -> None:
-        """Notes a measurement of `measured_utime` on the arm's clock, which is `age` old by it [us]."""
-        self._times.setdefault(measured_utime, self.now() - age)
-        if len(self._times) > _MOST_MEASUREMENTS:
-            self._times.popitem(last=False)
-
-    def time_of(self, measured_utime: int, age: int) -> int:
-        """Time of a measurement [us]; for one that was not noted, `age` by the arm's clock before now [us]."""
-        time = self._times.get(measured_utime)
-        return self.now() - age if time is None else time
-
-    def forget(self) -> None:
-        """Forgets all measurements, for when the arm's clock went back."""
-        self._times.clear()
 
 
 @dataclass

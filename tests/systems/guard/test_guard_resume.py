@@ -8,7 +8,7 @@ from guard_bench import MS, WITH_OFF, Bench, N, Q, modes
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.systems.guard.command_stream import WallClock
+from dvrk_drake.systems.guard.command_expiry import WallClock
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
 
@@ -266,7 +266,7 @@ def test_a_clock_of_the_arm_that_went_back_has_no_times_of_its_future():
     bench.stalled += 10**6
     bench.utime -= 10**6
     bench.step()
-    assert bench.guard._wall.time_of(bench.utime + 10**6 - MS, 7) == bench.guard._wall.now() - 7
+    assert bench.guard._expiry.wall.time_of(bench.utime + 10**6 - MS, 7) == bench.guard._expiry.wall.now() - 7
 
 
 def test_a_stall_while_starting_starts_anew_and_needs_no_resume():
