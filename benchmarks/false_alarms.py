@@ -44,7 +44,7 @@ USES = {
     "teleoperation, hand at 0.3 rad/s": ("mtml", "teleoperation", 0.3, 0.2, True, 4),
 }
 
-#: Part of the effort limits that poses of a collection may need to be held; a wrist pitch needs more than its limit at some.
+#: Part of the effort limits that poses of a collection may need; at some poses, a wrist pitch needs more than its limit.
 STRENGTH = 0.7
 
 
