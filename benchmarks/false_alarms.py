@@ -44,7 +44,7 @@ USES = {
     "teleoperation, hand at 0.3 rad/s": ("mtml", "teleoperation", 0.3, 0.2, True, 4),
 }
 
-#: Part of the effort limits that poses of a collection may need; at some poses, a wrist pitch needs more than its limit.
+#: Part of the effort limits that poses of a collection may need. At some, a wrist pitch needs more than its limit.
 STRENGTH = 0.7
 
 
