@@ -9,9 +9,7 @@ that can have one has one that gives STRETCH under the motor's largest effort. R
 busy machine slows all rows alike; times are CPU time of this process, the least over the repetitions. `real time` is
 simulated time over CPU time.
 
-A third of a step is Drake's allocations. This program starts itself again with a faster allocator, as the verbs of
-`dvrk-drake` that simulate do: see `dvrk_drake.allocation`. LD_PRELOAD= or GLIBC_TUNABLES= before the command keeps what
-is there.
+A third of a step is Drake's allocations: set LD_PRELOAD or GLIBC_TUNABLES for a faster allocator, see docs/real_arm.md.
 """
 
 from __future__ import annotations
@@ -28,7 +26,6 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
-from dvrk_drake.allocation import restart_with_faster_allocator
 from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
@@ -103,5 +100,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    restart_with_faster_allocator()
     main()

@@ -17,8 +17,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if arguments is None:
         signal.signal(signal.SIGINT, leave)
-        # `restart_with_faster_allocator` blocks it until here.
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     from dvrk_drake.cli.program import run
 
     try:

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import NoReturn
 
-from dvrk_drake.allocation import restart_with_faster_allocator
 from dvrk_drake.cli import (
     check,
     collect,
@@ -45,8 +44,6 @@ _SIMULATED = (simulate, study, tune, transparency, reproduce, demo)
 def run(arguments: Sequence[str] | None) -> int:
     """Runs one verb; returns the exit code. Without `arguments` those of the process, which is then the verb's own."""
     options = _parser().parse_args(arguments)
-    if arguments is None and options.run.__module__ in [module.__name__ for module in _SIMULATED]:
-        restart_with_faster_allocator()
     try:
         import_interruptibly()
         if arguments is None:
