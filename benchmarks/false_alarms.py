@@ -24,7 +24,7 @@ from faulty_arm import PERIOD, FaultyArm, wave
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes.collector import CollectionSettings, Collector
-from dvrk_drake.recordings.collection_file import CollectionFile
+from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.systems.teleoperation import Teleoperation
 
 #: Use -> arm, control, speed [rad/s; a tenth in m/s], reach, whether a hand moves it, and weight in the whole time.

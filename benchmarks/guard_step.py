@@ -25,7 +25,7 @@ from dvrk_drake.models.arm import load_arm
 
 arm = load_arm(sys.argv[1])
 try:
-    from dvrk_drake.dynamics.control_model import ControlModel
+    from dvrk_drake.dynamics.identified_model import ControlModel
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
 
     bench = Bench(arm, model=ControlModel(IdentifiedModel.from_arm(arm)), checks=True).at_rest()

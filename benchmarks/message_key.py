@@ -18,8 +18,7 @@ import argparse
 import numpy as np
 from timing import measured_times
 
-from dvrk_drake.dynamics.control_model import ControlModel
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.lcm_messages import StatusFilter

@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from dvrk_drake.experiments.study.executors import run_study_locally
+from dvrk_drake.experiments.study.study import run_study_locally
 from dvrk_drake.experiments.study.study_file import load_study
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "release_study.yaml"

@@ -29,20 +29,19 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.experiments.reproduction.recordings import PaperRecordings
-from dvrk_drake.experiments.scenario_file import load_scenario
+from dvrk_drake.experiments.reproduction.published import PaperRecordings
+from dvrk_drake.experiments.scenario import load_scenario
 from dvrk_drake.experiments.study.study_file import load_study
 from dvrk_drake.experiments.study.table import Row, StudyTable
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.gains_file import load_gains
+from dvrk_drake.models.arm_schema import load_gains
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
 from dvrk_drake.processes.simulated_arm import load_driver
-from dvrk_drake.recordings.collection_file import CollectionFile
 from dvrk_drake.recordings.conversion import convert
-from dvrk_drake.recordings.pose_file import load_poses, save_poses
+from dvrk_drake.recordings.pose_file import CollectionFile, load_poses, save_poses
 from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
 
 #: How many times as many examples as CI runs; more than 1 draws new ones each time.
@@ -275,7 +274,7 @@ def test_a_damaged_file_is_read_or_refused(name, valid):
 WORK = (
     "dvrk_drake.processes.lcm_network.open_lcm",
     "dvrk_drake.experiments.tuning.tuning.tune_arm",
-    "dvrk_drake.experiments.study.executors.run_study_locally",
+    "dvrk_drake.experiments.study.study.run_study_locally",
     "dvrk_drake.experiments.transparency.feel",
     "dvrk_drake.analysis.dynamic.dynamic_identification.identify_dynamic",
     "dvrk_drake.analysis.payload.payload.estimate_payload",

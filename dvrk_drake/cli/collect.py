@@ -105,8 +105,7 @@ def _visit(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
-    from dvrk_drake.recordings.collection_file import CollectionFile
-    from dvrk_drake.recordings.pose_file import load_poses
+    from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
 
     settings = CollectionSettings(options.traverse_time, options.both_sides)
     arm = load_arm(options.arm)

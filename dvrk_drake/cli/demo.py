@@ -35,7 +35,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 def _demo(options: argparse.Namespace) -> None:
     from dvrk_drake.experiments.demo.demo import run_demo
-    from dvrk_drake.reports.demo import plot_demo
+    from dvrk_drake.reports.figures import plot_demo
     from dvrk_drake.reports.terminal_tables import make_console, print_demo
 
     quiet_drake()

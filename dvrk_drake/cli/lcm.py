@@ -150,7 +150,7 @@ def _gains(options: argparse.Namespace) -> Gains | None:
         return None
     from dvrk_drake.errors import ControllerError
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.gains_file import load_gains
+    from dvrk_drake.models.arm_schema import load_gains
 
     if options.mode == "gravity":
         raise ControllerError("--gains is for --mode hold or damped: in mode gravity the arm is not regulated")

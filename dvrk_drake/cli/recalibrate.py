@@ -27,7 +27,7 @@ def _recalibrate(options: argparse.Namespace) -> None:
     from dvrk_drake.analysis.recalibration import recalibrate
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.recordings.recording import read_recording
-    from dvrk_drake.reports.recalibration import print_recalibration
+    from dvrk_drake.reports.dynamic_identification import print_recalibration
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(options.output, options.recording, options.model, overwrite=options.overwrite)

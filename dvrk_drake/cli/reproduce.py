@@ -27,7 +27,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _reproduce(options: argparse.Namespace) -> None:
-    from dvrk_drake.experiments.reproduction.recordings import PaperRecordings
+    from dvrk_drake.experiments.reproduction.published import PaperRecordings
     from dvrk_drake.reports.reproduction.run import reproduce
 
     quiet_drake()

@@ -33,7 +33,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    from dvrk_drake.experiments.scenario_file import load_scenario
+    from dvrk_drake.experiments.scenario import load_scenario
     from dvrk_drake.experiments.simulation import simulate
     from dvrk_drake.recordings.recording import write_recording
     from dvrk_drake.reports.terminal_tables import make_console, print_simulation

@@ -41,8 +41,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _study(options: argparse.Namespace) -> None:
-    from dvrk_drake.experiments.study.executors import dask_executor, run_study_locally
-    from dvrk_drake.experiments.study.study import run_study
+    from dvrk_drake.experiments.study.study import dask_executor, run_study, run_study_locally
     from dvrk_drake.experiments.study.study_file import load_study
     from dvrk_drake.reports.study import plot_study, print_study
     from dvrk_drake.reports.terminal_tables import make_console

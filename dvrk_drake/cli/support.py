@@ -36,7 +36,7 @@ def import_interruptibly() -> None:
     Nothing is half-written at that time. Where signals are not ours (a thread, a test) they are left alone.
     """
     # Together these import what the others do.
-    modules = ("dvrk_drake.reports.demo", "dvrk_drake.reports.terminal_tables")
+    modules = ("dvrk_drake.reports.figures", "dvrk_drake.reports.terminal_tables")
     if threading.current_thread() is not threading.main_thread() or sys.modules.keys() >= set(modules):
         return
 

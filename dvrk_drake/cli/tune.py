@@ -26,7 +26,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 def _tune(options: argparse.Namespace) -> None:
     from dvrk_drake.experiments.tuning.tuning import Method, tune_arm
     from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.gains_file import save_gains
+    from dvrk_drake.models.arm_schema import save_gains
     from dvrk_drake.reports.terminal_tables import make_console
     from dvrk_drake.reports.tuning import plot_steps, print_tuning
 

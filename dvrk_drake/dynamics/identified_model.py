@@ -1,6 +1,5 @@
-"""What an identification leaves behind: parameters with their uncertainty, and where they came from. Stored as YAML."""
+"""The identified model of an arm: its files, its torques, and its evaluation in a control loop."""
 
-# No postponed annotations here: yaml_load_typed reads the types at run time.
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -14,6 +13,7 @@ from pydrake.common.yaml import yaml_dump_typed
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, effect_fault
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import (
     ESTIMATES,
     RMS_EFFORTS,
@@ -30,6 +30,9 @@ from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import missing_key, schema_fault, within
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
+
+# No postponed annotations here: yaml_load_typed reads the types at run time.
+
 
 #: Measured positions, which may be beyond the limits of a joint.
 _POSITIONS = within(-50.0, 50.0, "rad or m")
@@ -243,3 +246,38 @@ class IdentifiedModel:
     def holding_torque(self, q: ArrayLike) -> NDArray[np.float64]:
         """Torque [N m, N] on the joints that holds the arm: (n,) for q (n,), (m, n) for q (m, n)."""
         return self.trust * self.static_model.torque(q, self.theta)
+
+
+class ControlModel:
+    """Gravity effort and mass matrix of one arm, evaluated fast enough for each tick of a control loop."""
+
+    def __init__(self, model: IdentifiedModel, *, with_gravity: bool = True) -> None:
+        """Compiles the gravity effort of `model` and reads its inertial parameters.
+
+        Args:
+            model: of the arm, mounted as it is. A model that was identified from poses has no inertias: those of the
+                arm's SDF are used then.
+            with_gravity: False for an arm that adds its own gravity compensation to all efforts: it needs none.
+
+        Raises:
+            ModelError: the model does not fit its arm.
+        """
+        model.check()
+        self._torque_into = model.static_model.torque_into
+        self._theta = np.ascontiguousarray(model.theta)
+        self._scale = model.trust * with_gravity
+        if model.dynamics is None:
+            self._regressor = DynamicRegressor(model.load_arm())
+            self._parameters = self._regressor.values
+        else:
+            self._regressor, self._parameters = model.dynamic_model.regressor, model.dynamic_model.parameters
+
+    def gravity_effort(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the effort (n,) [N m, N] that holds the arm at q (n,) [rad, m], a C-contiguous array."""
+        effort = np.empty(len(q))
+        self._torque_into(q, self._theta, effort)
+        return effort * self._scale
+
+    def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the mass matrix (n, n) of the independent joints at q (n,) [rad, m], rotors included."""
+        return self._regressor.mass_matrix(q[None], self._parameters)[0]

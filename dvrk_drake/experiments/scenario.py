@@ -1,4 +1,4 @@
-"""What to simulate: the schema of a scenario, and what of it makes no sense; `scenario_file` reads it.
+"""Scenarios: the schema of their files, what can be simulated, and their readers.
 
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
@@ -7,21 +7,23 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import get_args
+from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
-from dvrk_drake.dynamics.arm_frame import ArmFrame
 from dvrk_drake.dynamics.friction_compensation import LARGEST_HYSTERESIS_RATIO, LARGEST_RATIO
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ArmError, ScenarioError
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.arm_schema import GRAVITIES, Gains
+from dvrk_drake.models.arm_schema import GRAVITIES, Gains, load_gains
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.typed_yaml import load_yaml, parse_yaml, typed_content
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.hand import Grip
 
@@ -250,3 +252,52 @@ def check_pose(name: str, pose: list[float], arm: Arm) -> None:
         if np.any(far) and np.all(np.abs(q[far]) / 1000 <= arm.position_upper[far]):
             message += f"; is {arm.joint_names[int(np.argmax(far))]} in mm? It must be in m"
         raise ScenarioError(message)
+
+
+def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
+    """Reads a scenario file, or makes the scenario of an arm that holds its home pose; changes it, and checks it.
+
+    Args:
+        arm_or_file: path of a YAML file, or the name of an arm.
+        settings: "key=value" in YAML; a dot goes into a group: "controller.mode=gravity", "targets=[...]".
+
+    Raises:
+        ScenarioError: the file cannot be read, has an unknown key, or asks for what makes no sense.
+    """
+    path = Path(arm_or_file)
+    if path.suffix in (".yaml", ".yml"):
+        content = load_yaml(path, ScenarioError)
+        if isinstance(content, dict) and "mechanism" in content:
+            raise ScenarioError(f"{path}: is an arm's file, not a scenario; give an arm's name and --set arm={path}")
+    else:
+        content = {"arm": arm_or_file}
+    if isinstance(content, dict):
+        for setting in settings:
+            _change(content, setting)
+        _load_gains_of(content)
+    scenario = typed_content(Scenario, content, arm_or_file, ScenarioError, "a scenario")
+    try:
+        scenario.check()
+    except ScenarioError as error:
+        raise ScenarioError(f"{arm_or_file}: {error}") from error
+    return scenario
+
+
+def _load_gains_of(content: dict[str, Any]) -> None:
+    """Puts what is in a file of gains in the place of its name."""
+    controller = content.get("controller")
+    if isinstance(controller, dict) and isinstance(controller.get("gains"), str):
+        controller["gains"] = dataclasses.asdict(load_gains(controller["gains"]))
+
+
+def _change(content: dict[str, Any], setting: str) -> None:
+    key, equals, value = setting.partition("=")
+    if not equals or not key:
+        raise ScenarioError(f'--set {setting}: must be key=value, e.g. "duration=2" or "controller.mode=gravity"')
+    *groups, last = key.strip().split(".")
+    group: Any = content
+    for name in groups:
+        group = group.setdefault(name, {})
+        if not isinstance(group, dict):
+            raise ScenarioError(f"--set {setting}: {name} has no keys of its own")
+    group[last] = parse_yaml(value, f"--set {setting}", ScenarioError)

@@ -11,9 +11,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 
-from dvrk_drake.dynamics.arm_frame import ArmFrame, handle_frame
 from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.kinematics import ArmFrame, handle_frame
 from dvrk_drake.errors import ScenarioError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects

@@ -1,12 +1,16 @@
-"""Schemas of `arms/*.yaml`, `mechanisms/*.yaml` and `instruments/*.yaml`, for yaml_load_typed: a typo is an error.
+"""Schemas of `arms/*.yaml`, `mechanisms/*.yaml` and `instruments/*.yaml`, for yaml_load_typed: a typo is an error."""
 
-No postponed annotations here: yaml_load_typed reads the types at run time.
-"""
-
+import dataclasses
 from dataclasses import dataclass, field
+from pathlib import Path
 
+from pydrake.common.yaml import yaml_dump
+
+from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.effects_schema import ArmEffects
+from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import Range, within
+from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 #: Position limits of a joint; an MTM's roll turns to -8.4 rad, that of a UR10e to 6.3 rad.
 ANGLES, TRAVELS = Range(-12.6, 12.6, "rad"), Range(-2.0, 2.0, "m")
@@ -152,3 +156,27 @@ class ArmDescription:
     coupled_limits: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
     mirrored_links: dict[str, list[str]] = field(default_factory=dict)
     gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81], metadata=GRAVITIES)
+
+
+def load_gains(path: str | Path) -> Gains:
+    """Reads kp, kd and ki, one number a joint each; whether they fit an arm is the controller's to say.
+
+    Raises:
+        ControllerError: no such file, not one of gains, or a gain outside the range of `Gains`.
+    """
+    gains = load_typed_yaml(Gains, path, ControllerError, "a file of gains")
+    for name, values in dataclasses.asdict(gains).items():
+        if not values:
+            raise ControllerError(f"{path}: {name} is missing; a file of gains has kp, kd and ki, one number a joint")
+    return gains
+
+
+def save_gains(gains: Gains, path: str | Path, remark: str) -> None:
+    """Writes a file of gains with a remark of one line at its top.
+
+    Raises:
+        DvrkDrakeError: it cannot be written.
+    """
+    with atomic_write(path) as stream:
+        stream.write(f"# {remark}\n# N m/rad, N m s/rad, N m/(rad s); N and m on a joint that slides.\n")
+        stream.write(yaml_dump(dataclasses.asdict(gains)))

@@ -14,9 +14,9 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.coupled_limits import beside
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.processes.leg import Leg, RestDetector
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
-from dvrk_drake.recordings.collection_file import CollectionFile
+from dvrk_drake.processes.teacher import Leg, RestDetector
+from dvrk_drake.recordings.pose_file import CollectionFile
 
 #: The way goes on by no more than this between two statuses [s]: after a pause of the computer it does not jump.
 _LONGEST_STEP = 0.01

@@ -14,7 +14,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import STATUS_PREFIX, StatusFilter, describe_state, status_channel
 from dvrk_drake.models.message_key import MessageKey
 from dvrk_drake.processes.lcm_network import handle_message
-from dvrk_drake.recordings.lcm_status_log import StatusStream
+from dvrk_drake.recordings.lcm_log_reader import StatusStream
 from dvrk_drake.recordings.recording_stream import RecordingFile, check_stream_output, open_recording_file
 
 #: How long the first status may take [s], and after how long without one the live line says so.

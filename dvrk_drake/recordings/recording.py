@@ -19,8 +19,7 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.csv_rows import CsvReader, is_number, parse_finite, parse_or_nan, skipped_note
-from dvrk_drake.recordings.lcm_log_reader import is_lcm_log
-from dvrk_drake.recordings.lcm_status_log import read_status_log
+from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
 
 Coordinates = Literal["joint", "actuator"]
 

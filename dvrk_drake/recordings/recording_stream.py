@@ -14,9 +14,8 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import status_channel
-from dvrk_drake.recordings.growing_file import GrowingFile
-from dvrk_drake.recordings.lcm_log_reader import LcmEvent, event_bytes
-from dvrk_drake.recordings.lcm_status_log import StatusStream, measurements
+from dvrk_drake.recordings.csv_rows import GrowingFile
+from dvrk_drake.recordings.lcm_log_reader import LcmEvent, StatusStream, event_bytes, measurements
 from dvrk_drake.recordings.recording import column_names
 
 #: Columns of a CSV behind those of a Recording, to find a row again elsewhere.

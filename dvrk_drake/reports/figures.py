@@ -1,13 +1,10 @@
-"""Pictures of what was identified; each draws only what it is given."""
+"""Figures of identifications, motions and the demo."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import matplotlib
-
-matplotlib.use("Agg")
-
 import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +13,19 @@ from dvrk_drake.analysis.static.doubts import Doubt, usable_measurements
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
 from dvrk_drake.analysis.static.validation import Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.experiments.demo.demo import (
+    HELD_UNTIL,
+    NO_DRY_FRICTION,
+    PLANS,
+    RELEASED_UNTIL,
+    DemoResult,
+)
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.recording import Recording
+
+matplotlib.use("Agg")
+
 
 MODEL_COLOUR, ZERO_COLOUR, MEASURED_COLOUR = "#1f6f8b", "#c9c9c9", "#d1495b"
 
@@ -171,3 +178,29 @@ def save_figure(figure: plt.Figure, path: Path) -> None:
     with atomic_write(path, "wb") as stream:
         figure.savefig(stream, dpi=110, format="png")
     plt.close(figure)
+
+
+def plot_demo(output: Path, result: DemoResult) -> None:
+    """Writes torque_error.png, predicted.png, fresh_torque_error.png, release.png and step.png into `output`."""
+    arm = result.arm
+    plot_identification(output, result.identification)
+    plot_torque_error(
+        output / "fresh_torque_error.png",
+        arm,
+        np.array([j.rms_torque for j in result.fresh.joints]),
+        {
+            "identified": np.array([j.rms_error for j in result.fresh.joints]),
+            "the paper's least squares": np.array([j.rms_error for j in result.fresh_paper.joints]),
+        },
+        f"{arm.name} (simulated): {result.fresh.poses} fresh poses",
+    )
+    plot_positions(
+        output / "release.png",
+        arm,
+        result.release_time,
+        {"identified model": result.released, "model as drawn (SDF)": result.released_as_drawn},
+        f"{arm.name} (simulated without dry friction): held until {HELD_UNTIL} s, released under gravity compensation "
+        f"until {RELEASED_UNTIL} s, then driven home\n{NO_DRY_FRICTION}",
+    )
+    title = PLANS[arm.name.lower()].step_title
+    plot_positions(output / "step.png", arm, result.step_time, {"identified model": result.step}, title)

@@ -13,8 +13,7 @@ from rich.markup import escape
 
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import Study
-from dvrk_drake.experiments.study.summary import Share, Summary, summarise, values_of
-from dvrk_drake.experiments.study.table import Row
+from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise, values_of
 from dvrk_drake.reports.figures import MEASURED_COLOUR, MODEL_COLOUR, save_figure
 from dvrk_drake.reports.terminal_tables import make_table
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from dvrk_drake.experiments.tuning.bench import band, step_size
 from dvrk_drake.experiments.tuning.model_based import ArmDesign, friction
 from dvrk_drake.experiments.tuning.procedure import JointProcedure
-from dvrk_drake.experiments.tuning.settings import band, step_size
 from dvrk_drake.experiments.tuning.tuning import DURATION, OWN, PUBLISHED, REST, Comparison, Tuning
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.figures import save_figure

@@ -10,7 +10,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from dvrk_drake.dynamics.arm_frame import ArmFrame
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.schema_fault import number_fault, within

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
 from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 
-from dvrk_drake.dynamics.arm_frame import ArmFrame
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.models.arm import Arm
 
 

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from dvrk_drake.dynamics.arm_frame import ArmFrame
-from dvrk_drake.dynamics.psm_inverse_kinematics import PsmInverseKinematics
+from dvrk_drake.dynamics.kinematics import ArmFrame, PsmInverseKinematics
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant

@@ -12,7 +12,7 @@ STUDY = "scenario: psm\nset: [duration=1]\nmeasures: [{kind: drift, time: 1}]\n"
 VERBS = {
     "simulate": (["psm", "--output", "o.csv", "--plots", "new/p"], "experiments.simulation.simulate"),
     "transparency": (["--arm", "mtml", "--output", "new/p"], "experiments.transparency.feel"),
-    "study": (["study.yaml", "--output", "o.csv", "--plots", "new/p"], "experiments.study.executors.run_study_locally"),
+    "study": (["study.yaml", "--output", "o.csv", "--plots", "new/p"], "experiments.study.study.run_study_locally"),
     "tune": (["--arm", "mtml", "--output", "o.yaml", "--plots", "new/p"], "experiments.tuning.tuning.tune_arm"),
     "reproduce": (["fig7", "--output", "new/p"], "reports.reproduction.run.reproduce"),
 }

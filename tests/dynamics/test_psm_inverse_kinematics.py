@@ -5,7 +5,7 @@ import pytest
 from pydrake.math import RigidTransform
 from teleoperation_loop import MTM, PSM, Q_F, tip
 
-from dvrk_drake.dynamics.psm_inverse_kinematics import PsmInverseKinematics
+from dvrk_drake.dynamics.kinematics import PsmInverseKinematics
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 

@@ -23,8 +23,13 @@ from dvrk_drake.experiments.reproduction.drift_experiment import (
 )
 from dvrk_drake.experiments.reproduction.laboratory import Extent, Identified, Laboratory
 from dvrk_drake.experiments.reproduction.mechanisms import mechanism_errors, published_row, recomputed_table
-from dvrk_drake.experiments.reproduction.published import paper_model, paper_torque, with_zeroed
-from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM, PaperRecordings
+from dvrk_drake.experiments.reproduction.published import (
+    PAPER_ARM,
+    PaperRecordings,
+    paper_model,
+    paper_torque,
+    with_zeroed,
+)
 from dvrk_drake.experiments.reproduction.step_response import (
     PERIOD,
     paper_simulated_arm,
@@ -37,8 +42,8 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.recordings.recording import Recording, read_recording
 from dvrk_drake.reports.reproduction import run
-from dvrk_drake.reports.reproduction.dh_table import reproduce_table_1
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5
+from dvrk_drake.reports.reproduction.mechanisms import reproduce_table_1
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, share, write_page
 from dvrk_drake.reports.reproduction.run import NAMES, reproduce
 from dvrk_drake.reports.reproduction.transparency import reproduce_transparency

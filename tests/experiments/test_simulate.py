@@ -7,8 +7,7 @@ from repository import ROOT
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ScenarioError
-from dvrk_drake.experiments.scenario import Scenario, Target
-from dvrk_drake.experiments.scenario_file import load_scenario
+from dvrk_drake.experiments.scenario import Scenario, Target, load_scenario
 from dvrk_drake.experiments.simulation import simulate
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions

@@ -7,8 +7,8 @@ import pytest
 from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.arm_frame import handle_frame
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.kinematics import handle_frame
 from dvrk_drake.errors import ScenarioError
 from dvrk_drake.experiments.transparency import Compensation, feel, rambling_path, recorded_path
 from dvrk_drake.models.arm import load_arm

@@ -12,9 +12,9 @@ from scipy.optimize import brentq
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
-from dvrk_drake.experiments.scenario_file import load_scenario
-from dvrk_drake.experiments.study.executors import local_executor
-from dvrk_drake.experiments.tuning.bench import Bench, JointOnBench, Response
+from dvrk_drake.experiments.scenario import load_scenario
+from dvrk_drake.experiments.study.study import local_executor
+from dvrk_drake.experiments.tuning.bench import Bench, JointOnBench, Response, band, published_gains, step_size
 from dvrk_drake.experiments.tuning.model_based import (
     GAIN_MARGIN,
     PHASE_MARGIN,
@@ -27,7 +27,6 @@ from dvrk_drake.experiments.tuning.model_based import (
 )
 from dvrk_drake.experiments.tuning.procedure import RELEASE, find_ultimate_gain, judge_oscillation, tune_joint
 from dvrk_drake.experiments.tuning.sampled_loop import SampledLoop, Sampling, place
-from dvrk_drake.experiments.tuning.settings import band, published_gains, step_size
 from dvrk_drake.experiments.tuning.tuning import (
     CONDITIONS,
     DURATION,
@@ -39,9 +38,8 @@ from dvrk_drake.experiments.tuning.tuning import (
 )
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.models.arm_schema import Gains, load_gains, save_gains
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, DriveEffect
-from dvrk_drake.models.gains_file import load_gains, save_gains
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.reports.tuning import plot_steps, print_tuning
 

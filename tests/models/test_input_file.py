@@ -14,19 +14,18 @@ from recordings import HEADER, ROW, random_recording
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError, RecordingError
-from dvrk_drake.experiments.scenario_file import load_scenario
+from dvrk_drake.experiments.scenario import load_scenario
 from dvrk_drake.experiments.study.study_file import load_study
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.arm_schema import load_gains
 from dvrk_drake.models.files import LARGEST_TEXT
-from dvrk_drake.models.gains_file import load_gains
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 from dvrk_drake.models.typed_yaml import parse_yaml
 from dvrk_drake.processes.simulated_arm import load_driver
 from dvrk_drake.recordings import csv_rows, recording
-from dvrk_drake.recordings.collection_file import CollectionFile
 from dvrk_drake.recordings.conversion import convert
-from dvrk_drake.recordings.pose_file import load_poses
+from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
 from dvrk_drake.recordings.recording import read_recording, write_recording
 
 ARM = load_arm("mtml")

@@ -11,14 +11,13 @@ from dvrk_drake.analysis.static.validation import validate
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, ModelError
-from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM
+from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
     CompensationOptions,
     compensation_from_model,
     controller_torque,
 )
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile, compare_compensation
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, mirror_links

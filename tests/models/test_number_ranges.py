@@ -16,14 +16,21 @@ from guard_bench import Weightless
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, ControllerError, ModelError, ScenarioError, StationError
-from dvrk_drake.experiments.scenario import Scenario
-from dvrk_drake.experiments.scenario_file import load_scenario
+from dvrk_drake.experiments.scenario import Scenario, load_scenario
 from dvrk_drake.experiments.study.study_file import Study
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.arm_schema import ANGLES, EFFORTS, ArmDescription, CoupledLimit, Gains, Instrument, Mechanism
+from dvrk_drake.models.arm_schema import (
+    ANGLES,
+    EFFORTS,
+    ArmDescription,
+    CoupledLimit,
+    Gains,
+    Instrument,
+    Mechanism,
+    load_gains,
+)
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, FrictionEffect
-from dvrk_drake.models.gains_file import load_gains
 from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, schema_fault, within
 from dvrk_drake.models.sdf_model import _RANGES, MODELS_FOLDER
 from dvrk_drake.processes.collector import CollectionSettings

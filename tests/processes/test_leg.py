@@ -8,7 +8,7 @@ from sticky_arm import random_poses
 
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.coupled_limits import beside
-from dvrk_drake.processes.leg import Leg, RestDetector
+from dvrk_drake.processes.teacher import Leg, RestDetector
 
 ARMS = ("mtml", "psm")
 

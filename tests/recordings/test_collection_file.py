@@ -10,7 +10,7 @@ from sticky_arm import random_poses
 
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.recordings.collection_file import CollectionFile
+from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.recordings.recording import read_recording
 
 ARMS = ("mtml", "psm")
@@ -81,7 +81,7 @@ def test_an_output_of_something_else_is_refused_and_stays(tmp_path):
 def test_all_that_was_written_survives_kill(tmp_path):
     """A process that appends until it is killed: whole rows, in order, no gap."""
     code = (
-        "import sys\nfrom dvrk_drake.recordings.growing_file import GrowingFile\n"
+        "import sys\nfrom dvrk_drake.recordings.csv_rows import GrowingFile\n"
         "file, k = GrowingFile(sys.argv[1], sync=True), 0\n"
         "while True:\n    file.append(b'%d,%s\\n' % (k, b'x' * 4000)); k += 1\n    print(k, flush=True)\n"
     )
@@ -100,7 +100,7 @@ def test_all_that_was_written_survives_kill(tmp_path):
 
 def test_a_full_disk_leaves_whole_rows(tmp_path):
     code = (
-        "import resource, signal, sys\nfrom dvrk_drake.recordings.growing_file import GrowingFile\n"
+        "import resource, signal, sys\nfrom dvrk_drake.recordings.csv_rows import GrowingFile\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1050, 1050))\n"
         "file = GrowingFile(sys.argv[1], sync=True)\n"

@@ -14,8 +14,7 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.conversion import convert
-from dvrk_drake.recordings.lcm_log_reader import LcmLogReader
-from dvrk_drake.recordings.lcm_status_log import StatusStream
+from dvrk_drake.recordings.lcm_log_reader import LcmLogReader, StatusStream
 from dvrk_drake.recordings.recording import read_recording
 from dvrk_drake.recordings.recording_stream import check_stream_output, open_recording_file
 

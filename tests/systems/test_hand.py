@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from dvrk_drake.dynamics.arm_frame import ArmFrame
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ArmError, StationError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions

@@ -15,8 +15,7 @@ from patience import PATIENCE, wait_until
 from status_logs import ARM, log_bytes, statuses
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.recordings.lcm_log_reader import LcmLogReader
-from dvrk_drake.recordings.lcm_status_log import measurements
+from dvrk_drake.recordings.lcm_log_reader import LcmLogReader, measurements
 from dvrk_drake.recordings.recording import read_recording
 
 TOOLS = Path(lcm.__file__).parents[1] / "bin"  # the programs themselves: those on the PATH start them as children

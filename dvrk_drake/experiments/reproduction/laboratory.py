@@ -15,8 +15,13 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.reproduction.drift_experiment import DURATION, Drifts, Release, release_all
-from dvrk_drake.experiments.reproduction.published import FIGURE_7_FAULTY, paper_model, with_zeroed
-from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM, PaperRecordings
+from dvrk_drake.experiments.reproduction.published import (
+    FIGURE_7_FAULTY,
+    PAPER_ARM,
+    PaperRecordings,
+    paper_model,
+    with_zeroed,
+)
 from dvrk_drake.experiments.reproduction.true_arms import KnownTruth, collect, paper_arm, unlike_its_drawing
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.recording import Recording, write_recording

@@ -1,4 +1,4 @@
-"""What the paper publishes, and what its team's own files say: the numbers that ours stand beside.
+"""The paper's published numbers and its recordings.
 
 `paper_model` makes a model of the paper's twelve parameters, which our controller runs.
 
@@ -9,7 +9,10 @@ team's repository WPI-AIM/dvrk_gravity_comp. Drifts are read off the team's plot
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.tree import JacobianWrtVariable
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
+from dvrk_drake.recordings.recording import Recording, read_recording
 
 #: Real lengths of Table I's symbols [m]; L1 is of no joint's concern and 0 in the SDF.
 LENGTHS = {"0": 0.0, "L1": 0.0, "L2": 0.2794, "L3": 0.3645, "L4": 0.1506}
@@ -127,3 +132,65 @@ def with_zeroed(model: IdentifiedModel, joints: Sequence[int]) -> IdentifiedMode
     """The model with no torque on `joints` (from 0), as the paper's Fig. 6 has it."""
     statistics = [dataclasses.replace(s, trust=0.0) if j in joints else s for j, s in enumerate(model.joints)]
     return dataclasses.replace(model, joints=statistics)
+
+
+#: The paper's identification set; the squared errors behind its Fig. 4, if somebody has them.
+STATIC, FIGURE_4 = "mtm_2015_good72.csv", "paper_fig4_squared_errors.csv"
+#: The arm that was recorded: a right one, by the moment of its wrist's brackets (docs/public_recordings.md).
+PAPER_ARM = "mtmr"
+#: Names the folder above data/mtm_static, as the tests have it.
+VARIABLE = "DVRK_DRAKE_SHARED"
+
+
+@dataclass(frozen=True)
+class PaperRecordings:
+    """The files in `folder`; `folder` is None where there is none."""
+
+    folder: Path | None
+
+    @classmethod
+    def find(cls, folder: str | Path | None) -> PaperRecordings:
+        """In `folder`, else below the folder that the environment variable DVRK_DRAKE_SHARED names.
+
+        Raises:
+            RecordingError: `folder` was given and has no such recording.
+        """
+        if folder is not None:
+            if not (Path(folder) / STATIC).is_file():
+                raise RecordingError(f"{folder}: no {STATIC} there; {_where_from()}")
+            return cls(Path(folder))
+        shared = os.environ.get(VARIABLE)
+        below = Path(shared) / "data" / "mtm_static" if shared else None
+        return cls(below if below is not None and (below / STATIC).is_file() else None)
+
+    @property
+    def poses(self) -> Recording:
+        """The paper's 72 poses.
+
+        Raises:
+            RecordingError: there are none.
+        """
+        if self.folder is None:
+            raise RecordingError(f"needs {STATIC}: name its folder with --data; {_where_from()}")
+        return read_recording(self.folder / STATIC)
+
+    @property
+    def figure_4(self) -> NDArray[np.float64] | None:
+        """(72, 6) squared errors [(N m)^2] of J2..J7 as published, or None.
+
+        Raises:
+            RecordingError: the file is not that.
+        """
+        if self.folder is None or not (path := self.folder / FIGURE_4).is_file():
+            return None
+        try:
+            table = np.loadtxt(path, delimiter=",", skiprows=1)
+        except ValueError as error:
+            raise RecordingError(f"{path}: {error}") from error
+        if table.shape != (72, 7):
+            raise RecordingError(f"{path}: must be 72 rows of pose, J2..J7; it is {table.shape}")
+        return np.asarray(table[:, 1:])
+
+
+def _where_from() -> str:
+    return "docs/public_recordings.md says how to make it from the team's repository"

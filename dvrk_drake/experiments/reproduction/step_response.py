@@ -16,7 +16,7 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.experiments.reproduction import published
-from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM
+from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.files import atomic_write

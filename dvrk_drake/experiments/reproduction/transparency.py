@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM
+from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.transparency import Compensation, Felt, feel, rambling_path
 from dvrk_drake.models.arm import Arm, load_arm
 

@@ -16,7 +16,7 @@ from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.dynamics.model_links import model_bodies
-from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM
+from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.static_pose_collection import collect_static_poses
 from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm, load_arm

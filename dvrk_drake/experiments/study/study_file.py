@@ -19,8 +19,7 @@ import numpy as np
 from pydrake.common.yaml import yaml_dump_typed
 
 from dvrk_drake.errors import DvrkDrakeError, StudyError
-from dvrk_drake.experiments.scenario import Scenario, check_pose
-from dvrk_drake.experiments.scenario_file import load_scenario
+from dvrk_drake.experiments.scenario import Scenario, check_pose, load_scenario
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.schema_fault import number_fault, within

@@ -1,4 +1,4 @@
-"""The results of a study as a file: a row a run as they come, whole whatever ends the process, sorted in the end."""
+"""The results of a study: a file with a row per run, whole whatever ends the process, and their summary."""
 
 from __future__ import annotations
 
@@ -11,11 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binomtest
+
 from dvrk_drake.errors import StudyError
+from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import Case, Study
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.recordings.csv_rows import read_bytes
-from dvrk_drake.recordings.growing_file import GrowingFile
+from dvrk_drake.recordings.csv_rows import GrowingFile, read_bytes
 from dvrk_drake.recordings.recording import column_names
 
 
@@ -208,3 +212,59 @@ def _finished_rows(path: Path, study: Study) -> dict[int, Row]:
         raise StudyError(f"{path}: was made by another study; name another output")
     names = [measure.column for measure in study.measures]
     return {row["case"]: Row({} if row["error"] else {n: row[n] for n in names}, row["error"] or "") for row in content}
+
+
+@dataclass(frozen=True)
+class Share:
+    """How many of `runs` answered yes; `lower`..`upper`: Wilson's 95 % interval of the share, for independent runs."""
+
+    yes: int
+    runs: int
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class Quantiles:
+    """Of one number of all runs, each the number of a run; a run that failed counts as infinite."""
+
+    median: float
+    percentile_95: float
+    largest: float
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Of one variation: how many of its `runs` failed, and each measure by its column."""
+
+    variation: str
+    runs: int
+    failed: int
+    measures: dict[str, Share | Quantiles]
+
+
+def summarise(study: Study, rows: Mapping[int, Row]) -> list[Summary]:
+    """One a variation, over the cases that have a row in `rows`; variations without any are left out."""
+    summaries = []
+    for variation in study.variations:
+        of_it = [rows[c.index] for c in study.cases if c.variation == variation.name and c.index in rows]
+        if of_it:
+            measures = {measure.column: _summary_of(measure, of_it) for measure in study.measures}
+            summaries.append(Summary(variation.name, len(of_it), sum(bool(row.error) for row in of_it), measures))
+    return summaries
+
+
+def values_of(measure: Measure, rows: list[Row]) -> NDArray[np.float64]:
+    """(m,) of each run; of one that failed, the worst."""
+    return np.array([row.values.get(measure.column, measure.worst) for row in rows], float)
+
+
+def _summary_of(measure: Measure, rows: list[Row]) -> Share | Quantiles:
+    values = values_of(measure, rows)
+    if measure.is_answer:
+        yes = int(values.sum())
+        interval = binomtest(yes, len(values)).proportion_ci(method="wilson")
+        return Share(yes, len(values), float(interval.low), float(interval.high))
+    # Values of runs, not between runs: infinite ones have no middle.
+    median, percentile_95 = np.quantile(values, [0.5, 0.95], method="inverted_cdf")
+    return Quantiles(float(median), float(percentile_95), float(values.max()))

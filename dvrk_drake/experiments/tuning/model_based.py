@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.errors import ControllerError
+from dvrk_drake.experiments.tuning.bench import band, counts, effort_limits, rounded_gains
 from dvrk_drake.experiments.tuning.sampled_loop import Margins, SampledLoop, Sampling, place
-from dvrk_drake.experiments.tuning.settings import band, counts, effort_limits, rounded_gains
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.plant import holding_torques, make_arm_plant, set_arm_positions, tree_selector

@@ -10,11 +10,22 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.experiments.study.executors import local_executor
-from dvrk_drake.experiments.tuning.bench import NOMINAL, Bench, Condition, JointOnBench, Response, bench_of
+from dvrk_drake.experiments.study.study import local_executor
+from dvrk_drake.experiments.tuning.bench import (
+    NOMINAL,
+    Bench,
+    Condition,
+    JointOnBench,
+    Response,
+    band,
+    bench_of,
+    published_gains,
+    rounded_gains,
+    step_size,
+    tuning_poses,
+)
 from dvrk_drake.experiments.tuning.model_based import ArmDesign, design_arm
 from dvrk_drake.experiments.tuning.procedure import JointProcedure, tune_joint
-from dvrk_drake.experiments.tuning.settings import band, published_gains, rounded_gains, step_size, tuning_poses
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
 

@@ -14,7 +14,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.reproduction import published
 from dvrk_drake.experiments.reproduction.drift_experiment import APPROACH, BAND, RESTING, SAMPLE_PERIOD, Drifts
 from dvrk_drake.experiments.reproduction.laboratory import Laboratory
-from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM
+from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.tuning.model_based import friction
 from dvrk_drake.models.effects_schema import EFFECT_NAMES
 from dvrk_drake.reports.figures import MEASURED_COLOUR, MODEL_COLOUR, save_figure

@@ -7,12 +7,11 @@ from pathlib import Path
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.experiments.reproduction.laboratory import Extent, Laboratory
-from dvrk_drake.experiments.reproduction.recordings import PaperRecordings
-from dvrk_drake.experiments.study.executors import local_executor
-from dvrk_drake.reports.reproduction.dh_table import reproduce_table_1
+from dvrk_drake.experiments.reproduction.published import PaperRecordings
+from dvrk_drake.experiments.study.study import local_executor
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, reproduce_figure_6
+from dvrk_drake.reports.reproduction.mechanisms import reproduce_psm, reproduce_table_1
 from dvrk_drake.reports.reproduction.page import Section, write_page
-from dvrk_drake.reports.reproduction.psm import reproduce_psm
 from dvrk_drake.reports.reproduction.step_response import reproduce_figure_7
 from dvrk_drake.reports.reproduction.torque_errors import reproduce_figure_4
 from dvrk_drake.reports.reproduction.transparency import reproduce_transparency

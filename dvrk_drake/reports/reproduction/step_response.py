@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.experiments.reproduction import published
 from dvrk_drake.experiments.reproduction.laboratory import Laboratory
-from dvrk_drake.experiments.reproduction.recordings import PAPER_ARM
+from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.reproduction.step_response import (
     DURATION,
     LINK_INERTIA,

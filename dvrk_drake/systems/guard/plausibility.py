@@ -25,7 +25,7 @@ _COUNTS = 3.0
 
 
 class ArmModel(Protocol):
-    """Model of the arm that the guard needs, such as `dvrk_drake.dynamics.control_model.ControlModel`."""
+    """Model of the arm that the guard needs, such as `dvrk_drake.dynamics.identified_model.ControlModel`."""
 
     def gravity_effort(self, q: Vector) -> Vector:
         """Returns the effort (n,) [N m, N] that holds the arm at q (n,) [rad, m]."""

@@ -8,8 +8,7 @@ from pydrake.lcm import DrakeLcmInterface
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.lcm import LcmPublisherSystem
 
-from dvrk_drake.dynamics.control_model import ControlModel
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel

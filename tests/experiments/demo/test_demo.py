@@ -14,7 +14,7 @@ from dvrk_drake.experiments.static_pose_collection import visiting_trajectory
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.recordings.recording import read_recording
-from dvrk_drake.reports import demo as demo_figures
+from dvrk_drake.reports import figures as demo_figures
 from dvrk_drake.reports.terminal_tables import print_demo
 
 

@@ -14,8 +14,7 @@ import pytest
 from patience import PATIENCE, wait_until
 
 import dvrk_drake.experiments.study.study as study_module
-from dvrk_drake.experiments.study.executors import dask_executor
-from dvrk_drake.experiments.study.study import run_study
+from dvrk_drake.experiments.study.study import dask_executor, run_study
 from dvrk_drake.experiments.study.study_file import load_study
 
 pytestmark = pytest.mark.slow

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from real_arm import ARMS
 
-from dvrk_drake.dynamics.arm_frame import ArmFrame
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ArmError, ScenarioError, StationError
-from dvrk_drake.experiments.scenario import HandScenario
-from dvrk_drake.experiments.scenario_file import load_scenario
+from dvrk_drake.experiments.scenario import HandScenario, load_scenario
 from dvrk_drake.experiments.simulation import simulate
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.effects_schema import EFFECT_NAMES, ArmEffects, FrictionEffect

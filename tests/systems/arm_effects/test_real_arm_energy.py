@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 from real_arm import STEP, middle, weightless
 
 from dvrk_drake.dynamics.actuator_effects import joint_row
-from dvrk_drake.dynamics.arm_frame import ArmFrame
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.hand import Grip, Hand
 

@@ -5,8 +5,7 @@ import pytest
 from guard_bench import ARM, LIMIT, Bench, Heavy, N, Q, Weightless
 
 from dvrk_drake.analysis.signals.true_time import true_time
-from dvrk_drake.dynamics.control_model import ControlModel
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm

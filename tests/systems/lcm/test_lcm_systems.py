@@ -9,8 +9,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.lcm import LcmSubscriberSystem
 
-from dvrk_drake.dynamics.control_model import ControlModel
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
