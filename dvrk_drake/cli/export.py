@@ -157,7 +157,8 @@ def _kinematic_writer(model: IdentifiedModel, path: str, options: argparse.Names
 
 
 def _compare(options: argparse.Namespace) -> None:
-    from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile, compare_compensation
+    from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
+    from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
     from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.export import plot_compensation, print_comparison
     from dvrk_drake.reports.terminal_tables import make_console

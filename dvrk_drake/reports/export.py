@@ -15,7 +15,8 @@ from rich.table import Table
 
 from dvrk_drake.dynamics.model_links import ModelBodies
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import MTM_JOINTS
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import CompensationComparison, GravityCompensationFile
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import CompensationComparison
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import ARM_JOINTS, NAMES, KinematicCompensation
 from dvrk_drake.export.sdf import LinkChange
 from dvrk_drake.models.arm import Arm

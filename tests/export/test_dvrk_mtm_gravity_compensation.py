@@ -20,7 +20,8 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
     largest_differences,
     unclipped_torque,
 )
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile, compare_compensation
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.reports.export import plot_compensation
 

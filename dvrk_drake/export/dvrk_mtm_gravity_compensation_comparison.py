@@ -1,0 +1,199 @@
+"""Where the dVRK's installed gravity compensation of a master arm is no model of its gravity."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ModelError
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
+    MTM_JOINTS,
+    NUM_GRAVITY,
+    controller_regressor,
+    controller_torque,
+    unclipped_torque,
+)
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import NUM_JOINTS, GravityCompensationFile
+from dvrk_drake.models.arm import known_arms
+
+#: Signs of the joints, and of their torques, in the mirror image of an arm: a left MTM's wrist is a right one's.
+_MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
+#: Joints whose torque tells the side: shoulder_pitch, elbow_pitch and wrist_platform carry the wrist's brackets.
+_TELLS_SIDE = slice(1, 4)
+#: The mirror image fits clearly better if its error is below this share; of the four public files the wrong
+#: side has 1.8 to 2.1 times the error of the right one.
+_CLEARLY_BETTER = 0.8
+_LEAST_POSES = 200
+#: A torque below this share of the model's largest on that joint has no sign that matters.
+SIGN_SHARE = 0.1
+POSES = 20000
+
+
+@dataclass(frozen=True)
+class JointComparison:
+    """One joint over the joint box, at rest; torques in N m, shares 0..1 of the poses.
+
+    Attributes:
+        name: of the joint.
+        model_lower, model_upper: range of the model's torque.
+        file_lower, file_upper: range of the file's torque before its clip.
+        clip_lower, clip_upper: the file's limits.
+        clipped: share of poses at which the clip is active: there the file's torque is a constant.
+        opposed: share of poses at which file (clipped) and model push opposite ways, both by more than a tenth of the
+            model's largest torque.
+        runaway: share of poses at which the file (unclipped) lies outside the model's range widened by half of it on
+            both sides: a torque that the model has nowhere on this joint. Not of the last joint, which no file has.
+        polynomial: largest |torque| of the file's polynomial in the joint's own position, constant left out.
+        rms_inside, rms_outside: RMS of file (clipped) less model inside and outside of the sweep that the file says
+            its data are from; if it does not say, all poses are outside. NaN where there are no such poses.
+    """
+
+    name: str
+    model_lower: float
+    model_upper: float
+    file_lower: float
+    file_upper: float
+    clip_lower: float
+    clip_upper: float
+    clipped: float
+    opposed: float
+    runaway: float
+    polynomial: float
+    rms_inside: float
+    rms_outside: float
+
+
+@dataclass(frozen=True, eq=False)
+class CompensationComparison:
+    """A file and a model at the same random poses of the joint box.
+
+    Attributes:
+        file, model: what was compared.
+        joints: one a joint.
+        q: (m, 7) poses [rad], inside the joint box and the coupled limits.
+        model_torque, file_torque, clipped_torque: (m, 7) [N m] at rest; `file_torque` before the clip.
+        clipped, opposed, runaway: (m, 7) True where `JointComparison` counts the pose.
+        in_sweep: (m,) True where all of the first six joints are inside the file's sweep.
+        other_side: the mirror image of the model fits the file clearly better: the file is one of the other side's arm.
+    """
+
+    file: GravityCompensationFile
+    model: IdentifiedModel
+    joints: list[JointComparison]
+    q: NDArray[np.float64]
+    model_torque: NDArray[np.float64]
+    file_torque: NDArray[np.float64]
+    clipped_torque: NDArray[np.float64]
+    clipped: NDArray[np.bool_]
+    opposed: NDArray[np.bool_]
+    runaway: NDArray[np.bool_]
+    in_sweep: NDArray[np.bool_]
+    other_side: bool
+
+    def as_dict(self) -> dict:
+        """For JSON; NaN becomes None."""
+        joints = [{k: None if v != v else v for k, v in asdict(j).items()} for j in self.joints]
+        return {
+            "poses": len(self.q),
+            "other_side": self.other_side,
+            "share_in_sweep": float(self.in_sweep.mean()),
+            "joints": joints,
+        }
+
+
+def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) -> CompensationComparison:
+    """Compares at random poses, uniform in the joint box and inside the coupled limits.
+
+    Raises:
+        ModelError: the model is not of an MTM, or the file is named as one of another arm of this project.
+    """
+    arm = model.load_arm()
+    if arm.joint_names != MTM_JOINTS:
+        raise ModelError(f"{arm.name}: a gravity-compensation file of the dVRK is one of an MTM; joints differ")
+    known = [name.upper() for name in known_arms()]
+    if file.arm_name.upper() != arm.name.upper() and {file.arm_name.upper(), arm.name.upper()} <= set(known):
+        raise ModelError(
+            f"the file is of {file.arm_name}, by its ARM_NAME or its file name, but the model is of {arm.name}, and "
+            f"their torques differ. Use a model of {file.arm_name}; if the name is wrong, correct it in the file"
+        )
+    q = arm.sample_poses(POSES, np.random.default_rng(0))
+    tau_model, tau_raw, tau_clipped = model.holding_torque(q), unclipped_torque(file, q), controller_torque(file, q)
+    half_range = 0.5 * np.ptp(tau_model, axis=0)
+    least = SIGN_SHARE * np.abs(tau_model).max(axis=0)
+    clipped = tau_raw != tau_clipped
+    opposed = (tau_model * tau_clipped < 0) & (np.abs(tau_model) > least) & (np.abs(tau_clipped) > least)
+    runaway = (tau_raw < tau_model.min(axis=0) - half_range) | (tau_raw > tau_model.max(axis=0) + half_range)
+    # A joint without gravity has no range to leave, and for the last joint the file says nothing.
+    judged = (half_range > 1e-9) & (np.arange(NUM_JOINTS) < NUM_JOINTS - 1)
+    runaway, opposed = runaway & judged, opposed & judged
+    in_sweep = np.zeros(len(q), dtype=bool)
+    if file.sweep is not None:
+        # The last joint does not enter the file's torque.
+        in_sweep = np.all(
+            (q >= file.sweep[0]) & (q <= file.sweep[1]), axis=1, where=np.arange(NUM_JOINTS) < NUM_JOINTS - 1
+        )
+    polynomial = _polynomial_torque(file, q)
+    error = tau_clipped - tau_model
+    joints = [
+        JointComparison(
+            name=name,
+            model_lower=float(tau_model[:, j].min()),
+            model_upper=float(tau_model[:, j].max()),
+            file_lower=float(tau_raw[:, j].min()),
+            file_upper=float(tau_raw[:, j].max()),
+            clip_lower=float(file.torque_lower[j]),
+            clip_upper=float(file.torque_upper[j]),
+            clipped=float(clipped[:, j].mean()),
+            opposed=float(opposed[:, j].mean()),
+            runaway=float(runaway[:, j].mean()),
+            polynomial=float(np.abs(polynomial[:, j]).max()),
+            rms_inside=_rms(error[in_sweep, j]),
+            rms_outside=_rms(error[~in_sweep, j]),
+        )
+        for j, name in enumerate(arm.joint_names)
+    ]
+    return CompensationComparison(
+        file,
+        model,
+        joints,
+        q,
+        tau_model,
+        tau_raw,
+        tau_clipped,
+        clipped,
+        opposed,
+        runaway,
+        in_sweep,
+        other_side=_is_of_other_side(model, q, tau_clipped, in_sweep),
+    )
+
+
+def _is_of_other_side(
+    model: IdentifiedModel, q: NDArray[np.float64], tau_file: NDArray[np.float64], in_sweep: NDArray[np.bool_]
+) -> bool:
+    """Whether the mirror image of the model fits a file's torque clearly better, where the file has data if it says."""
+    if np.count_nonzero(in_sweep) >= _LEAST_POSES:
+        q, tau_file = q[in_sweep], tau_file[in_sweep]
+    own, mirrored = model.holding_torque(q), _MIRROR * model.holding_torque(_MIRROR * q)
+    return _side_error(tau_file, mirrored) < _CLEARLY_BETTER * _side_error(tau_file, own)
+
+
+def _side_error(tau_file: NDArray[np.float64], tau_model: NDArray[np.float64]) -> float:
+    """RMS error over the joints that tell the side, each as a share of the RMS of the file's torque."""
+    size = np.sqrt(np.mean(tau_file[:, _TELLS_SIDE] ** 2, axis=0)) + 1e-12
+    return _rms((tau_file - tau_model)[:, _TELLS_SIDE] / size)
+
+
+def _polynomial_torque(file: GravityCompensationFile, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(m, 7) what the powers q .. q^4 add at rest [N m]."""
+    parameters = (file.positive + file.negative) / 2
+    parameters[:NUM_GRAVITY] = 0.0
+    parameters[NUM_GRAVITY::5] = 0.0
+    return controller_regressor(q) @ parameters
+
+
+def _rms(x: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(x**2))) if len(x) else float("nan")
