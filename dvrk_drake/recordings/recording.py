@@ -29,6 +29,8 @@ LIMIT_TOLERANCE = 0.2, 0.02
 LARGEST = 1e6
 #: Most rows of a CSV; 15 min at 1 kHz. With these, `check` takes 1.5 GB.
 LARGEST_COUNT = 900_000
+#: Fewest rows of a motion, and the median interval below which rows are samples of one [s].
+LEAST_ROWS, LONGEST_PERIOD = 100, 0.05
 #: RMS joint speed above which a recording counts as a motion [rad/s], [m/s].
 REST_SPEED = 0.05, 0.005
 #: Poses whose joints all agree this well are one pose [rad], [m].
@@ -69,6 +71,20 @@ class Recording:
         source = self.source or "recording"
         return f"{source}:{self.lines[row]}" if self.lines is not None else f"{source}: row {row + 1}"
 
+    @property
+    def is_motion(self) -> bool:
+        """Whether its rows are samples of a motion: `LEAST_ROWS` or more, closer than `LONGEST_PERIOD` in time.
+
+        Times may go back, see `has_increasing_times`; whether the arm moves tells `motion`.
+        """
+        t = self.t
+        return t is not None and len(t) >= LEAST_ROWS and float(np.median(np.abs(np.diff(t)))) < LONGEST_PERIOD
+
+    @property
+    def has_increasing_times(self) -> bool:
+        """Whether it has times, and each is later than the one before."""
+        return self.t is not None and bool(np.all(np.diff(self.t) > 0))
+
     def motion(self, arm: Arm) -> str:
         """Which joint moves most and how fast, e.g. "joint 1 at 0.2 rad/s RMS"; empty if all rest, or nothing tells.
 
@@ -76,7 +92,7 @@ class Recording:
         """
         if self.qd is not None:
             qd = self.qd
-        elif self.t is not None and len(self) > 1 and np.all(np.diff(self.t) > 0) and np.median(np.diff(self.t)) < 0.1:
+        elif self.t is not None and len(self) > 1 and self.has_increasing_times and np.median(np.diff(self.t)) < 0.1:
             qd = np.diff(self.q, axis=0) / np.diff(self.t)[:, None]
         else:
             return ""

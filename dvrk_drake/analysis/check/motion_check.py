@@ -10,14 +10,19 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport
 from dvrk_drake.analysis.signals.effort_lag import LAG_STEP, LONGEST_LAG, EffortLag, effort_lag
 from dvrk_drake.analysis.signals.low_pass import resample
-from dvrk_drake.analysis.signals.motion_signals import MotionSignals, motion_signals
+from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionSignals, motion_signals
 from dvrk_drake.analysis.signals.noise import cut_offs, narrow_band, spectra
 from dvrk_drake.analysis.signals.repetition import find_period, repeatability_floor
-from dvrk_drake.analysis.signals.static_segments import LONGEST_PERIOD
-from dvrk_drake.analysis.signals.true_time import TrueTime, repeated_block, repeated_rows, true_time
-from dvrk_drake.analysis.signals.velocity_agreement import VelocityAgreement, velocity_agreement
+from dvrk_drake.analysis.signals.true_time import (
+    TrueTime,
+    VelocityAgreement,
+    repeated_block,
+    repeated_rows,
+    true_time,
+    velocity_agreement,
+)
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import REST_SPEED, Recording
+from dvrk_drake.recordings.recording import LONGEST_PERIOD, REST_SPEED, Recording
 
 #: Below this share, repeated rows are chance.
 LEAST_REPEATED = 0.005
@@ -52,7 +57,7 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
         what = f"{duration:.3g} s at {rate:.3g} Hz"
         advice = f"lags, noise and repetition are judged from {LEAST_DURATION:g} s at {2 / LONGEST_PERIOD:g} Hz on"
         return report, [*findings, Finding("warning", "short or slow", "t", what, advice, size=duration)]
-    signals = motion_signals(actuators, 20.0, rate=min(rate, 400.0))
+    signals = motion_signals(actuators, 20.0, rate=min(rate, GRID_RATE))
     moving = np.sqrt(np.mean(signals.v**2, axis=0)) > arm.per_joint(*REST_SPEED)
     agreement = _agreement(actuators, clock, signals)
     lags = effort_lag(signals, moving)

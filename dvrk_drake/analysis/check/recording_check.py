@@ -12,12 +12,12 @@ from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingR
 from dvrk_drake.analysis.check.motion_check import check_motion
 from dvrk_drake.analysis.check.pose_check import check_poses
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
-from dvrk_drake.analysis.signals.static_segments import LEAST_ROWS, LONGEST_PERIOD, find_poses
+from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.analysis.static.doubts import check_effort_unit
 from dvrk_drake.analysis.static.static_identification import usable_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import REST_SPEED, Recording
+from dvrk_drake.recordings.recording import LEAST_ROWS, REST_SPEED, Recording
 
 #: A joint that moves less has never moved [rad], [m].
 LEAST_RANGE = 0.02, 0.002
@@ -49,7 +49,7 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
         arm: which was recorded.
     """
     source = recording.source or "recording"
-    report = RecordingReport(source, arm.name, "motion" if _is_motion(recording) else "poses", len(recording))
+    report = RecordingReport(source, arm.name, "motion" if recording.is_motion else "poses", len(recording))
     findings = [Finding("note", "reading", source, note, "read the rest with that in mind") for note in recording.notes]
     try:
         joints = recording.in_joint_coordinates(arm)
@@ -73,12 +73,6 @@ def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
     else:
         findings += check_poses(recording, arm)
     return replace(report, findings=tuple(sorted(findings, key=lambda finding: _ORDER[finding.severity])))
-
-
-def _is_motion(recording: Recording) -> bool:
-    """Rows that follow each other closely, if not always forwards."""
-    t = recording.t
-    return t is not None and len(t) >= LEAST_ROWS and float(np.median(np.abs(np.diff(t)))) < LONGEST_PERIOD
 
 
 def _joint_signals(joints: Recording, arm: Arm) -> tuple[JointSignals, ...]:

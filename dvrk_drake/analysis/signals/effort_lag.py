@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.signals.low_pass import low_pass
-from dvrk_drake.analysis.signals.motion_signals import MotionSignals
+from dvrk_drake.analysis.signals.motion_grid import MotionSignals
 
 #: Of the low-pass that efforts and what explains them get [Hz].
 CUT_OFF = 20.0

@@ -8,19 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfiltfilt
 
+from dvrk_drake.analysis.signals.low_pass import low_pass
 from dvrk_drake.analysis.static.static_identification import LEAST_POSES, average_repeated_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import LEAST_ROWS, LONGEST_PERIOD, Recording
 
-#: Cut-off of the zero-phase low-pass for speeds [Hz], and its order.
+#: Cut-off of the zero-phase low-pass for speeds [Hz], at most half the rate of a motion, and its order.
 CUT_OFF, ORDER = 10.0, 4
-#: Samples further apart than this are no motion that can be followed [s].
-LONGEST_PERIOD = 0.5 / CUT_OFF
-#: Fewest rows of a motion.
-LEAST_ROWS = 100
 #: At rest: all joints slower than this [rad/s], [m/s], for this long [s], and within this of its begin [rad], [m].
 SLOWEST, LEAST_REST, SAME_REST = (0.02, 0.002), 0.3, (0.01, 0.001)
 
@@ -43,7 +39,7 @@ def rest_poses(recording: Recording, arm: Arm) -> Recording | None:
     """
     moving = recording.in_joint_coordinates(arm)
     t = moving.t
-    if t is None or not is_motion(moving):
+    if t is None or not (moving.is_motion and moving.has_increasing_times):
         return None
     tau = moving.measured_effort()
     v = smooth_velocity(moving)
@@ -63,20 +59,12 @@ def rest_poses(recording: Recording, arm: Arm) -> Recording | None:
     return average_repeated_poses(rests, arm)
 
 
-def is_motion(recording: Recording) -> bool:
-    """Whether its rows follow each other closely enough in time to be differentiated."""
-    t = recording.t
-    if t is None or len(t) < LEAST_ROWS or not np.all(np.diff(t) > 0):
-        return False
-    return float(np.median(np.diff(t))) < LONGEST_PERIOD
-
-
 def smooth_velocity(recording: Recording) -> NDArray[np.float64]:
     """(m, n) velocities of a motion below the cut-off, without delay."""
     t = np.asarray(recording.t)
     qd = np.gradient(recording.q, t, axis=0) if recording.qd is None else recording.qd
     rate = 1 / float(np.median(np.diff(t)))
-    return sosfiltfilt(butter(ORDER, CUT_OFF, fs=rate, output="sos"), qd, axis=0)
+    return low_pass(qd, rate, CUT_OFF, ORDER)
 
 
 def stationary_runs(
@@ -134,7 +122,7 @@ def slow_parts(recording: Recording, arm: Arm) -> SlowParts:
     moving = recording.in_joint_coordinates(arm)
     moving.measured_effort()
     where = recording.source or "recording"
-    if moving.qd is None or not is_motion(moving):
+    if moving.qd is None or not (moving.is_motion and moving.has_increasing_times):
         raise IdentificationError(
             f"{where}: slow parts need a motion: qd1..qd{arm.num_joints}, and t that increases by less than "
             f"{LONGEST_PERIOD} s, over {LEAST_ROWS} rows or more"
@@ -269,9 +257,9 @@ def find_poses(recording: Recording, arm: Arm, take_slow_parts: bool = False) ->
 def _check_times(recording: Recording, arm: Arm) -> None:
     """Refuses a motion whose times do not increase: it would be taken for poses."""
     t = recording.t
-    if t is None or len(t) < LEAST_ROWS or np.all(np.diff(t) > 0):
+    if t is None or len(t) < LEAST_ROWS or recording.has_increasing_times:
         return
-    if np.median(np.abs(np.diff(t))) < LONGEST_PERIOD or recording.motion(arm):
+    if recording.is_motion or recording.motion(arm):
         row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
         raise RecordingError(
             f"{recording.where(row)}: time t does not increase; rows of a motion must follow in time: sort them, and "

@@ -7,9 +7,8 @@ import pytest
 
 from dvrk_drake.analysis.signals.drive_efforts import refuse_opposite_efforts
 from dvrk_drake.analysis.signals.effort_lag import CUT_OFF, effort_lag
-from dvrk_drake.analysis.signals.motion_signals import MotionSignals, motion_signals
-from dvrk_drake.analysis.signals.true_time import increasing_times, repeated_rows, true_time
-from dvrk_drake.analysis.signals.velocity_agreement import velocity_agreement
+from dvrk_drake.analysis.signals.motion_grid import MotionSignals, motion_signals
+from dvrk_drake.analysis.signals.true_time import increasing_times, repeated_rows, true_time, velocity_agreement
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.recording import Recording
 

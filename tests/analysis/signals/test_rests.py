@@ -8,7 +8,6 @@ from rests import motion_with_rests
 
 from dvrk_drake.analysis.signals.static_segments import (
     find_poses,
-    is_motion,
     rest_poses,
     smooth_velocity,
     stationary_runs,
@@ -58,11 +57,12 @@ def test_rests_are_where_the_arm_was_put():
 def test_what_is_no_motion_has_no_rests():
     _, recording = moving()
     t = recording.t
-    assert is_motion(recording)
+    assert recording.is_motion and recording.has_increasing_times
     for other in (None, 20 * t, t[::-1], np.where(np.arange(len(t)) == 50, t[49], t)):
-        assert not is_motion(replace(recording, t=other))
+        poses = replace(recording, t=other)
+        assert not (poses.is_motion and poses.has_increasing_times)
         assert rest_poses(replace(recording, t=other), ARM) is None
-    assert not is_motion(Recording(q=recording.q[:99], t=t[:99]))
+    assert not Recording(q=recording.q[:99], t=t[:99]).is_motion
 
 
 def test_poses_come_from_rests_or_are_left_as_they_are():
