@@ -1,17 +1,18 @@
-"""Runs a scenario: an arm under control, simulated and recorded."""
+"""Runs a scenario: an arm under control, simulated and recorded; and samples of any simulation."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import TrajectorySource
+from pydrake.systems.primitives import LogVectorOutput, TrajectorySource, VectorLogSink
 from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
@@ -90,37 +91,59 @@ def simulate(
     builder = DiagramBuilder()
     add_closed_loop(builder, station, controller, desired, friction=_friction(scenario))
     hand = _add_hand(builder, station, scenario)
+    outputs = [station.GetOutputPort(f"{name}.{port}") for port in ("state_estimated", "effort_measured", "state_true")]
+    if hand is not None:
+        outputs.append(hand.GetOutputPort("spatial_force"))
+    logs = [LogVectorOutput(output, builder, scenario.sample_period) for output in outputs]
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     station.set_positions(context, poses[0])
     if meshcat is not None:
         simulator.set_target_realtime_rate(1.0)
-        meshcat.StartRecording()
-
-    samples = 1 + int(scenario.duration / scenario.sample_period + 1e-9)
-    t = scenario.sample_period * np.arange(samples, dtype=np.float64)
-    names = ("state_estimated", "effort_measured", "state_true")
-    sources = [(station.GetOutputPort(f"{name}.{port}"), context) for port in names]
-    if hand is not None:
-        sources.append((hand.GetOutputPort("spatial_force"), hand.GetMyContextFromRoot(simulator.get_context())))
-    rows = []
-    simulator.Initialize()
-    for sample in t:
-        if sample > 0:  # AdvanceTo(0) would make the plant's first step already
-            simulator.AdvanceTo(sample)
-        rows.append(np.concatenate([port.Eval(of) for port, of in sources]))
-        progress(sample / scenario.duration)
-    if meshcat is not None:
-        meshcat.StopRecording()
-        meshcat.PublishRecording()
-    n = arm.num_joints
-    q, qd, tau, state_true, hand_force = np.split(np.array(rows), [n, 2 * n, 3 * n, 5 * n], axis=1)
+    t = sample_times(scenario.duration, scenario.sample_period)
+    with recorded_in(meshcat):
+        advance(simulator, t, progress)
+    estimated, tau, state_true, *hand_forces = (samples(log, simulator) for log in logs)
+    q, qd = np.hsplit(estimated, 2)
     noise = np.random.default_rng(scenario.seed).normal(size=tau.shape)
     tau = tau + scenario.effort_noise * arm.effort_limits * noise
     recording = Recording(q=q, qd=qd, tau=tau, t=t, source="simulation")
-    if hand is None:
-        hand_force = np.zeros((samples, 6))
+    hand_force = hand_forces[0] if hand_forces else np.zeros((len(t), 6))
     return Simulation(recording, state_true, hand_force, trajectory.vector_values(t).T if holds else None)
+
+
+def sample_times(duration: float, period: float) -> NDArray[np.float64]:
+    """(m,) 0, period, ... up to `duration` [s], where a `LogVectorOutput` of this period has its samples."""
+    # Multiples, not sums: where rounding tells the time from that of a step, the step would count or not by chance.
+    return period * np.arange(1 + int(duration / period + 1e-9), dtype=np.float64)
+
+
+def advance(
+    simulator: Simulator, times: NDArray[np.float64], progress: Callable[[float], None] = lambda share: None
+) -> None:
+    """Advances a simulation to each of `times` (m,) [s]; `progress` is called with the finished share of the last."""
+    for t in times:
+        if t > 0:
+            simulator.AdvanceTo(t)
+        else:  # AdvanceTo(0) would make the plant's first step already
+            simulator.Initialize()
+        progress(t / times[-1])
+
+
+def samples(log: VectorLogSink, simulator: Simulator) -> NDArray[np.float64]:
+    """What a `LogVectorOutput` has of a simulation, a row per sample."""
+    return np.array(log.FindLog(simulator.get_context()).data().T)
+
+
+@contextmanager
+def recorded_in(meshcat: Meshcat | None, **options: Any) -> Iterator[None]:
+    """Records the animation of what is simulated in the block, with `options` of StartRecording; None: does nothing."""
+    if meshcat is not None:
+        meshcat.StartRecording(**options)
+    yield
+    if meshcat is not None:
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
 
 
 def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration: float) -> PiecewisePolynomial:

@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import LogVectorOutput
 from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 
 from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import ArmFrame, handle_frame
 from dvrk_drake.errors import ScenarioError
+from dvrk_drake.experiments.simulation import advance, samples
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.recordings.recording import Recording
@@ -154,25 +156,22 @@ def feel(
         controller = GravityPidController(compensation.model, mode="gravity")
         connect_controller(builder, station, controller, friction=_friction(arm, compensation))
     hand = builder.AddSystem(Hand(arm, frame_name, grip))
-    way = builder.AddSystem(PoseTrajectorySource(PiecewisePose.MakeLinear(knots, poses)))
+    way = PiecewisePose.MakeLinear(knots, poses)
+    source = builder.AddSystem(PoseTrajectorySource(way))
     builder.Connect(station.GetOutputPort(f"{name}.state_true"), hand.GetInputPort("state_estimated"))
-    builder.Connect(way.get_output_port(), hand.GetInputPort("X_BG_desired"))
+    builder.Connect(source.get_output_port(), hand.GetInputPort("X_BG_desired"))
     builder.Connect(hand.GetOutputPort("effort_disturbance"), station.GetInputPort(f"{name}.effort_disturbance"))
+    outputs = hand.GetOutputPort("spatial_force"), station.GetOutputPort(f"{name}.state_true")
+    logs = [LogVectorOutput(output, builder, SAMPLE_PERIOD) for output in outputs]
     simulator = Simulator(builder.Build())
     root = simulator.get_mutable_context()
     station.set_positions(station.GetMyMutableContextFromRoot(root), path.value(0.0).ravel())
-    simulator.Initialize()
-    # Multiples, not sums: where rounding tells the time from that of a step, the step would count or not by chance.
     times = SAMPLE_PERIOD * np.arange(1, int(path.end_time() / SAMPLE_PERIOD), dtype=np.float64)
-    forces, deviation = np.empty((len(times), 6)), np.empty(len(times))
-    state = station.GetOutputPort(f"{name}.state_true")
-    for i, t in enumerate(times):
-        simulator.AdvanceTo(t)
-        forces[i] = hand.GetOutputPort("spatial_force").Eval(hand.GetMyContextFromRoot(root))
-        q = state.Eval(station.GetMyContextFromRoot(root))[: arm.num_joints]
-        wanted = way.get_output_port().Eval(way.GetMyContextFromRoot(root))
-        deviation[i] = np.linalg.norm(wanted.translation() - frame.pose(q).translation())
-        progress((i + 1) / len(times))
+    advance(simulator, times, progress)
+    forces, state = (samples(log, simulator)[1:] for log in logs)
+    positions = np.array([frame.pose(q).translation() for q in state[:, : arm.num_joints]])
+    wanted = np.array([way.GetPose(min(t, way.end_time())).translation() for t in times])
+    deviation = np.linalg.norm(wanted - positions, axis=1)
     return Felt(compensation.name, times, forces[:, :3], forces[:, 3:], deviation)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, VectorLogSink
 
 from dvrk_drake.analysis.static.static_identification import StaticIdentification, identify_static
 from dvrk_drake.analysis.static.validation import Validation, validate
@@ -19,12 +19,12 @@ from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError
 from dvrk_drake.experiments.demo.true_arm import TrueArm, make_true_arm
+from dvrk_drake.experiments.simulation import advance, recorded_in, sample_times, samples
 from dvrk_drake.experiments.static_pose_collection import collect_static_poses
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.recordings.recording import Recording, write_recording
-from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.arm_view import framing, start_meshcat
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
@@ -35,6 +35,8 @@ EFFORT_NOISE = 0.01
 #: Release: pose held, then let go, then driven home; phases end at these times [s].
 HELD_UNTIL, RELEASED_UNTIL, HOME_UNTIL = 0.5, 4.5, 7.5
 STEP_DURATION = 4.0
+#: Between two samples of a motion [s].
+SAMPLE_PERIOD = 0.01
 #: What a reader of the drift must know.
 NO_DRY_FRICTION = (
     "Dry friction is not simulated here: every error of the model moves the released arm. On a real arm dry friction "
@@ -208,16 +210,18 @@ def run_demo(
 
 def _closed_loop(
     true_arm: TrueArm, model: IdentifiedModel, q_start: Sequence[float], meshcat: Meshcat | None
-) -> tuple[Simulator, ArmStation, GravityPidController, ConstantVectorSource]:
+) -> tuple[Simulator, VectorLogSink, GravityPidController, ConstantVectorSource]:
+    """The simulated arm at q_start, the log of its state, its controller, and the desired state."""
     station, controller = true_arm.station(meshcat), GravityPidController(model)
     desired = ConstantVectorSource(_at_rest(q_start))
     builder = DiagramBuilder()
     add_closed_loop(builder, station, controller, desired)
+    log = LogVectorOutput(station.GetOutputPort(f"{station.arm.name.lower()}.state_true"), builder, SAMPLE_PERIOD)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     true_arm.prepare(station, context)
     station.set_positions(context, q_start)
-    return simulator, station, controller, desired
+    return simulator, log, controller, desired
 
 
 def _at_rest(q: Sequence[float]) -> NDArray[np.float64]:
@@ -232,53 +236,28 @@ def _release(
     progress: Callable[[float], None],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Holds a pose, releases the arm under gravity compensation, drives it home; t (m,) and q (m, n)."""
-    simulator, station, controller, desired = _closed_loop(true_arm, model, plan.release, meshcat)
+    simulator, log, controller, desired = _closed_loop(true_arm, model, plan.release, meshcat)
     root = simulator.get_mutable_context()
     settings = controller.GetMyMutableContextFromRoot(root)
-    home = _at_rest(plan.home)
-
-    def at(t: float) -> None:
-        if abs(t - HELD_UNTIL) < 1e-9:
-            controller.SetMode(settings, "gravity")
-        if abs(t - RELEASED_UNTIL) < 1e-9:
-            desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(home)
-            controller.SetMode(settings, "hold")
-
-    if meshcat is not None:
-        meshcat.StartRecording()
-    t, q = _sample(simulator, station, HOME_UNTIL, at, progress)
-    if meshcat is not None:
-        meshcat.StopRecording()
-        meshcat.PublishRecording()
-    return t, q
+    t = sample_times(HOME_UNTIL, SAMPLE_PERIOD)
+    held, released = (int(np.searchsorted(t, end - 1e-9)) + 1 for end in (HELD_UNTIL, RELEASED_UNTIL))
+    with recorded_in(meshcat):
+        advance(simulator, t[:held])
+        controller.SetMode(settings, "gravity")
+        advance(simulator, t[held:released], lambda share: progress(share * RELEASED_UNTIL / HOME_UNTIL))
+        desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(_at_rest(plan.home))
+        controller.SetMode(settings, "hold")
+        advance(simulator, t[released:], progress)
+    return t, samples(log, simulator)[:, : true_arm.arm.num_joints]
 
 
 def _step(
     true_arm: TrueArm, model: IdentifiedModel, plan: DemoPlan, progress: Callable[[float], None]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """From the plan's step to its home under gravity + PID."""
-    simulator, station, _, desired = _closed_loop(true_arm, model, plan.step, None)
-    home = _at_rest(plan.home)
+    """From the plan's step to its home under gravity + PID; t (m,) and q (m, n)."""
+    simulator, log, _, desired = _closed_loop(true_arm, model, plan.step, None)
     root = simulator.get_mutable_context()
-    desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(home)
-    return _sample(simulator, station, STEP_DURATION, lambda t: None, progress)
-
-
-def _sample(
-    simulator: Simulator,
-    station: ArmStation,
-    duration: float,
-    at: Callable[[float], None],
-    progress: Callable[[float], None],
-    period: float = 0.01,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Simulates and samples the pose every `period`; `at(t)` is called before the arm moves on from t."""
-    context = station.GetMyContextFromRoot(simulator.get_context())
-    times = np.arange(round(duration / period) + 1, dtype=np.float64) * period
-    q = []
-    for t in times:
-        simulator.AdvanceTo(t)
-        q.append(station.get_positions(context))
-        at(t)
-        progress(t / duration)
-    return times, np.array(q)
+    desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(_at_rest(plan.home))
+    t = sample_times(STEP_DURATION, SAMPLE_PERIOD)
+    advance(simulator, t, progress)
+    return t, samples(log, simulator)[:, : true_arm.arm.num_joints]

@@ -17,6 +17,7 @@ from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 from pydrake.visualization import MeshcatPoseSliders
 
+from dvrk_drake.experiments.simulation import recorded_in
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.arm_view import start_meshcat
 from dvrk_drake.systems.hand_path import PoseTrajectorySource
@@ -94,17 +95,14 @@ def play_teleoperation(
     arms.set_positions(context, START_MASTER, START_FOLLOWER)
 
     samples = _Samples([], [], [])
+    with recorded_in(meshcat, frames_per_second=32):
+        for t in np.arange(round(duration / PERIOD) + 1) * PERIOD:
+            simulator.AdvanceTo(t)
+            samples.following.append(bool(arms.GetOutputPort("following").Eval(context)[0]))
+            samples.X_MG.append(arms.X_MG(context))
+            samples.X_FT.append(arms.X_FT(context))
+            progress(t / duration)
     if meshcat is not None:
-        meshcat.StartRecording(frames_per_second=32)
-    for t in np.arange(round(duration / PERIOD) + 1) * PERIOD:
-        simulator.AdvanceTo(t)
-        samples.following.append(bool(arms.GetOutputPort("following").Eval(context)[0]))
-        samples.X_MG.append(arms.X_MG(context))
-        samples.X_FT.append(arms.X_FT(context))
-        progress(t / duration)
-    if meshcat is not None:
-        meshcat.StopRecording()
-        meshcat.PublishRecording()
         _draw_paths(meshcat, samples)
     return _evaluate(samples)
 

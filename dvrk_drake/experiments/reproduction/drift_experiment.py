@@ -16,6 +16,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.experiments.simulation import samples
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.coupled_limits import beside
 from dvrk_drake.systems.arm_station import ArmStation
@@ -84,8 +85,7 @@ def release(case: Release) -> NDArray[np.float64]:
         simulator.AdvanceTo(before)
         controller.SetMode(controller.GetMyMutableContextFromRoot(context), _mode(case))
     simulator.AdvanceTo(before + case.duration)
-    positions: NDArray[np.float64] = log.FindLog(context).data()[: arm.num_joints].T
-    return positions[round(before / SAMPLE_PERIOD) :].copy()
+    return samples(log, simulator)[round(before / SAMPLE_PERIOD) :, : arm.num_joints]
 
 
 def _mode(case: Release) -> Mode:

@@ -17,6 +17,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.experiments.reproduction import published
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
+from dvrk_drake.experiments.simulation import samples
 from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.files import atomic_write
@@ -98,8 +99,7 @@ def simulate_ours(true_arm: Arm, model: IdentifiedModel, duration: float) -> NDA
     context = simulator.get_mutable_context()
     station.set_positions(station.GetMyMutableContextFromRoot(context), published.FIGURE_7_START)
     simulator.AdvanceTo(duration)
-    positions: NDArray[np.float64] = log.FindLog(context).data()[: arm.num_joints].T
-    return positions.copy()
+    return samples(log, simulator)[:, : arm.num_joints]
 
 
 def _gravity(plant: MultibodyPlant, simulator: Simulator, arm: Arm) -> NDArray[np.float64]:
