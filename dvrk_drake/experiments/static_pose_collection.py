@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
@@ -61,7 +61,6 @@ def collect_static_poses(
     *,
     effort_noise: float,
     generator: np.random.Generator,
-    prepare: Callable[[ArmStation, Context], None] = lambda station, context: None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Recording:
     """Visits hand-picked poses under position control and records the holding effort of each (steps 4 to 6).
@@ -72,7 +71,6 @@ def collect_static_poses(
         poses: (m, n) inside the limits (steps 1 to 3).
         effort_noise: standard deviation of one effort sample as a share of the effort limit.
         generator: of the noise.
-        prepare: called with the station and its context before the start, e.g. to change inertias.
         progress: called with the finished share, 0..1.
 
     Returns:
@@ -86,7 +84,6 @@ def collect_static_poses(
     add_closed_loop(builder, station, GravityPidController(model), desired)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    prepare(station, context)
     station.set_positions(context, poses[0])
     position = station.GetOutputPort(f"{name}.position_measured")
     effort = station.GetOutputPort(f"{name}.effort_measured")

@@ -12,6 +12,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.cli import reproduce as verb
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
+from dvrk_drake.experiments.ground_truth import GroundTruth, unlike_its_drawing
 from dvrk_drake.experiments.reproduction import published
 from dvrk_drake.experiments.reproduction.drift_experiment import (
     BAND,
@@ -37,7 +38,6 @@ from dvrk_drake.experiments.reproduction.step_response import (
     slowest_swing,
     swings,
 )
-from dvrk_drake.experiments.reproduction.true_arms import KnownTruth, unlike_its_drawing
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.recordings.recording import Recording, read_recording
@@ -274,7 +274,7 @@ def test_psm_keeps_its_remote_centre_and_its_wrist_axes_apart():
 @pytest.mark.slow
 def test_a_led_arm_stays_if_its_wide_hysteresis_is_compensated(tmp_path):
     arm = load_arm(PAPER_ARM)
-    truth, exact = KnownTruth(arm, IdentifiedModel.from_arm(arm), False, ""), tmp_path / "exact.yaml"
+    truth, exact = GroundTruth(arm, IdentifiedModel.from_arm(arm), False, ""), tmp_path / "exact.yaml"
     truth.model.save(exact)
     start = ARM.sample_poses(1, np.random.default_rng(10), margin=0.2)[0]
     case = Release(PAPER_ARM, arm, ("friction",), str(exact), start, led=True, duration=1.5, seed=10)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +16,17 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, Ve
 
 from dvrk_drake.analysis.static.static_identification import StaticIdentification, identify_static
 from dvrk_drake.analysis.static.validation import Validation, validate
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError
-from dvrk_drake.experiments.demo.true_arm import TrueArm, make_true_arm
+from dvrk_drake.experiments.ground_truth import damped_station, perturbed_links, with_links
 from dvrk_drake.experiments.simulation import advance, recorded_in, sample_times, samples
 from dvrk_drake.experiments.static_pose_collection import collect_static_poses
 from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.recordings.recording import Recording, write_recording
+from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.arm_view import framing, start_meshcat
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
@@ -32,6 +34,8 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 POSES, FRESH_POSES = 40, 15
 #: Effort noise of one sample, as a share of the effort limit.
 EFFORT_NOISE = 0.01
+#: Farthest that the true centres of mass are from the model's along each axis [m].
+LARGEST_SHIFT = 0.002
 #: Release: pose held, then let go, then driven home; phases end at these times [s].
 HELD_UNTIL, RELEASED_UNTIL, HOME_UNTIL = 0.5, 4.5, 7.5
 STEP_DURATION = 4.0
@@ -49,7 +53,7 @@ class DemoPlan:
     """What the demo does with one kind of arm; poses in rad and m.
 
     Attributes:
-        effects, coefficients: what its true arm has beside the model [N m].
+        effects: what its true arm has beside the model [N m].
         release: where it is held, then let go.
         step: where the step to `home` starts.
         home: where both end.
@@ -57,8 +61,7 @@ class DemoPlan:
         closure: how the loops of the true arm's linkage are held, see `add_arm`.
     """
 
-    effects: tuple[ActuatorEffect, ...]
-    coefficients: tuple[float, ...]
+    effects: tuple[DriveEffect, ...]
     release: tuple[float, ...]
     step: tuple[float, ...]
     home: tuple[float, ...]
@@ -68,11 +71,10 @@ class DemoPlan:
 
 MTM_PLAN = DemoPlan(
     effects=(
-        ActuatorEffect("joint.wrist_platform", "offset"),
-        ActuatorEffect("joint.wrist_platform", "cable sine", 1.0),
-        ActuatorEffect("joint.wrist_pitch", "cable sine", 1.0),
+        DriveEffect("joint.wrist_platform", "offset", 0.0, 0.02),
+        DriveEffect("joint.wrist_platform", "cable sine", 1.0, 0.05),
+        DriveEffect("joint.wrist_pitch", "cable sine", 1.0, -0.03),
     ),
-    coefficients=(0.02, 0.05, -0.03),
     release=(0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5),
     # The paper's Fig. 7: J5, J3 and J2 off home; q2 + q3 is beyond a real linkage's stop.
     step=(0.0, -0.22, -0.79, 0.0, 3.13, 0.0, 0.0),
@@ -84,11 +86,10 @@ PLANS = {
     "mtmr": MTM_PLAN,
     "psm": DemoPlan(
         effects=(
-            ActuatorEffect("joint.yaw", "offset"),
-            ActuatorEffect("joint.roll", "cable sine", 1.0),
-            ActuatorEffect("joint.wrist_pitch", "offset"),
+            DriveEffect("joint.yaw", "offset", 0.0, 0.05),
+            DriveEffect("joint.roll", "cable sine", 1.0, 0.03),
+            DriveEffect("joint.wrist_pitch", "offset", 0.0, 0.01),
         ),
-        coefficients=(0.05, 0.03, 0.01),
         release=(0.4, 0.3, 0.15, 0.6, 0.5, -0.3, 0.5),
         step=(0.5, -0.4, 0.2, -0.8, 0.6, 0.4, 0.8),
         home=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0),
@@ -146,24 +147,34 @@ def run_demo(
     Raises:
         ArmError: an arm that the demo has no plan for.
     """
-    generator = np.random.default_rng(seed)
     if arm_name not in PLANS:
         raise ArmError(f'the demo has no plan for "{arm_name}"; it has for {", ".join(PLANS)}')
+    with TemporaryDirectory() as folder:
+        return _run_demo(output, Path(folder) / "true_arm.sdf", arm_name, seed, progress)
+
+
+def _run_demo(
+    output: Path, true_sdf: Path, arm_name: str, seed: int, progress: Callable[[str, float], None]
+) -> DemoResult:
+    generator = np.random.default_rng(seed)
     arm, plan = load_arm(arm_name), PLANS[arm_name]
     nominal = IdentifiedModel.from_arm(arm)
-    true_arm = make_true_arm(arm, generator, plan.effects, plan.coefficients, plan.closure)
+    links = perturbed_links(arm, generator, shift=LARGEST_SHIFT)
+    true_arm = with_links(arm, links, true_sdf, "no arm: drawn at random")
+
+    def station(meshcat: Meshcat | None = None) -> ArmStation:
+        return damped_station(arm, true_arm, ArmEffects(cables=list(plan.effects)), plan.closure, meshcat)
 
     def collect(count: int, what: str) -> Recording:
         poses = arm.sample_poses(count, generator, margin=0.1)
         # A person turns platform and handle (or roll) by a hand's reach, not by turns.
         poses[:, [3, 6]] = np.clip(poses[:, [3, 6]], -1.5, 1.5)
         return collect_static_poses(
-            true_arm.station(),
+            station(),
             nominal,
             poses,
             effort_noise=EFFORT_NOISE,
             generator=generator,
-            prepare=true_arm.prepare,
             progress=lambda share: progress(what, share),
         )
 
@@ -179,14 +190,15 @@ def run_demo(
     paper_model = identify_static(poses, arm, "paper").model
     fresh_paper = validate(paper_model, fresh_poses)
 
-    meshcat = start_meshcat(*framing(true_arm.arm))
-    t, released = _release(true_arm, model, plan, meshcat, lambda share: progress("releasing and holding", share / 3))
+    def third(index: int) -> Callable[[float], None]:
+        return lambda share: progress("releasing and holding", (index + share) / 3)
+
+    meshcat = start_meshcat(*framing(arm))
+    t, released = _release(station(meshcat), model, plan, meshcat, third(0))
     with atomic_write(output / "arm.html") as stream:
         stream.write(meshcat.StaticHtml())
-    _, with_nominal = _release(
-        true_arm, nominal, plan, None, lambda share: progress("releasing and holding", (1 + share) / 3)
-    )
-    t_step, step = _step(true_arm, model, plan, lambda share: progress("releasing and holding", (2 + share) / 3))
+    _, with_nominal = _release(station(), nominal, plan, None, third(1))
+    t_step, step = _step(station(), model, plan, third(2))
 
     window = (t >= HELD_UNTIL) & (t <= RELEASED_UNTIL)
     drift = {
@@ -209,17 +221,16 @@ def run_demo(
 
 
 def _closed_loop(
-    true_arm: TrueArm, model: IdentifiedModel, q_start: Sequence[float], meshcat: Meshcat | None
+    station: ArmStation, model: IdentifiedModel, q_start: Sequence[float]
 ) -> tuple[Simulator, VectorLogSink, GravityPidController, ConstantVectorSource]:
     """The simulated arm at q_start, the log of its state, its controller, and the desired state."""
-    station, controller = true_arm.station(meshcat), GravityPidController(model)
+    controller = GravityPidController(model)
     desired = ConstantVectorSource(_at_rest(q_start))
     builder = DiagramBuilder()
     add_closed_loop(builder, station, controller, desired)
     log = LogVectorOutput(station.GetOutputPort(f"{station.arm.name.lower()}.state_true"), builder, SAMPLE_PERIOD)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    true_arm.prepare(station, context)
     station.set_positions(context, q_start)
     return simulator, log, controller, desired
 
@@ -229,14 +240,14 @@ def _at_rest(q: Sequence[float]) -> NDArray[np.float64]:
 
 
 def _release(
-    true_arm: TrueArm,
+    station: ArmStation,
     model: IdentifiedModel,
     plan: DemoPlan,
     meshcat: Meshcat | None,
     progress: Callable[[float], None],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Holds a pose, releases the arm under gravity compensation, drives it home; t (m,) and q (m, n)."""
-    simulator, log, controller, desired = _closed_loop(true_arm, model, plan.release, meshcat)
+    simulator, log, controller, desired = _closed_loop(station, model, plan.release)
     root = simulator.get_mutable_context()
     settings = controller.GetMyMutableContextFromRoot(root)
     t = sample_times(HOME_UNTIL, SAMPLE_PERIOD)
@@ -248,16 +259,16 @@ def _release(
         desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(_at_rest(plan.home))
         controller.SetMode(settings, "hold")
         advance(simulator, t[released:], progress)
-    return t, samples(log, simulator)[:, : true_arm.arm.num_joints]
+    return t, samples(log, simulator)[:, : station.arm.num_joints]
 
 
 def _step(
-    true_arm: TrueArm, model: IdentifiedModel, plan: DemoPlan, progress: Callable[[float], None]
+    station: ArmStation, model: IdentifiedModel, plan: DemoPlan, progress: Callable[[float], None]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """From the plan's step to its home under gravity + PID; t (m,) and q (m, n)."""
-    simulator, log, _, desired = _closed_loop(true_arm, model, plan.step, None)
+    simulator, log, _, desired = _closed_loop(station, model, plan.step)
     root = simulator.get_mutable_context()
     desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(_at_rest(plan.home))
     t = sample_times(STEP_DURATION, SAMPLE_PERIOD)
     advance(simulator, t, progress)
-    return t, samples(log, simulator)[:, : true_arm.arm.num_joints]
+    return t, samples(log, simulator)[:, : station.arm.num_joints]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.experiments.ground_truth import GroundTruth, collect, paper_arm, unlike_its_drawing
 from dvrk_drake.experiments.reproduction.drift_experiment import DURATION, Drifts, Release, release_all
 from dvrk_drake.experiments.reproduction.published import (
     FIGURE_7_FAULTY,
@@ -22,7 +23,6 @@ from dvrk_drake.experiments.reproduction.published import (
     paper_model,
     with_zeroed,
 )
-from dvrk_drake.experiments.reproduction.true_arms import KnownTruth, collect, paper_arm, unlike_its_drawing
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.recording import Recording, write_recording
 
@@ -54,7 +54,7 @@ class Extent:
 class Identified:
     """A true arm, poses collected on it, and the model that was identified from them, with its file."""
 
-    truth: KnownTruth
+    truth: GroundTruth
     poses: Recording
     model: IdentifiedModel
     file: Path
@@ -108,7 +108,7 @@ class Laboratory:
     def release(
         self,
         name: str,
-        truth: KnownTruth,
+        truth: GroundTruth,
         model: Path,
         poses: NDArray[np.float64],
         what: str,
@@ -139,7 +139,7 @@ class Laboratory:
         with_zeroed(IdentifiedModel.load(model), FIGURE_7_FAULTY).save(path)
         return path
 
-    def _identified(self, truth: KnownTruth, name: str) -> Identified:
+    def _identified(self, truth: GroundTruth, name: str) -> Identified:
         label = name.upper()
         poses = collect(
             truth,

@@ -15,7 +15,6 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm, load_arm
@@ -57,9 +56,7 @@ def effort_limits(arm: Arm) -> NDArray[np.float64]:
 
 def known_model(arm: Arm) -> IdentifiedModel:
     """What an identification leaves a controller with: the SDF's links, and springs and cables of the arm's effects."""
-    position = [*arm.effects.cables, *arm.effects.springs]
-    effects = [ActuatorEffectEstimate(e.coordinate, e.kind, e.scale, e.coefficient) for e in position]
-    return dataclasses.replace(IdentifiedModel.from_arm(arm), effects=effects)
+    return IdentifiedModel.from_arm(arm, [*arm.effects.cables, *arm.effects.springs])
 
 
 #: Poses that tuning looks at need this share of each motor's largest effort to be held, at most: with nothing left to

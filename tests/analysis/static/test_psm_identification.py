@@ -7,13 +7,13 @@ import pytest
 
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
-from dvrk_drake.experiments.demo.true_arm import make_true_arm
+from dvrk_drake.experiments.ground_truth import damped_station, perturbed_links, with_links
 from dvrk_drake.experiments.static_pose_collection import collect_static_poses
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 from dvrk_drake.recordings.recording import Recording, write_recording
 
@@ -26,30 +26,29 @@ def arm():
 
 
 @pytest.fixture(scope="module")
-def true_arm(arm):
-    effects = (ActuatorEffect("joint.yaw", "offset"), ActuatorEffect("joint.roll", "cable sine", 1.0))
-    return make_true_arm(arm, np.random.default_rng(5), effects, (0.05, 0.03), closure="ball")
+def true_arm(arm, tmp_path_factory):
+    links = perturbed_links(arm, np.random.default_rng(5), shift=0.002)
+    return with_links(arm, links, tmp_path_factory.mktemp("true_arm") / "psm.sdf", "a test")
 
 
 @pytest.fixture(scope="module")
 def recording(arm, true_arm):
     """Collected with the nominal model, so that the integrator has to make up for what is wrong with it."""
     generator = np.random.default_rng(6)
+    laws = [DriveEffect("joint.yaw", "offset", 0.0, 0.05), DriveEffect("joint.roll", "cable sine", 1.0, 0.03)]
+    effects = ArmEffects(cables=laws)
     return collect_static_poses(
-        true_arm.station(),
+        damped_station(arm, true_arm, effects, "ball"),
         IdentifiedModel.from_arm(arm),
         arm.sample_poses(COUNT, generator, margin=0.1),
         effort_noise=0.0,
         generator=generator,
-        prepare=true_arm.prepare,
     )
 
 
 def true_torque(arm, true_arm, poses):
-    plant = make_arm_plant(arm)
+    plant = make_arm_plant(true_arm)
     context = plant.CreateDefaultContext()
-    for name, M in true_arm.inertias.items():
-        plant.GetBodyByName(name).SetSpatialInertiaInBodyFrame(context, M)
     tau = []
     for q in poses:
         set_arm_positions(plant, context, arm, q)

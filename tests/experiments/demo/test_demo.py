@@ -9,10 +9,9 @@ from rich.console import Console
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.experiments.demo import demo
-from dvrk_drake.experiments.demo.true_arm import make_true_arm
+from dvrk_drake.experiments.ground_truth import perturbed_links
 from dvrk_drake.experiments.static_pose_collection import visiting_trajectory
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.recordings.recording import read_recording
 from dvrk_drake.reports import figures as demo_figures
 from dvrk_drake.reports.terminal_tables import print_demo
@@ -89,14 +88,14 @@ def test_drift_is_shown_as_that_of_an_arm_without_friction(result):
     assert demo.NO_DRY_FRICTION in printed and "without dry friction" in printed
 
 
-def test_true_arm_is_possible_and_differs():
+def test_perturbed_links_are_physically_consistent_and_differ():
     arm = load_arm("mtml")
-    true_arm = make_true_arm(arm, np.random.default_rng(3))
-    plant = make_arm_plant(arm)
-    assert set(true_arm.inertias) == {link.link for link in link_inertias(arm)}
-    for name, M in true_arm.inertias.items():
-        assert M.IsPhysicallyValid(), name
-        assert M.get_mass() != plant.GetBodyByName(name).default_mass()
+    links = perturbed_links(arm, np.random.default_rng(3), shift=0.002)
+    for link, drawn in zip(links, link_inertias(arm), strict=True):
+        assert link.link == drawn.link
+        M, M_drawn = link.to_spatial_inertia(), drawn.to_spatial_inertia()
+        assert M.IsPhysicallyValid() and M.get_mass() != M_drawn.get_mass()
+        assert 0 < np.abs(M.get_com() - M_drawn.get_com()).max() <= 0.002
 
 
 def test_trajectory_rests_at_each_pose_and_stays_inside_the_limits():

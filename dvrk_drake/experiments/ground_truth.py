@@ -1,18 +1,20 @@
-"""Simulated arms that no controller has a model of, and poses collected on them."""
+"""Ground-truth arms: simulated arms whose links and effects no controller knows, and poses collected on them."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.geometry import Meshcat
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
 from dvrk_drake.analysis.static.static_identification import identify_static
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.dynamics.model_links import model_bodies
@@ -21,8 +23,10 @@ from dvrk_drake.experiments.static_pose_collection import collect_static_poses
 from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.coupled_limits import beside
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.loop_closure import Closure
+from dvrk_drake.models.plant import set_joint_damping
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
 
@@ -31,7 +35,7 @@ SPREAD = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class KnownTruth:
+class GroundTruth:
     """An arm with all effects of a real one, and what holds it.
 
     Attributes:
@@ -47,7 +51,7 @@ class KnownTruth:
     origin: str
 
 
-def paper_arm(recording: Recording, folder: Path) -> KnownTruth:
+def paper_arm(recording: Recording, folder: Path) -> GroundTruth:
     """The paper's own MTM, as its recording shows it to a robust identification; writes its SDF into `folder`.
 
     Its links are the possible bodies nearest to our SDF's that have the identified gravity, its cables and springs are
@@ -66,7 +70,7 @@ def paper_arm(recording: Recording, folder: Path) -> KnownTruth:
     model = dataclasses.replace(model, joints=statistics, effects=lasting)
     laws = [DriveEffect(e.coordinate, e.kind, e.scale, e.value) for e in model.effects]
     effects = dataclasses.replace(arm.effects, cables=laws, springs=[])
-    true_arm = _with_links(arm, model_bodies(model).links, folder / "true_mtm.sdf", "the paper's recording")
+    true_arm = with_links(arm, model_bodies(model).links, folder / "true_mtm.sdf", "the paper's recording")
     origin = (
         "The true arm is the paper's MTM as our identification sees it in the paper's 72 poses (gravity, cables, "
         "springs), with the friction, stops, encoders, motors and delays of `mechanisms/mtm.yaml`, which are "
@@ -74,44 +78,66 @@ def paper_arm(recording: Recording, folder: Path) -> KnownTruth:
         "which is what its friction leaves, larger towards one side: there the true arm has less to compensate than "
         "the real one seems to have had."
     )
-    return KnownTruth(dataclasses.replace(true_arm, effects=effects), model, True, origin)
+    return GroundTruth(dataclasses.replace(true_arm, effects=effects), model, True, origin)
 
 
 def _at_actuator(coordinate: str) -> str:
     return "actuator." + coordinate.partition(".")[2]
 
 
-def unlike_its_drawing(name: str, folder: Path, seed: int) -> KnownTruth:
+def unlike_its_drawing(name: str, folder: Path, seed: int) -> GroundTruth:
     """An arm whose links are each up to `SPREAD` heavier or lighter than the SDF's; writes its SDF into `folder`.
 
     An MTM has no wrist spring then: the identified spring balances an identified wrist, which is heavier than the
     SDF's, and would exceed the motor's torque at a sixth of all poses.
     """
     arm = load_arm(name)
-    generator = np.random.default_rng(seed)
-    links = [
-        LinkInertia(link.link, link.parameters * generator.uniform(1 - SPREAD, 1 + SPREAD))
-        for link in link_inertias(arm)
-    ]
-    true_arm = _with_links(arm, links, folder / f"true_{name}.sdf", "no arm: each link's mass is drawn at random")
+    links = perturbed_links(arm, np.random.default_rng(seed))
+    true_arm = with_links(arm, links, folder / f"true_{name}.sdf", "no arm: each link's mass is drawn at random")
     if name == PAPER_ARM:
         true_arm = dataclasses.replace(true_arm, effects=arm.effects.without("springs"))
-    effects = [
-        ActuatorEffectEstimate(law.coordinate, law.kind, law.scale, law.coefficient)
-        for law in [*true_arm.effects.cables, *true_arm.effects.springs]
-    ]
-    model = dataclasses.replace(IdentifiedModel.from_arm(true_arm), arm=arm.source, effects=effects)
+    laws = [*true_arm.effects.cables, *true_arm.effects.springs]
+    model = dataclasses.replace(IdentifiedModel.from_arm(true_arm, laws), arm=arm.source)
     origin = (
         f"The true arm is the SDF's with links that are each up to {100 * SPREAD:.0f} % heavier or lighter (drawn with "
         f"seed {seed}), and the effects of `mechanisms/`: friction, cables, encoders, motors, delays."
     )
-    return KnownTruth(true_arm, model, False, origin)
+    return GroundTruth(true_arm, model, False, origin)
 
 
-def _with_links(arm: Arm, links: list[LinkInertia] | tuple[LinkInertia, ...], path: Path, origin: str) -> Arm:
+def perturbed_links(arm: Arm, generator: np.random.Generator, shift: float = 0.0) -> list[LinkInertia]:
+    """The links of an arm, each up to `SPREAD` heavier or lighter, its centre of mass moved by up to `shift` [m]."""
+    links = []
+    for link in link_inertias(arm):
+        parameters = link.parameters
+        if shift:
+            M = link.to_spatial_inertia()
+            com = M.get_com() + generator.uniform(-shift, shift, 3)
+            # The inertia about the centre of mass stays: a physically consistent body.
+            G = M.Shift(M.get_com()).get_unit_inertia().ShiftFromCenterOfMass(-com)
+            shifted = SpatialInertia(M.get_mass(), com, UnitInertia(G))
+            parameters = LinkInertia.from_spatial_inertia(link.link, shifted).parameters
+        links.append(LinkInertia(link.link, parameters * generator.uniform(1 - SPREAD, 1 + SPREAD)))
+    return links
+
+
+def with_links(arm: Arm, links: Sequence[LinkInertia], path: Path, origin: str) -> Arm:
+    """The arm with other links, in an SDF at `path` that is written here; `origin` of the links is its comment."""
     with atomic_write(path) as stream:
         stream.write(to_text(with_inertias(arm, links), f"{arm.name}, inertial parameters of {origin}."))
     return dataclasses.replace(arm, sdf=(str(path.resolve()),))
+
+
+def damped_station(
+    arm: Arm, true_arm: Arm, effects: ArmEffects, closure: Closure, meshcat: Meshcat | None = None
+) -> ArmStation:
+    """A station that simulates a ground-truth arm with these effects, its joints damped in the place of friction."""
+    damping = arm.per_joint(0.03, 0.3) * arm.effort_limits
+
+    def damp(plant: MultibodyPlant) -> None:
+        set_joint_damping(plant, true_arm, damping)
+
+    return ArmStation(arm, plant_arm=true_arm, meshcat=meshcat, closure=closure, modify_plant=damp, effects=effects)
 
 
 #: From how far on either side a pose is approached, so that dry friction cancels [rad], [m].
@@ -123,7 +149,7 @@ _CHUNK = 10
 
 
 def collect(
-    truth: KnownTruth,
+    truth: GroundTruth,
     name: str,
     count: int,
     seed: int,
