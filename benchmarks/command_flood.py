@@ -41,8 +41,7 @@ import numpy as np
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.lcm_messages import command_channel, status_channel
-from dvrk_drake.models.message_key import MessageKey, create_key_file
+from dvrk_drake.models.lcm_messages import MessageKey, command_channel, create_key_file, status_channel
 from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.processes.pace import make_realtime
 

@@ -21,8 +21,7 @@ from timing import measured_times
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.lcm_messages import StatusFilter
-from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.models.lcm_messages import MessageKey, StatusFilter
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.command_inbox import CommandInbox
 from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard

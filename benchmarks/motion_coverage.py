@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem, residuals
-from dvrk_drake.analysis.dynamic.parameter_uncertainty import parameter_covariance
+from dvrk_drake.analysis.dynamic.estimates import parameter_covariance
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of
-from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters
+from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.models.arm import Arm, load_arm
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))

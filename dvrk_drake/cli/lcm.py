@@ -101,7 +101,7 @@ def _add_key(verbs: argparse._SubParsersAction) -> None:
 
 
 def _key(options: argparse.Namespace) -> None:
-    from dvrk_drake.models.message_key import create_key_file
+    from dvrk_drake.models.lcm_messages import create_key_file
 
     create_key_file(options.file)
     print(f"{options.file}: copy it to the other side, e.g. with scp -p, and name it there and here with --key")

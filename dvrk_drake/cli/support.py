@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from dvrk_drake.models.arm import Arm
-    from dvrk_drake.models.message_key import MessageKey
+    from dvrk_drake.models.lcm_messages import MessageKey
 
 
 def import_interruptibly() -> None:
@@ -79,7 +79,7 @@ def load_key(path: str | None) -> MessageKey | None:
     Raises:
         KeyFileError: it cannot be used.
     """
-    from dvrk_drake.models.message_key import MessageKey
+    from dvrk_drake.models.lcm_messages import MessageKey
 
     return None if path is None else MessageKey.load(path)
 

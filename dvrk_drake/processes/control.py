@@ -13,8 +13,14 @@ from pydrake.common.value import AbstractValue
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import StatusFilter, command_channel, decode, describe_state, status_channel
-from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.models.lcm_messages import (
+    MessageKey,
+    StatusFilter,
+    command_channel,
+    decode,
+    describe_state,
+    status_channel,
+)
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.processes.live_status import AnswerTimes, LiveStatus, LiveStatusMaker, takeover_reason

@@ -11,8 +11,7 @@ import lcm
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import STATUS_PREFIX, StatusFilter, describe_state, status_channel
-from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.models.lcm_messages import STATUS_PREFIX, MessageKey, StatusFilter, describe_state, status_channel
 from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.recordings.lcm_log_reader import StatusStream
 from dvrk_drake.recordings.recording_stream import RecordingFile, check_stream_output, open_recording_file

@@ -1,4 +1,4 @@
-"""Shows what a hand felt of an arm: a table, a file with its numbers, a picture."""
+"""The interaction force at an arm's handle: a table, a file with its numbers, a figure, the reproduction's section."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 from rich.console import Console
 
+from dvrk_drake.dynamics.friction_compensation import LARGEST_RATIO
+from dvrk_drake.experiments.reproduction.laboratory import Laboratory, Lead, led
 from dvrk_drake.experiments.transparency import TAKES_HOLD, Felt
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.reports.figures import save_figure
+from dvrk_drake.reports.reproduction.page import ResultTable, Section
 from dvrk_drake.reports.terminal_tables import make_table
 
 
@@ -65,3 +68,47 @@ def plot_transparency(path: Path, arm: Arm, felt: Sequence[Felt]) -> None:
     both[0].legend(fontsize=8, ncols=min(4, len(felt)), loc="lower right", bbox_to_anchor=(1.0, 1.0))
     both[1].set_xlabel("time [s]")
     save_figure(figure, path)
+
+
+def reproduce_transparency(laboratory: Laboratory) -> Section:
+    """Leads the handle along one path with each compensation."""
+    mtm, paper = laboratory.mtm, laboratory.paper_file
+    poses, seed = laboratory.extent.path_poses, laboratory.seed
+    rows: list[tuple[str, Path | None, float]] = [
+        ("limp motors", None, 0.0),
+        ("the paper's compensation", paper, 0.0),
+        ("ours", mtm.file, 0.0),
+        (f"ours, friction {LARGEST_RATIO:g}", mtm.file, LARGEST_RATIO),
+    ]
+    leads = [Lead(name, mtm.truth.arm, str(model or ""), ratio, poses, seed) for name, model, ratio in rows]
+    felt = []
+    for one in laboratory.executor.map(led, leads):
+        felt.append(one)
+        laboratory.progress("a hand leads the MTM", len(felt) / len(leads))
+    plot_transparency(laboratory.folder / "transparency.png", mtm.truth.arm, felt)
+    table = ResultTable(
+        "transparency",
+        "What the hand must exert",
+        ("", "force, RMS [N]", "force, 95 % [N]", "torque, RMS [mN m]", "torque, 95 % [mN m]"),
+        tuple(_row(one) for one in felt),
+    )
+    remarks = (
+        "The paper wishes for it and gives no number: force and torque at the handle while a hand (a spring and damper "
+        "of a person's stiffness) leads the true arm along a path through random poses, slowly.",
+        mtm.truth.origin,
+        f"The last row also takes {LARGEST_RATIO:g} of the friction off the hand, less where what remains must hold "
+        "the arm against the error of the identified gravity (docs/friction_compensation.md).",
+    )
+    return Section(
+        "transparency",
+        "Transparency: what the operator feels",
+        remarks,
+        (table,),
+        {"transparency.png": "Force and torque of the hand over time"},
+    )
+
+
+def _row(felt: Felt) -> tuple[str, ...]:
+    force, torque = felt.peak()
+    values = (f"{felt.rms_force:.2f}", f"{force:.2f}", f"{1e3 * felt.rms_torque:.0f}", f"{1e3 * torque:.0f}")
+    return felt.name, *values

@@ -7,8 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters
-from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.models.arm import load_arm
 

@@ -10,6 +10,7 @@ from dvrk_drake.dynamics.physical_consistency import (
     MASS_RANGE,
     TOTAL_MASS_TOLERANCE,
     LinkScale,
+    bounding_boxes,
     consistent_parameters,
     least_eigenvalue_bound,
     log_det_curvature,
@@ -17,7 +18,6 @@ from dvrk_drake.dynamics.physical_consistency import (
 )
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.bounding_boxes import bounding_boxes
 
 
 @pytest.fixture(scope="module", params=["mtmr", "psm"])

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
-from dvrk_drake.dynamics.physical_consistency import reached_bounds, room_in_box
+from dvrk_drake.dynamics.physical_consistency import BoundingBox, bounding_boxes, reached_bounds, room_in_box
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.arm_schema import BoundingShapes, BoxCorners
-from dvrk_drake.models.bounding_boxes import BoundingBox, bounding_boxes
 
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])

@@ -10,7 +10,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.errors import KeyFileError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.message_key import MessageKey, create_key_file
+from dvrk_drake.models.lcm_messages import MessageKey, create_key_file
 from dvrk_drake.processes.simulated_arm import load_driver
 
 KEY = bytes(range(32))

@@ -12,8 +12,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.lcm_messages import describe_refusal, status_channel
-from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.models.lcm_messages import MessageKey, describe_refusal, status_channel
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.control import ArmLink, control, first_status, reset_fault
 from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker

@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import pytest
 from status_logs import ARM, statuses
 
-from dvrk_drake.models.lcm_messages import status_channel
-from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.models.lcm_messages import MessageKey, status_channel
 from dvrk_drake.processes import recorder as module
 from dvrk_drake.processes.recorder import Recorder
 from dvrk_drake.recordings.recording import read_recording

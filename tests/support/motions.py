@@ -14,9 +14,8 @@ from dvrk_drake.dynamics.dynamic_section import (
     SignalSettings,
 )
 from dvrk_drake.dynamics.inertial_parameters import parameters_from_pseudo_inertia, rotor_links
-from dvrk_drake.dynamics.physical_consistency import LinkScale, reached_bounds
+from dvrk_drake.dynamics.physical_consistency import LinkScale, bounding_boxes, reached_bounds
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.bounding_boxes import bounding_boxes
 from dvrk_drake.recordings.recording import Recording
 
 

@@ -24,7 +24,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.message_key import create_key_file
+from dvrk_drake.models.lcm_messages import create_key_file
 from dvrk_drake.processes.pace import Pace, make_realtime
 from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import drive_effects, dynamic_columns, optional_effects
 from dvrk_drake.analysis.dynamic.effect_choice import choose_effects, left_out_errors
-from dvrk_drake.analysis.dynamic.estimates import DynamicEstimates, base_parameter_estimates
-from dvrk_drake.analysis.dynamic.parameter_uncertainty import parameter_covariance
+from dvrk_drake.analysis.dynamic.estimates import DynamicEstimates, base_parameter_estimates, parameter_covariance
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of, phase_folds, repeatability_floor

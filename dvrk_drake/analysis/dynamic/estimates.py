@@ -1,15 +1,18 @@
-"""What an identification found, parameter by parameter with standard errors, from the fit and its covariance."""
+"""The parameters that an identification found, with standard errors and correlations from its fit."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import sympy
 from numpy.typing import NDArray
+from scipy.linalg import matmul_toeplitz
+from scipy.signal import correlate
 
-from dvrk_drake.analysis.dynamic.parameter_uncertainty import ParameterUncertainty
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
-from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters
-from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
 from dvrk_drake.dynamics.dynamic_section import (
     CorrelatedEstimates,
     DynamicSection,
@@ -21,6 +24,163 @@ from dvrk_drake.dynamics.identified_model import BaseParameterEstimate
 from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.dynamics.physical_consistency import reached_bounds
 from dvrk_drake.models.arm import Arm
+
+#: Above this size of their correlation the data tell the sum or difference of two parameters, hardly each of them.
+STRONG_CORRELATION = 0.95
+
+
+@dataclass(frozen=True)
+class StrongCorrelation:
+    """Two parameters that the data hardly tell apart; `correlation` of their estimates, -1..1."""
+
+    first: str
+    second: str
+    correlation: float
+
+    def __str__(self) -> str:
+        what = "difference" if self.correlation > 0 else "sum"
+        pair = f"{self.first} and {self.second}"
+        return f"{pair}: correlation {self.correlation:+.3f}, only their scaled {what} is well known"
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterUncertainty:
+    """Of the estimates of b parameters.
+
+    Attributes:
+        names: (b,).
+        standard_errors: (b,) in the parameters' units.
+        correlation: (b, b) of the estimates.
+    """
+
+    names: tuple[str, ...]
+    standard_errors: NDArray[np.float64]
+    correlation: NDArray[np.float64]
+
+    @classmethod
+    def of_covariance(cls, names: Sequence[str], covariance: NDArray[np.float64]) -> ParameterUncertainty:
+        """From the covariance (b, b) of the estimates."""
+        spread = np.sqrt(np.diag(covariance))
+        return cls(tuple(names), spread, covariance / np.outer(spread, spread))
+
+    def strong_correlations(self, limit: float = STRONG_CORRELATION) -> list[StrongCorrelation]:
+        """Pairs whose correlation exceeds `limit` in size, the strongest first."""
+        size = np.abs(np.triu(self.correlation, 1))
+        pairs = sorted(np.argwhere(size > limit).tolist(), key=lambda pair: -size[tuple(pair)])
+        return [StrongCorrelation(self.names[i], self.names[k], float(self.correlation[i, k])) for i, k in pairs]
+
+
+#: Errors of an effort further apart than this have nothing to do with each other, but for whole periods [s].
+MEMORY = 1.0
+#: Rows are taken this many times as often as the cut-off of the low-pass needs.
+_OVERSAMPLING = 2.0
+#: Two passes that overlap by less than this share of the motion do not tell what repeats.
+_LEAST_OVERLAP = 0.2
+
+
+def parameter_covariance(
+    problem: DynamicProblem,
+    fit: ConsistentFit,
+    residuals: NDArray[np.float64],
+    rate: float,
+    cut_off: float,
+    period: float | None,
+) -> NDArray[np.float64]:
+    """(p + e, p + e) covariance of `fit.x`, given the effects; inequalities are not counted as knowledge.
+
+    With A = (X'WX + P)^-1, the inverse of the second derivative of the cost,
+
+        covariance = A (sum_i w_i^2 X_i' Omega_i X_i + P) A,
+
+    P being what the priors know and Omega_i the covariance of actuator i's error over time, as the residuals show it:
+    errors that last (friction that is not modelled quite right) count as few measurements, and those that come again
+    in every period of the motion count once, whatever the number of periods. Residuals of a fit are smaller than the
+    errors where it could bend to them, those of phases that it has not seen are larger by as much: with H the hat
+    matrix, (1 - H) e and e / (1 - H). The products of one with the other are neither (MacKinnon and White, "Some
+    heteroskedasticity-consistent covariance matrix estimators", 1985: HC2).
+
+    Args:
+        problem, fit: as solved.
+        residuals: (r, n) what the fit leaves of the efforts.
+        rate: of the rows [Hz].
+        cut_off: of the low-pass that they are behind [Hz].
+        period: after which the motion repeats [s], or None.
+    """
+    step = max(1, int(rate / (2 * cut_off * _OVERSAMPLING)))
+    rows = slice(None, None, step)
+    A = _inverse(fit.information + fit.prior_precision)
+    middle = fit.prior_precision.copy()
+    unseen = _unseen_residuals(problem, fit, residuals)
+    for i, weight in enumerate(fit.weights):
+        covariance = error_covariance(residuals[rows, i], unseen[rows, i], rate / step, period)
+        X = problem.chosen_columns(i, fit.chosen)[rows]
+        moved = np.flatnonzero(np.any(X, axis=0))
+        X = X[:, moved]
+        middle[np.ix_(moved, moved)] += (weight * step) ** 2 * (X.T @ matmul_toeplitz(covariance, X))
+    return np.asarray(A @ middle @ A, dtype=np.float64)
+
+
+def _unseen_residuals(
+    problem: DynamicProblem, fit: ConsistentFit, residuals: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(r, n) what is left of each fold by the fit to the others: one step of Newton's, exact but for inequalities."""
+    unseen = residuals.copy()
+    free = np.flatnonzero(fit.x > fit.lower)
+    columns = [problem.chosen_columns(i, fit.chosen)[:, free] for i in range(residuals.shape[1])]
+    known = (fit.information + fit.prior_precision)[np.ix_(free, free)]
+    for fold in range(int(problem.fold.max()) + 1):
+        rows = problem.fold == fold
+        X, e = [x[rows] for x in columns], residuals[rows].T
+        own = sum(weight * x.T @ x for weight, x in zip(fit.weights, X, strict=True))
+        slope = sum(weight * x.T @ left for weight, x, left in zip(fit.weights, X, e, strict=True))
+        step = _inverse(known - own) @ slope
+        unseen[rows] += np.column_stack([x @ step for x in X])
+    return unseen
+
+
+def error_covariance(
+    seen: NDArray[np.float64], unseen: NDArray[np.float64], rate: float, period: float | None
+) -> NDArray[np.float64]:
+    """(r,) covariance of an actuator's error with itself, by how many rows later.
+
+    `seen` and `unseen` (r,) are its residuals when the fit knew these rows and when it did not.
+
+    Up to `MEMORY` it is the error's own, tapered (Parzen's window); whole periods later that of the part of it that
+    repeats, which is what the first repetition shows.
+    """
+    count = len(seen)
+    both = correlate(seen, unseen, method="fft")
+    lags = (both + both[::-1])[count - 1 :] / 2 / np.arange(count, 0, -1)
+    reach = min(round(MEMORY * rate), count - 1)
+    window = _parzen(np.arange(-reach, reach + 1) / reach)
+    near = np.concatenate([lags[reach:0:-1], lags[: reach + 1]]) * window
+    covariance = np.zeros(count + reach)
+    covariance[: reach + 1] = near[reach:]
+    shift = 0 if period is None else round(period * rate)
+    if reach < shift and (count - shift - reach) > _LEAST_OVERLAP * count:
+        again = lags[shift - reach : shift + reach + 1] * window
+        for start in range(shift, count + reach, shift):
+            until = min(start + reach + 1, len(covariance))
+            covariance[start - reach : until] += again[: until - start + reach]
+    return _nearest_covariance(covariance[:count])
+
+
+def _parzen(u: NDArray[np.float64]) -> NDArray[np.float64]:
+    u = np.abs(u)
+    return np.asarray(np.where(u < 0.5, 1 - 6 * u**2 * (1 - u), 2 * (1 - u) ** 3))
+
+
+def _nearest_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Estimates of covariances can have negative spectra, which no error has."""
+    circulant = np.concatenate([covariance, covariance[-1:0:-1]])
+    spectrum = np.maximum(np.fft.rfft(circulant).real, 0.0)
+    return np.asarray(np.fft.irfft(spectrum, len(circulant))[: len(covariance)], dtype=np.float64)
+
+
+def _inverse(H: NDArray[np.float64]) -> NDArray[np.float64]:
+    scale = 1 / np.sqrt(np.diag(H))
+    return np.asarray(np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale), dtype=np.float64)
+
 
 #: A base parameter of which the motion took away less than this share of the prior's variance is not told by it.
 LEAST_TOLD = 0.5

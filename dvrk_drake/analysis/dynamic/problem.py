@@ -14,8 +14,13 @@ from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, square
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import rotor_links
-from dvrk_drake.dynamics.physical_consistency import LinkScale, consistent_parameters, log_det_curvature
-from dvrk_drake.models.bounding_boxes import BoundingBox, bounding_boxes
+from dvrk_drake.dynamics.physical_consistency import (
+    BoundingBox,
+    LinkScale,
+    bounding_boxes,
+    consistent_parameters,
+    log_det_curvature,
+)
 
 #: Deviation of an inertial parameter from the SDF's, as a share of the link's own size; chosen by cross-validation.
 LINK_DEVIATION = 0.3

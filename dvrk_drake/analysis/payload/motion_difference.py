@@ -16,6 +16,50 @@ from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.recording import Recording
 
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """x[t] - sum_k coefficients[k - 1] x[t - k step], channel by channel.
+
+    The step is half a period of the low-pass that the rows are behind: at that spacing their whole band is there, and
+    nothing else is.
+
+    Attributes:
+        coefficients: (n, order) of each channel; zeros leave it as it is.
+        step: rows between the values that are combined.
+    """
+
+    coefficients: NDArray[np.float64]
+    step: int
+
+    @classmethod
+    def none(cls, channels: int) -> Whitening:
+        """That of white rows."""
+        return cls(np.zeros((channels, 0)), 1)
+
+    @classmethod
+    def of(cls, residual: NDArray[np.float64], order: int, rate: float, cut_off: float) -> Whitening:
+        """The autoregression of residuals (r, n) that lie behind a low-pass at `cut_off` [Hz], rows at `rate` [Hz]."""
+        step = max(1, round(rate / (2 * cut_off)))
+        coefficients = []
+        for x in residual.T:
+            past = np.column_stack([x[(order - k) * step : len(x) - k * step] for k in range(1, order + 1)])
+            coefficients.append(np.linalg.lstsq(past, x[order * step :], rcond=None)[0])
+        return cls(np.array(coefficients), step)
+
+    @property
+    def lost(self) -> int:
+        """Rows at the start that have no past."""
+        return self.coefficients.shape[1] * self.step
+
+    def __call__(self, x: NDArray[np.float64], channel: int) -> NDArray[np.float64]:
+        """Rows (r - lost, ...) of one channel's rows x (r, ...)."""
+        y = x[self.lost :].copy()
+        for k, a in enumerate(self.coefficients[channel], start=1):
+            y -= a * x[self.lost - k * self.step : len(x) - k * self.step]
+        return y
+
+
 #: A motion that does not repeat may have begun so much sooner or later than the other [s].
 LONGEST_SHIFT = 5.0
 #: Both recordings must have so much of the motion [s].

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
-from dvrk_drake.analysis.payload.motion_difference import MotionDifference, motion_difference
+from dvrk_drake.analysis.payload.motion_difference import MotionDifference, Whitening, motion_difference
 from dvrk_drake.analysis.payload.point_mass import PointMass, PointMassProblem
-from dvrk_drake.analysis.payload.whitening import Whitening
 from dvrk_drake.analysis.signals.repetition import phase_folds
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor

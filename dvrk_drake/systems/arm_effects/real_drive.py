@@ -14,11 +14,10 @@ from pydrake.systems.primitives import DiscreteTimeDelay, PassThrough
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect
 from dvrk_drake.systems.arm_effects.drive_force import DriveForce
+from dvrk_drake.systems.arm_effects.drive_joints import PlantEffects
 from dvrk_drake.systems.arm_effects.drive_step import DriveStep
 from dvrk_drake.systems.arm_effects.motors import EffortSensor, Motors
-from dvrk_drake.systems.arm_effects.plant_effects import PlantEffects
-from dvrk_drake.systems.ideal_drive import DrivePorts, add_true_state
-from dvrk_drake.systems.plant_joints import PlantJoints
+from dvrk_drake.systems.ideal_drive import DrivePorts, PlantJoints, add_true_state
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ import struct
 from typing import TYPE_CHECKING
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
-from dvrk_drake.models.lcm_messages import decode
-from dvrk_drake.models.message_key import MAC_SIZE, MessageKey
+from dvrk_drake.models.lcm_messages import MAC_SIZE, MessageKey, decode
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 
 if TYPE_CHECKING:

@@ -13,8 +13,7 @@ from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubsc
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import StatusFilter, command_channel, decode, status_channel
-from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.models.lcm_messages import MessageKey, StatusFilter, command_channel, decode, status_channel
 from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver

@@ -8,7 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.models.lcm_messages import MessageKey
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.command_inbox import CommandInbox
 from dvrk_drake.systems.guard.command_stream import is_finite

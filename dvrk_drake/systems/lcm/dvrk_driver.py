@@ -10,7 +10,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError, StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.models.lcm_messages import MessageKey
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.systems.guard.settings import GuardSettings
 

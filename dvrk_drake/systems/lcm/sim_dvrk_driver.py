@@ -11,8 +11,7 @@ from pydrake.systems.lcm import LcmPublisherSystem
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import command_channel, status_channel
-from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.models.lcm_messages import MessageKey, command_channel, status_channel
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.guard.command_guard import CommandGuard

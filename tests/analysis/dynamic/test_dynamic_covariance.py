@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.dynamic.parameter_uncertainty import (
+from dvrk_drake.analysis.dynamic.estimates import (
     error_covariance,
     parameter_covariance,
 )

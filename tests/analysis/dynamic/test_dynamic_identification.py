@@ -12,8 +12,7 @@ from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.estimates import base_parameter_map
 from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.dynamic_base_parameters import derive_base_parameters
-from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError, RecordingError

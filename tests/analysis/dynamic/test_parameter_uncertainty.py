@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.dynamic.parameter_uncertainty import ParameterUncertainty
+from dvrk_drake.analysis.dynamic.estimates import ParameterUncertainty
 
 
 def test_columns_that_are_almost_the_same_are_named():

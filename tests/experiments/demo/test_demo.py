@@ -9,8 +9,7 @@ from rich.console import Console
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.experiments.demo import demo
-from dvrk_drake.experiments.ground_truth import perturbed_links
-from dvrk_drake.experiments.static_pose_collection import visiting_trajectory
+from dvrk_drake.experiments.ground_truth import perturbed_links, visiting_trajectory
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.recording import read_recording
 from dvrk_drake.reports import figures as demo_figures

@@ -7,7 +7,7 @@ from guard_bench import LIMIT, SESSION, Bench
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.models.lcm_messages import MessageKey
 from dvrk_drake.systems.guard.command_inbox import CommandInbox
 
 KEY = MessageKey(bytes(range(32)))

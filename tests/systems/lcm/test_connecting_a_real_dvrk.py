@@ -11,7 +11,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.message_key import MessageKey
+from dvrk_drake.models.lcm_messages import MessageKey
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 DOCUMENT = ROOT / "docs" / "connecting_a_real_dvrk.md"

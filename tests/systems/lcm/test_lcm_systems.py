@@ -13,8 +13,7 @@ from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.models.lcm_messages import StatusFilter
-from dvrk_drake.models.message_key import create_key_file
+from dvrk_drake.models.lcm_messages import StatusFilter, create_key_file
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.arm_connection import TolerantSerializer
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
