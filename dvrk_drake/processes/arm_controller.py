@@ -14,8 +14,8 @@ from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.systems.effort_ramp import EffortRamp
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
-from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
-from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
+from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
+from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
 
 class ArmController:

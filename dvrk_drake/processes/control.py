@@ -24,7 +24,7 @@ from dvrk_drake.models.lcm_messages import (
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.processes.live_status import AnswerTimes, LiveStatus, LiveStatusMaker, takeover_reason
-from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
+from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
 
 #: Without a status for this long there is no arm [s]; at first it may have to be started.
 _SILENCE, _FIRST_WAIT = 1.0, 10.0

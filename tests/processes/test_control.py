@@ -17,7 +17,7 @@ from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.control import ArmLink, control, first_status, reset_fault
 from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
 from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
+from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 
 
 class GuardedArm:

@@ -14,7 +14,7 @@ from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.hand import Hand
 from dvrk_drake.systems.hand_path import HandPath
-from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
+from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import SimDvrkDriver
 

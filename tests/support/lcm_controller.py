@@ -15,7 +15,7 @@ import numpy as np
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes.pace import Pace, make_realtime
-from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
+from dvrk_drake.systems.lcm.dvrk_command import draw_id
 
 
 class Controller:

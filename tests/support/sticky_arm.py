@@ -12,7 +12,7 @@ from dvrk_drake.processes.collector import CollectionSettings, Collector
 from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
-from dvrk_drake.systems.lcm.dvrk_status_sender import fill_in_guard
+from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
 
 PERIOD = 1e-3
 

@@ -26,7 +26,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.lcm_messages import create_key_file
 from dvrk_drake.processes.pace import Pace, make_realtime
-from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
+from dvrk_drake.systems.lcm.dvrk_command import draw_id
 
 OTHER_URL = "udpm://239.255.76.67:7668?ttl=0"
 #: Of tests that publish garbage, which observers do not read.

@@ -14,9 +14,9 @@ from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubsc
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import MessageKey, StatusFilter, command_channel, decode, status_channel
-from dvrk_drake.systems.lcm.dvrk_command_sender import DvrkCommandSender
+from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
+from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
 
 class TolerantSerializer(PySerializer):

@@ -15,12 +15,10 @@ from dvrk_drake.models.lcm_messages import MessageKey, command_channel, status_c
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.lcm.arm_clock import ArmClock
 from dvrk_drake.systems.lcm.arm_connection import TolerantSerializer
-from dvrk_drake.systems.lcm.dvrk_command_receiver import DvrkCommandReceiver
-from dvrk_drake.systems.lcm.dvrk_command_sender import draw_id
+from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandReceiver, draw_id
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.lcm.dvrk_status_sender import DvrkStatusSender
+from dvrk_drake.systems.lcm.dvrk_status import ArmClock, DvrkStatusSender
 
 
 class SimDvrkDriver(Diagram):

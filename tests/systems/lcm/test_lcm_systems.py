@@ -17,7 +17,7 @@ from dvrk_drake.models.lcm_messages import StatusFilter, create_key_file
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.arm_connection import TolerantSerializer
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.lcm.dvrk_status_receiver import DvrkStatusReceiver
+from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])

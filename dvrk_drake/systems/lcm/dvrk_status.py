@@ -1,14 +1,39 @@
-"""The arm's end of the status channel."""
+"""The status channel of an arm as systems: the arm's sender with its clock, and the controller's receiver."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.lcm.arm_clock import ArmClock
+
+
+@dataclass(frozen=True)
+class ArmClock:
+    """An arm's clock, which begins with the context's time and never jumps.
+
+    Attributes:
+        start_utime: at time zero of the context [us].
+        period: in which the arm measures, judges and tells [s].
+    """
+
+    start_utime: int = 0
+    period: float = 1e-3
+
+    def utime(self, context: Context) -> int:
+        """Now [us]."""
+        return self.start_utime + round(1e6 * context.get_time())
+
+    def ticks(self, context: Context) -> int:
+        """How many periods have begun since time zero."""
+        return round(context.get_time() / self.period)
 
 
 class DvrkStatusSender(LeafSystem):
@@ -88,3 +113,49 @@ def fill_in_guard(status: lcmt_dvrk_status, guard: CommandGuard) -> None:
     status.num_ignored, status.ignored_code = counts.ignored, guard.ignored_code
     status.position_commanded = guard.output.position.tolist()
     status.joint_flags = guard.output.joint_flags.tolist()
+
+
+class DvrkStatusReceiver(LeafSystem):
+    """What one arm measures, as ports, from the status of an LcmSubscriberSystem.
+
+    .. pydrake_system::
+
+        name: DvrkStatusReceiver
+        input_ports:
+        - lcmt_dvrk_status
+        output_ports:
+        - position_measured
+        - velocity_estimated
+        - state_estimated
+        - effort_measured
+
+    `state_estimated` has 2n numbers, q, then v, the others n, in the arm's order [rad, rad/s, N m; m, m/s, N on a
+    prismatic joint]. Without a message of this arm, as before the first one, all are NaN: a pose that nobody measured
+    is not zero.
+    """
+
+    def __init__(self, arm: Arm) -> None:
+        """Of `arm`; messages of another arm or size count as none."""
+        super().__init__()
+        n = arm.num_joints
+        self._arm_name, self._num_joints = arm.name, n
+        self._status = self.DeclareAbstractInputPort("lcmt_dvrk_status", AbstractValue.Make(lcmt_dvrk_status()))
+        for name, fields in {
+            "position_measured": ("position",),
+            "velocity_estimated": ("velocity",),
+            "state_estimated": ("position", "velocity"),
+            "effort_measured": ("effort_measured",),
+        }.items():
+            self.DeclareVectorOutputPort(name, n * len(fields), self._make_calc(fields))
+
+    def _make_calc(self, fields: tuple[str, ...]) -> Callable[[Context, BasicVector], None]:
+        def calc(context: Context, output: BasicVector) -> None:
+            output.SetFromVector(np.concatenate([self._vector(context, field) for field in fields]))
+
+        return calc
+
+    def _vector(self, context: Context, field: str) -> NDArray[np.float64]:
+        status = self._status.Eval(context)
+        if status.arm_name != self._arm_name or status.num_joints != self._num_joints:
+            return np.full(self._num_joints, np.nan)
+        return np.array(getattr(status, field))
