@@ -19,8 +19,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.models.plant import add_arm, set_arm_positions, tree_selector
-from dvrk_drake.systems.arm_effects.drive_joints import PlantEffects
 from dvrk_drake.systems.arm_effects.drive_step import DriveStep
+from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 from dvrk_drake.systems.arm_effects.real_drive import RealDrive, add_real_drive
 from dvrk_drake.systems.ideal_drive import DrivePorts, PlantJoints, add_ideal_drive
 from dvrk_drake.systems.lcm.arm_connection import connect_arm

@@ -13,7 +13,7 @@ from dvrk_drake.dynamics.static_model import compile_effect_torque
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import POSITION_KINDS, ArmEffects
-from dvrk_drake.systems.arm_effects.drive_joints import PlantEffects
+from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 from dvrk_drake.systems.arm_effects.motors import Motors, motor_effort_into
 from dvrk_drake.systems.gravity_pid_step import entry_point
 

@@ -22,10 +22,8 @@ from pydrake.multibody.tree import (
 from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effects_schema import ArmEffects, Cable
+from dvrk_drake.models.effects_schema import Cable
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
-from dvrk_drake.systems.arm_effects.dry_friction import Slider, add_friction
-from dvrk_drake.systems.ideal_drive import PlantJoints
 
 #: Of each body that is added: its inertia, as a share of what the arm shows at the coordinate, and its mass [kg]. Drake
 #: makes a tie as stiff as the lighter of its bodies allows at the time step: so an MTM's parallelogram gives 1 mrad for
@@ -201,56 +199,3 @@ def _chain_name(i: int, leader: str) -> str:
 def _offset(frame: FixedOffsetFrame) -> NDArray[np.float64]:
     p: NDArray[np.float64] = frame.GetFixedPoseInBodyFrame().translation()
     return p
-
-
-class PlantEffects:
-    """Adds them to a plant that is not finalized, and says afterwards where they are in it.
-
-    Attributes:
-        drive: the joints that were added for coordinates of the drive.
-        to_actuators: (n, nq) positions of the plant to those of the arm's actuators; after `finish`.
-        from_motors: (nv, n) efforts of the motors to those on the plant; after `finish`.
-        joint_index: (n,) of the joints in the plant's q and v; after `finish`.
-        sliders: friction that follows; after `finish`.
-        num_actuators: of the plant's instance; after `finish`.
-    """
-
-    def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex, effects: ArmEffects) -> None:
-        """Of the `arm` that `add_arm` added to `plant` as `instance`; `friction`, `stops` and `stretch` count.
-
-        Raises:
-            StationError: an effect that the arm cannot have.
-        """
-        self._plant, self._arm = plant, arm
-        self.drive = DriveJoints(plant, arm, instance)
-        for actuator, cable in effects.stretch.items():
-            self.drive.add_motor(actuator, cable)
-        self._elements = add_friction(plant, arm, self.drive, effects.friction)
-        # Drake disarms the gains of all of an instance's actuators while their desired state is not connected.
-        self.needs_desired_state = any(effect.kind != "viscous" for effect in effects.friction)
-        if effects.stops:
-            rows, lower, upper = arm.limit_matrix()
-            for i in range(arm.num_joints, len(rows)):
-                joint, ratio = self.drive.joint(rows[i])
-                ends = np.sort([lower[i] / ratio, upper[i] / ratio])
-                joint.set_position_limits(ends[:1], ends[1:])
-
-    @property
-    def time_step(self) -> float:
-        """Of the plant [s]."""
-        step: float = self._plant.time_step()
-        return step
-
-    def finish(self, joints: PlantJoints) -> None:
-        """To be called when the plant is finalized."""
-        order = [actuator.index() for actuator in joints.actuators]
-        self.num_actuators = len(order)
-        self.sliders = [Slider.of(element, order) for element in self._elements]
-        J = self._arm.transmission.matrix
-        self.to_actuators: NDArray[np.float64] = np.ascontiguousarray(J @ joints.selection.T)
-        self.from_motors: NDArray[np.float64] = np.ascontiguousarray(joints.selection @ J.T)
-        self.joint_index = joints.index
-        for i, name in enumerate(self._arm.joint_names):
-            if (motor := self.drive.motors.get(name)) is not None:
-                own = np.eye(self._plant.num_positions())[motor.joint().position_start()]
-                self.to_actuators[i] = self.from_motors[:, i] = own

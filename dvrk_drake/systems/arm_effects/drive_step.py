@@ -13,7 +13,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, 
 from dvrk_drake.dynamics.actuator_effects import effect_step
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
-from dvrk_drake.systems.arm_effects.drive_joints import PlantEffects
+from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 from dvrk_drake.systems.arm_effects.motors import in_steps
 from dvrk_drake.systems.gravity_pid_step import entry_point
 
