@@ -23,8 +23,6 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     shown = verb.add_mutually_exclusive_group()
     for name in ("latex", "python", "c"):
         shown.add_argument(f"--{name}", dest="format", action="store_const", const=name, help=f"write {name} source")
-    verb.add_argument("--frames", default="dh", help="link frames of the parameters: dh (dVRK) or paper (Table I)")
-    verb.add_argument("--serial", action="store_true", help="leave out the links of the linkage, as the paper does")
     verb.add_argument("--output", metavar="FILE", help="write to a file instead of standard output")
     add_overwrite(verb)
     add_gravity(verb)
@@ -51,9 +49,9 @@ def _model(options: argparse.Namespace) -> None:
             raise DvrkDrakeError("--output needs to know what to write: --latex, --python or --c")
         check_output(options.output, overwrite=options.overwrite)
     arm = mounted(load_arm(options.arm), options.gravity)
-    gravity = derive_gravity(arm, options.frames, options.serial)
+    gravity = derive_gravity(arm)
     writers = {
-        "latex": lambda gravity: gravity_sources.to_latex(gravity, SymbolicPlant(arm, options.frames).frame_poses()),
+        "latex": lambda gravity: gravity_sources.to_latex(gravity, SymbolicPlant(arm).frame_poses()),
         "python": gravity_sources.to_python,
         "c": gravity_sources.to_c,
     }
