@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
+from dvrk_drake.experiments.study.study import await_results
 from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.coupled_limits import beside
@@ -252,9 +253,7 @@ def collect(
     poses[:, wide] = np.clip(poses[:, wide], -REACH, REACH)
     chunks = np.array_split(poses, -(-count // _CHUNK))
     futures = [executor.submit(_collect_chunk, name, truth.arm, c, seed + i) for i, c in enumerate(chunks)]
-    for done, _ in enumerate(as_completed(futures), 1):
-        progress(done / len(futures))
-    rows = np.concatenate([future.result() for future in futures])
+    rows = np.concatenate(await_results(futures, progress))
     q, tau = np.split(rows, 2, axis=1)
     return Recording(q=q, tau=tau, source=f"{count} poses of the simulated {arm.name}")
 

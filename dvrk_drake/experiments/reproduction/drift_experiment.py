@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cache
 
@@ -17,6 +17,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.simulation import samples
+from dvrk_drake.experiments.study.study import await_results
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.coupled_limits import beside
 from dvrk_drake.systems.arm_station import ArmStation
@@ -113,9 +114,7 @@ def release_all(
 ) -> NDArray[np.float64]:
     """Positions (cases, samples, n) of each; they do not depend on the executor."""
     futures = [executor.submit(release, case) for case in cases]
-    for done, _ in enumerate(as_completed(futures), 1):
-        progress(done / len(futures))
-    return np.array([future.result() for future in futures])
+    return np.array(await_results(futures, progress))
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future,
 from contextlib import contextmanager
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from dvrk_drake.experiments.study.table import ParquetStudyTable, Row, StudyTabl
 if TYPE_CHECKING:
     from distributed import Client
 
+Result = TypeVar("Result")
 #: Called with the number of rows that are there, and the number of all cases.
 Progress = Callable[[int, int], None]
 
@@ -146,6 +147,14 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
         raise
     finally:
         executor.shutdown(cancel_futures=True)
+
+
+def await_results(futures: Sequence[Future[Result]], progress: Callable[[float], None]) -> list[Result]:
+    """The results of all futures in their order, or the first error; `progress` is called with the finished share."""
+    for done, future in enumerate(as_completed(futures), start=1):
+        future.result()
+        progress(done / len(futures))
+    return [future.result() for future in futures]
 
 
 def _allocator_environment() -> dict[str, str]:

@@ -223,6 +223,12 @@ class Share:
     lower: float
     upper: float
 
+    @classmethod
+    def of(cls, yes: int, runs: int) -> Share:
+        """The share of `yes` among `runs`, with its interval."""
+        interval = binomtest(yes, runs).proportion_ci(method="wilson")
+        return cls(yes, runs, float(interval.low), float(interval.high))
+
 
 @dataclass(frozen=True)
 class Quantiles:
@@ -262,9 +268,7 @@ def values_of(measure: Measure, rows: list[Row]) -> NDArray[np.float64]:
 def _summary_of(measure: Measure, rows: list[Row]) -> Share | Quantiles:
     values = values_of(measure, rows)
     if measure.is_answer:
-        yes = int(values.sum())
-        interval = binomtest(yes, len(values)).proportion_ci(method="wilson")
-        return Share(yes, len(values), float(interval.low), float(interval.high))
+        return Share.of(int(values.sum()), len(values))
     # Values of runs, not between runs: infinite ones have no middle.
     median, percentile_95 = np.quantile(values, [0.5, 0.95], method="inverted_cdf")
     return Quantiles(float(median), float(percentile_95), float(values.max()))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Executor, Future, as_completed
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.experiments.study.study import local_executor
+from dvrk_drake.experiments.study.study import await_results, local_executor
 from dvrk_drake.experiments.tuning.bench import (
     NOMINAL,
     Bench,
@@ -184,8 +184,7 @@ def tune_arm(
     with local_executor() as executor:
         if "paper" in methods:
             trials = [executor.submit(_tune_joint, name, j) for j in range(arm.num_joints)]
-            _await(trials, lambda done: progress(share * done))
-            procedure = tuple(trial.result() for trial in trials)
+            procedure = tuple(await_results(trials, lambda done: progress(share * done)))
             gains["paper"] = rounded_gains((joint.kp, joint.kd, joint.ki) for joint in procedure)
         if "model" in methods:
             design = design_arm(arm)
@@ -210,7 +209,7 @@ def _compare(
         for which in gains
         for p in range(poses)
     }
-    _await(list(runs.values()), progress)
+    await_results(list(runs.values()), progress)
     columns = range(len(conditions))
     measures = {which: [[runs[which, c, p].result()[0] for p in range(poses)] for c in columns] for which in gains}
     responses = {which: runs[which, 0, 0].result()[1] for which in gains}
@@ -225,9 +224,3 @@ def _step(name: str, condition: Condition, poses: int, pose: int, gains: Gains) 
     bench = bench_of(name, condition)
     response = run_step(bench, tuning_poses(bench.arm, poses, SEED)[pose], gains)
     return measure_step(bench.arm, response), response
-
-
-def _await(futures: Sequence[Future], progress: Progress) -> None:
-    for done, future in enumerate(as_completed(futures), start=1):
-        future.result()
-        progress(done / len(futures))

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import binomtest
 
+from dvrk_drake.experiments.study.table import Share
 from dvrk_drake.models.files import atomic_write
 
 
@@ -92,8 +92,9 @@ def numbers(values: ArrayLike, pattern: str) -> tuple[str, ...]:
 
 def share(held: int, of: int) -> str:
     """A share with its 95 % confidence interval (Wilson, 1927)."""
-    low, high = binomtest(held, of).proportion_ci(method="wilson")
-    return f"{held} of {of} ({100 * held / of:.1f} %, 95 % interval {100 * low:.1f}..{100 * high:.1f} %)"
+    interval = Share.of(held, of)
+    low, high = 100 * interval.lower, 100 * interval.upper
+    return f"{held} of {of} ({100 * held / of:.1f} %, 95 % interval {low:.1f}..{high:.1f} %)"
 
 
 def _line(cells: Sequence[str]) -> str:
