@@ -23,8 +23,7 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
-from dvrk_drake.systems.hand import Hand
-from dvrk_drake.systems.hand_path import HandPath
+from dvrk_drake.systems.hand import Hand, HandPath
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,7 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import connect_controller
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.hand import Grip, Hand
-from dvrk_drake.systems.hand_path import PoseTrajectorySource
+from dvrk_drake.systems.hand import Grip, Hand, PoseTrajectorySource
 
 #: Of what is recorded [s].
 SAMPLE_PERIOD = 5e-3

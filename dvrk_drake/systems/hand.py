@@ -1,4 +1,4 @@
-"""A person's hand on an arm: a spring and damper between a frame of the arm and where the hand wants it."""
+"""A person's hand on an arm: a spring and damper between a frame of the arm and the path that the hand follows."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 
 from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import StationError
@@ -142,3 +143,66 @@ def _limited(vector: NDArray[np.floating], limit: float) -> NDArray[np.floating]
     """`vector`, shortened to a length of `limit` if it is longer."""
     length = float(np.linalg.norm(vector))
     return vector if length <= limit else vector * (limit / length)
+
+
+class PoseTrajectorySource(LeafSystem):
+    """Gives the pose of a trajectory at the context's time; before it and after it, that of its end.
+
+    .. pydrake_system::
+
+        name: PoseTrajectorySource
+        output_ports:
+        - pose
+
+    - `pose` (RigidTransform). Drake's TrajectorySource gives vectors only.
+    """
+
+    def __init__(self, trajectory: PiecewisePose) -> None:
+        super().__init__()
+        self._trajectory = trajectory
+        self.DeclareAbstractOutputPort(
+            name="pose",
+            alloc=lambda: AbstractValue.Make(RigidTransform()),
+            calc=self._calc_pose,
+            prerequisites_of_calc={self.time_ticket()},
+        )
+
+    def _calc_pose(self, context: Context, output: AbstractValue) -> None:
+        time = min(max(context.get_time(), self._trajectory.start_time()), self._trajectory.end_time())
+        output.set_value(self._trajectory.GetPose(time))
+
+
+class HandPath(LeafSystem):
+    """The pose X_BG that a frame G of an arm with base B has where its joints follow a trajectory.
+
+    .. pydrake_system::
+
+        name: HandPath
+        output_ports:
+        - X_BG_desired
+
+    - `X_BG_desired` (RigidTransform): for `Hand`'s port of that name. Before the trajectory starts and after its end it
+      is not a number: the hand has let go.
+    """
+
+    def __init__(self, arm: Arm, frame_name: str, trajectory: PiecewisePolynomial) -> None:
+        """Of the frame that `arm`'s SDF names so, along `trajectory` (n) of its joints [rad, m].
+
+        Raises:
+            ArmError: no such frame.
+        """
+        super().__init__()
+        self._frame, self._trajectory = ArmFrame(arm, frame_name), trajectory
+        self.DeclareAbstractOutputPort(
+            name="X_BG_desired",
+            alloc=lambda: AbstractValue.Make(RigidTransform()),
+            calc=self._calc_pose,
+            prerequisites_of_calc={self.time_ticket()},
+        )
+
+    def _calc_pose(self, context: Context, output: AbstractValue) -> None:
+        time, trajectory = context.get_time(), self._trajectory
+        if trajectory.start_time() <= time <= trajectory.end_time():
+            output.set_value(self._frame.pose(trajectory.value(time).ravel()))
+        else:
+            output.set_value(RigidTransform(np.full(3, np.nan)))

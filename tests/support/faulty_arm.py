@@ -12,8 +12,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.hand import Hand
-from dvrk_drake.systems.hand_path import HandPath
+from dvrk_drake.systems.hand import Hand, HandPath
 from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import SimDvrkDriver

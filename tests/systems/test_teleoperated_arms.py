@@ -13,7 +13,7 @@ from dvrk_drake.experiments.demo.teleoperation import (
     START_FOLLOWER,
     START_MASTER,
 )
-from dvrk_drake.systems.hand_path import PoseTrajectorySource
+from dvrk_drake.systems.hand import PoseTrajectorySource
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
 

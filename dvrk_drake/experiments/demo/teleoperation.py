@@ -20,7 +20,7 @@ from pydrake.visualization import MeshcatPoseSliders
 from dvrk_drake.experiments.simulation import recorded_in
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.arm_view import start_meshcat
-from dvrk_drake.systems.hand_path import PoseTrajectorySource
+from dvrk_drake.systems.hand import PoseTrajectorySource
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
 SCALE = 0.4
