@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.signals.drive_efforts import (
     FRICTION_PARTS,
     FrictionPart,
@@ -21,6 +24,8 @@ from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.files import refuse_existing
+from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: Parts of the motion, cut by its phase where it repeats, each predicted from the others to decide what is kept.
@@ -68,15 +73,65 @@ class Recalibration:
         actuators: in the arm's order.
         shared: scales of friction at places that several actuators move, e.g. "finger_1 dry".
         seconds: of the motion that were used, a second at each end left out.
+        warnings: what `check` found in the recording; `str` of each is one line.
     """
 
     model: IdentifiedModel
     actuators: list[RecalibratedActuator]
     shared: dict[str, float]
     seconds: float
+    warnings: tuple[Finding, ...] = ()
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Writes the model file, at once or not at all.
+
+        Args:
+            path: the YAML file to write.
+            overwrite: replace an existing file.
+
+        Raises:
+            DvrkDrakeError: the file exists, or cannot be written.
+        """
+        refuse_existing(path, overwrite)
+        self.model.save(path)
 
 
-def recalibrate(model: IdentifiedModel, recording: Recording) -> Recalibration:
+def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progress | None = None) -> Recalibration:
+    """Checks a short motion and refits a model's friction and offsets to it: what `dvrk-drake recalibrate` does.
+
+    The gain is for motions like that one; at other positions and speeds it can be much smaller.
+
+    Args:
+        model: identified from a motion.
+        recording: a motion with efforts (m, n), in joint or actuator coordinates, of another day.
+        progress: called with the step, "checking the recording" or "refitting friction", and its finished share 0..1.
+
+    Returns:
+        The new model as `model`, each actuator's error before and after as `actuators`, and `warnings`.
+
+    Raises:
+        RecordingError: `check` refuses the recording, it is of another arm, or no actuator moves both ways.
+        ModelError: the model has no dynamics.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("psm"))  # of poses: it has no friction to refit
+        >>> try:
+        ...     dvrk.recalibrate(model, dvrk.Recording(q=np.zeros((9, 7)), tau=np.ones((9, 7))))
+        ... except dvrk.DvrkDrakeError as error:
+        ...     print(error)
+        the model has no dynamics: it was identified from poses; identify a motion
+    """
+    dynamics = model.dynamic_model
+    report = check_recording(recording, dynamics.arm)
+    step_progress(progress, "checking the recording")(1.0)
+    report.require_usable()
+    result = refit_friction(model, recording)
+    step_progress(progress, "refitting friction")(1.0)
+    return replace(result, warnings=report.warnings)
+
+
+def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibration:
     """Fits one scale of dry and one of viscous friction at every coordinate of the drive, and an offset an actuator.
 
     Rigid bodies, springs and cables stay. Each of `FOLDS` parts of the motion is predicted from the others: where an

@@ -6,13 +6,12 @@ from pydrake.systems.framework import DiagramBuilder, System
 
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
-from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 
 def add_closed_loop(
     builder: DiagramBuilder,
     station: ArmStation,
-    controller: GravityPidController,
+    controller: System,
     desired: System | None = None,
     friction: FrictionCompensator | None = None,
 ) -> None:
@@ -21,7 +20,8 @@ def add_closed_loop(
     Args:
         builder: of the diagram that they become part of.
         station: the arm.
-        controller: of an arm with the same joints.
+        controller: of an arm with the same joints: a `GravityPidController`, or a System with an input port
+            `state_estimated` (2n) and an output port `effort` (n).
         desired: a source with one output port: q_d, then v_d (2n,). Without it the controller holds where it starts.
         friction: takes a share of the arm's friction off a hand.
     """
@@ -32,7 +32,7 @@ def add_closed_loop(
 def connect_controller(
     builder: DiagramBuilder,
     station: ArmStation,
-    controller: GravityPidController,
+    controller: System,
     desired: System | None = None,
     friction: FrictionCompensator | None = None,
 ) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+
+from dvrk_drake.errors import RecordingError
 
 Severity = Literal["note", "warning", "refusal"]
 
@@ -107,6 +109,36 @@ class RecordingReport:
     def refusals(self) -> tuple[Finding, ...]:
         """The findings with which nothing should be identified."""
         return tuple(finding for finding in self.findings if finding.severity == "refusal")
+
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
+        """The findings that make results worse."""
+        return tuple(finding for finding in self.findings if finding.severity == "warning")
+
+    def apart_from(self, kind: str) -> RecordingReport:
+        """Returns the report without the findings of one kind."""
+        return replace(self, findings=tuple(finding for finding in self.findings if finding.kind != kind))
+
+    @property
+    def refusal(self) -> str:
+        """The first refusal in one line, with the number of all; "" without any."""
+        if not self.refusals:
+            return ""
+        first, *others = self.refusals
+        reasons = f"refused for {len(others) + 1} reasons, the first: " if others else "refused: "
+        where = "" if first.where == self.source else f"{first.where}: "
+        return f"{self.source}: {reasons}{where}{first.what}; {first.advice}"
+
+    def require_usable(self) -> None:
+        """Refuses a recording that has refusals.
+
+        Raises:
+            RecordingError: the first refusal; refusals and warnings are its `findings`.
+        """
+        if self.refusals:
+            error = RecordingError(self.refusal)
+            error.findings = (*self.refusals, *self.warnings)
+            raise error
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: what does not apply is null."""
