@@ -115,12 +115,16 @@ def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progr
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
-        >>> model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("psm"))  # of poses: it has no friction to refit
-        >>> try:
-        ...     dvrk.recalibrate(model, dvrk.Recording(q=np.zeros((9, 7)), tau=np.ones((9, 7))))
-        ... except dvrk.DvrkDrakeError as error:
-        ...     print(error)
-        the model has no dynamics: it was identified from poses; identify a motion
+        >>> arm = dvrk.load_arm("psm")
+        >>> model, today = (dvrk.IdentifiedModel.from_arm(arm, dynamics=True) for _ in range(2))
+        >>> for effect in today.dynamics.effects:
+        ...     effect.value *= 1.5 if effect.kind == "presliding" else 1.0
+        >>> t, w, reach = np.arange(0, 12, 0.01)[:, None], 1 + 0.25 * np.arange(7), 0.3 * arm.position_upper
+        >>> q, v, vd = reach * (1 + np.sin(w * t)), reach * w * np.cos(w * t), -reach * w**2 * np.sin(w * t)
+        >>> tau = arm.transmission.pull_back_effort(today.dynamic_model.effort(q, v, vd))
+        >>> result = dvrk.recalibrate(model, dvrk.Recording(q=q, qd=v, tau=tau, t=t[:, 0]))
+        >>> round(result.actuators[0].dry, 2), bool(result.actuators[0].after < 0.1 * result.actuators[0].before)
+        (1.5, True)
     """
     dynamics = model.dynamic_model
     report = check_recording(recording, dynamics.arm)

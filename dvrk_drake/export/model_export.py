@@ -130,7 +130,7 @@ def export_model(
         >>> model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("psm"))
         >>> exported = dvrk.export_model(model, "psm.json", "dvrk-kinematic-gc", tolerance=0.5)
         >>> exported.compensation.mass.shape  # [kg] of the links of the controller's chain
-        (5,)
+        (7,)
     """
     if format is None:
         suffix = Path(path).suffix

@@ -57,7 +57,7 @@ class Recording:
         >>> poses = dvrk.Recording(q=np.zeros((8, 7)), tau=np.ones((8, 7)), coordinates="actuator")
         >>> joints = poses.in_joint_coordinates(dvrk.load_arm("mtmr"))
         >>> joints.tau[0].round(2).tolist()  # tau_joint = J' tau_actuator
-        [1.0, 2.0, 2.67, 1.0, 1.0, 1.0, 1.0]
+        [1.0, 2.0, 1.67, 1.0, 1.0, 1.0, 1.0]
     """
 
     q: NDArray[np.float64]

@@ -16,6 +16,8 @@ from dvrk_drake.analysis.static.doubts import Doubt, usable_measurements
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
 from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.experiments.scenario import Scenario
+from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.recording import Recording
@@ -167,6 +169,15 @@ def plot_positions(
         figure.legend(*key, loc="lower right", fontsize=8)
     figure.suptitle(title)
     save_figure(figure, path)
+
+
+def plot_simulation(path: Path, simulation: Simulation, scenario: Scenario) -> None:
+    """Writes a PNG of the simulated positions, beside the desired ones if there are any."""
+    curves = {"simulated": simulation.recording.q}
+    if simulation.desired is not None:
+        curves["desired"] = simulation.desired
+    arm = scenario.mounted_arm
+    plot_positions(path, arm, simulation.time, curves, f"{arm.name}, simulated, mode {scenario.controller.mode}")
 
 
 def save_figure(figure: plt.Figure, path: Path) -> None:

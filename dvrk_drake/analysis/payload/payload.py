@@ -224,12 +224,20 @@ def payload(
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
-        >>> poses = dvrk.Recording(q=np.zeros((9, 7)), tau=np.ones((9, 7)))
-        >>> try:
-        ...     dvrk.payload(poses, poses, dvrk.load_arm("psm"), link="tool")
-        ... except dvrk.DvrkDrakeError as error:
-        ...     print(str(error)[:40])
-        unknown link "tool"; links of PSM that m
+        >>> arm = dvrk.load_arm("psm")
+        >>> t, w = np.arange(0, 8, 0.01)[:, None], 1 + 0.25 * np.arange(7)
+        >>> middle = (arm.position_upper + arm.position_lower) / 2
+        >>> reach = 0.3 * (arm.position_upper - arm.position_lower)
+        >>> q, v, vd = middle + reach * np.sin(w * t), reach * w * np.cos(w * t), -reach * w**2 * np.sin(w * t)
+        >>> def recorded(model):
+        ...     tau = arm.transmission.pull_back_effort(model.dynamic_model.effort(q, v, vd))
+        ...     return dvrk.Recording(q=q, qd=v, tau=tau, t=t[:, 0])
+        >>> model, heavier = (dvrk.IdentifiedModel.from_arm(arm, dynamics=True) for _ in range(2))
+        >>> links = {link.link: link for link in heavier.dynamics.links}
+        >>> links["end_link"].parameters[0] += 0.1  # [kg] at the origin of the link
+        >>> result = dvrk.payload(recorded(model), recorded(heavier), model, "end_link")
+        >>> round(result.payload.body.mass, 3), result.warnings
+        (0.1, ())
     """
     arm = model if isinstance(model, Arm) else model.load_arm()
     check_links(DynamicRegressor(arm), [] if link is None else [link])

@@ -25,7 +25,7 @@ from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.arm_view import framing, start_meshcat
+from dvrk_drake.systems.arm_view import start_meshcat
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
@@ -177,7 +177,7 @@ def run_demo(
     paper_model = identify_static(poses, arm, "paper").model
     fresh_paper = validate_static(paper_model, fresh_poses)
 
-    meshcat = start_meshcat(*framing(true_arm.arm))
+    meshcat = start_meshcat(true_arm.arm)
     t, released = _release(true_arm, model, plan, meshcat, lambda share: progress("releasing and holding", share / 3))
     with atomic_write(output / "arm.html") as stream:
         stream.write(meshcat.StaticHtml())
