@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import Finding
-from dvrk_drake.analysis.check.recording_check import check_with_channels
+from dvrk_drake.analysis.check.recording_check import require_usable
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, identify_dynamic
 from dvrk_drake.analysis.signals.static_segments import find_poses
 from dvrk_drake.analysis.static.static_identification import Method, StaticIdentification, identify_static
@@ -63,11 +63,7 @@ def identify(
         >>> result.save("model.yaml")
     """
     poses = find_poses(recording, arm, slow_parts)
-    report_check = step_progress(progress, "checking the recording")
-    report_check(0.0)
-    report = check_with_channels(poses.recording, arm)
-    report.require_usable()
-    report_check(1.0)
+    report = require_usable(poses.recording, arm, progress, channels=True)
     share = step_progress(progress, "identifying")
     try:
         if poses.moves:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from dvrk_drake.analysis.check.findings import Finding
-from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.analysis.check.recording_check import require_usable
 from dvrk_drake.analysis.signals.drive_efforts import (
     FRICTION_PARTS,
     FrictionPart,
@@ -127,9 +127,7 @@ def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progr
         (1.5, True)
     """
     dynamics = model.dynamic_model
-    report = check_recording(recording, dynamics.arm)
-    step_progress(progress, "checking the recording")(1.0)
-    report.require_usable()
+    report = require_usable(recording, dynamics.arm, progress)
     result = refit_friction(model, recording)
     step_progress(progress, "refitting friction")(1.0)
     return replace(result, warnings=report.warnings)

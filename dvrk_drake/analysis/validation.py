@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from dvrk_drake.analysis.check.findings import Finding
-from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.analysis.check.recording_check import require_usable
 from dvrk_drake.analysis.dynamic.validation import DynamicValidation, predict_motion, validate_motion
 from dvrk_drake.analysis.results import Prediction
 from dvrk_drake.analysis.signals.static_segments import find_poses
@@ -50,9 +50,7 @@ def validate(
     """
     arm = model.load_arm()
     poses = find_poses(recording, arm, slow_parts)
-    report = check_recording(poses.recording, arm)
-    step_progress(progress, "checking the recording")(1.0)
-    report.require_usable()
+    report = require_usable(poses.recording, arm, progress)
     validation: StaticValidation | DynamicValidation
     if poses.moves and model.dynamics is not None:
         validation = validate_motion(model, poses.recording)
@@ -104,11 +102,7 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
     measured = recording if recording.tau is not None else replace(recording, tau=np.zeros_like(recording.q))
     if model.dynamics is None or not find_poses(measured, arm).moves:
         return Prediction(predict_static(model, recording))
-    report = check_recording(measured, arm)
-    if recording.tau is None:
-        report = report.apart_from("no effort")
-    step_progress(progress, "checking the recording")(1.0)
-    report.require_usable()
+    report = require_usable(measured, arm, progress, apart_from="no effort" if recording.tau is None else "")
     tau = predict_motion(model, recording)
     if recording.coordinates == "joint":
         tau = arm.transmission.pull_back_effort(tau)

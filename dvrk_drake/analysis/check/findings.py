@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-
-from dvrk_drake.errors import RecordingError
 
 Severity = Literal["note", "warning", "refusal"]
 
@@ -115,10 +113,6 @@ class RecordingReport:
         """The findings that make results worse."""
         return tuple(finding for finding in self.findings if finding.severity == "warning")
 
-    def apart_from(self, kind: str) -> RecordingReport:
-        """Returns the report without the findings of one kind."""
-        return replace(self, findings=tuple(finding for finding in self.findings if finding.kind != kind))
-
     @property
     def refusal(self) -> str:
         """The first refusal in one line, with the number of all; "" without any."""
@@ -128,17 +122,6 @@ class RecordingReport:
         reasons = f"refused for {len(others) + 1} reasons, the first: " if others else "refused: "
         where = "" if first.where == self.source else f"{first.where}: "
         return f"{self.source}: {reasons}{where}{first.what}; {first.advice}"
-
-    def require_usable(self) -> None:
-        """Refuses a recording that has refusals.
-
-        Raises:
-            RecordingError: the first refusal; refusals and warnings are its `findings`.
-        """
-        if self.refusals:
-            error = RecordingError(self.refusal)
-            error.findings = (*self.refusals, *self.warnings)
-            raise error
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: what does not apply is null."""

@@ -261,6 +261,41 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
     return replace(report, findings=(*refusals, *others))
 
 
+def require_usable(
+    recording: Recording,
+    arm: Arm,
+    progress: Progress | None = None,
+    *,
+    channels: bool = False,
+    apart_from: str = "",
+) -> RecordingReport:
+    """Checks a recording before it is used.
+
+    Args:
+        recording, arm: as of `check_recording`.
+        progress: called with the step, "checking the recording", and its finished share 0..1.
+        channels: check them too, see `check_with_channels`.
+        apart_from: kind of findings that do not matter.
+
+    Returns:
+        The report, without refusals.
+
+    Raises:
+        RecordingError: the first refusal; refusals and warnings are its `findings`.
+    """
+    report_share = step_progress(progress, "checking the recording")
+    report_share(0.0)
+    report = (check_with_channels if channels else check_recording)(recording, arm)
+    report_share(1.0)
+    kept = tuple(finding for finding in report.findings if finding.kind != apart_from)
+    report = replace(report, findings=kept)
+    if report.refusals:
+        error = RecordingError(report.refusal)
+        error.findings = (*report.refusals, *report.warnings)
+        raise error
+    return report
+
+
 def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
     """As `check_recording`, with the findings of `check_channels` for a recording that has no other refusals.
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
 from dvrk_drake.analysis.check.findings import Finding
-from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.analysis.check.recording_check import require_usable
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
 from dvrk_drake.analysis.payload.motion_difference import MotionDifference, motion_difference
@@ -225,7 +225,7 @@ def payload(
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
         >>> arm = dvrk.load_arm("psm")
-        >>> t, w = np.arange(0, 8, 0.01)[:, None], 1 + 0.25 * np.arange(7)
+        >>> t, w = np.arange(0, 11, 0.02)[:, None], 1 + 0.25 * np.arange(7)
         >>> middle = (arm.position_upper + arm.position_lower) / 2
         >>> reach = 0.3 * (arm.position_upper - arm.position_lower)
         >>> q, v, vd = middle + reach * np.sin(w * t), reach * w * np.cos(w * t), -reach * w**2 * np.sin(w * t)
@@ -236,17 +236,15 @@ def payload(
         >>> links = {link.link: link for link in heavier.dynamics.links}
         >>> links["end_link"].parameters[0] += 0.1  # [kg] at the origin of the link
         >>> result = dvrk.payload(recorded(model), recorded(heavier), model, "end_link")
-        >>> round(result.payload.body.mass, 3), result.warnings
-        (0.1, ())
+        >>> round(result.payload.body.mass, 3), result.payload.found  # [kg]
+        (0.1, True)
     """
     arm = model if isinstance(model, Arm) else model.load_arm()
     check_links(DynamicRegressor(arm), [] if link is None else [link])
     found: tuple[Finding, ...] = ()
-    for k, recording in enumerate((reference, loaded)):
-        report = check_recording(recording, arm)
-        step_progress(progress, "checking the recording")((k + 1) / 2)
-        report.require_usable()
-        found += report.warnings
+    for recording in (reference, loaded):
+        report = require_usable(recording, arm, progress)
+        found += tuple(replace(warning, where=f"{report.source}: {warning.where}") for warning in report.warnings)
     if isinstance(model, Arm):
         model = identify_dynamic(reference, arm, step_progress(progress, "identifying")).model
     estimates = estimate_payload(reference, loaded, model.dynamic_model, progress=step_progress(progress, "estimating"))
