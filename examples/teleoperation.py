@@ -7,15 +7,15 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from dvrk_drake.experiments.demo.teleoperation import START_FOLLOWER, START_MASTER, start_scene
-from dvrk_drake.models.arm import load_arm
-from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
+import dvrk_drake as dvrk
 
-meshcat = start_scene()
-arms = TeleoperatedArms(load_arm("mtml"), load_arm("psm"), scale=1 / 3, meshcat=meshcat)
+meshcat = dvrk.start_meshcat(camera=[1.7, 0.45, 0.5], target=[0, -0.12, 0.08])
+meshcat.SetTransform("mtml", RigidTransform([0, 0.45, 0.05]))  # where the bases stand [m]
+meshcat.SetTransform("psm", RigidTransform([0, -0.22, 0]))
+arms = dvrk.TeleoperatedArms(dvrk.load_arm("mtml"), dvrk.load_arm("psm"), scale=1 / 3, meshcat=meshcat)
 simulator = Simulator(arms)
 context = simulator.get_mutable_context()
-arms.set_positions(context, START_MASTER, START_FOLLOWER)
+arms.set_positions(context, [0, 0.25, -0.1, 0, 1.2, 0, 0], [0, 0, 0.13, 0, 0, 0, 0.5])
 X_MG0, X_FT0 = arms.X_MG(context), arms.X_FT(context)
 
 arms.GetInputPort("engaged").FixValue(context, [1.0])

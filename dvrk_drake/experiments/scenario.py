@@ -108,6 +108,13 @@ class Scenario:
         real_arm: parts of the arm's own `effects` that the simulation has, by name; ["all"] for all of them.
         effort_noise: standard deviation of recorded efforts, as a share of the effort limits.
         seed: of all noise, and of the controller's parameter error.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> scenario = dvrk.Scenario(arm="psm", duration=0.1, real_arm=["friction"])
+        >>> scenario.controller.mode = "gravity"
+        >>> dvrk.simulate(scenario).recording.measured_effort().shape
+        (11, 7)
     """
 
     arm: str = ""

@@ -22,6 +22,12 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
 
     Raises:
         ScenarioError: the file cannot be read, has an unknown key, or asks for what makes no sense.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> scenario = dvrk.load_scenario("mtml", ["duration=2", "controller.mode=damped"])
+        >>> scenario.duration, scenario.controller.mode
+        (2.0, 'damped')
     """
     path = Path(arm_or_file)
     if path.suffix in (".yaml", ".yml"):

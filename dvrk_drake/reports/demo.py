@@ -13,13 +13,13 @@ from dvrk_drake.experiments.demo.demo import (
     RELEASED_UNTIL,
     DemoResult,
 )
-from dvrk_drake.reports.figures import plot_identification, plot_positions, plot_torque_error
+from dvrk_drake.reports.figures import plot_positions, plot_static_identification, plot_torque_error
 
 
 def plot_demo(output: Path, result: DemoResult) -> None:
     """Writes torque_error.png, predicted.png, fresh_torque_error.png, release.png and step.png into `output`."""
     arm = result.arm
-    plot_identification(output, result.identification)
+    plot_static_identification(output, result.identification)
     plot_torque_error(
         output / "fresh_torque_error.png",
         arm,

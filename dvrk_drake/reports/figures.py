@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.static.doubts import Doubt, usable_measurements
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
-from dvrk_drake.analysis.static.validation import Validation
+from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.experiments.scenario import Scenario
+from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.recording import Recording
@@ -110,7 +112,7 @@ def plot_measured_against_predicted(
     save_figure(figure, path)
 
 
-def plot_identification(folder: Path, result: StaticIdentification) -> None:
+def plot_static_identification(folder: Path, result: StaticIdentification) -> None:
     """Writes torque_error.png and predicted.png of an identification."""
     recording = result.recording
     joints = result.model.joints
@@ -127,11 +129,14 @@ def plot_identification(folder: Path, result: StaticIdentification) -> None:
     plot_measured_against_predicted(folder / "predicted.png", result.model, recording, result.measured, result.doubts)
 
 
-def plot_validation(folder: Path, model: IdentifiedModel, validation: Validation, recording: Recording) -> None:
-    """Writes torque_error.png and predicted.png of a validation; `recording` in joint coordinates."""
+def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
+    """Writes torque_error.png and predicted.png of a validation."""
+    model = validation.model
+    arm = model.load_arm()
+    recording = validation.recording.in_joint_coordinates(arm)
     plot_torque_error(
         folder / "torque_error.png",
-        model.load_arm(),
+        arm,
         np.array([j.rms_torque for j in validation.joints]),
         {"model": np.array([j.rms_error for j in validation.joints])},
         f"{model.arm}: all {validation.poses} poses of {Path(recording.source).name}",
@@ -164,6 +169,15 @@ def plot_positions(
         figure.legend(*key, loc="lower right", fontsize=8)
     figure.suptitle(title)
     save_figure(figure, path)
+
+
+def plot_simulation(path: Path, simulation: Simulation, scenario: Scenario) -> None:
+    """Writes a PNG of the simulated positions, beside the desired ones if there are any."""
+    curves = {"simulated": simulation.recording.q}
+    if simulation.desired is not None:
+        curves["desired"] = simulation.desired
+    arm = scenario.mounted_arm
+    plot_positions(path, arm, simulation.time, curves, f"{arm.name}, simulated, mode {scenario.controller.mode}")
 
 
 def save_figure(figure: plt.Figure, path: Path) -> None:

@@ -99,6 +99,15 @@ class ArmStation(Diagram):
     publishing, and the arm's command guard decides what becomes of them; unconnected, the arm is told to hold. After
     the guard's watchdog took over, e.g. because this process was stopped for 50 ms, efforts act again only when an
     operator resumes: end this process, look at the arm, run `dvrk-drake run --reset`, end that, start this one again.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> arm = dvrk.load_arm("psm")
+        >>> station = dvrk.ArmStation(arm, effects=arm.effects.only(["friction"]))
+        >>> context = station.CreateDefaultContext()
+        >>> station.set_positions(context, [0.1, 0.2, 0.1, 0, 0, 0, 0.5])
+        >>> station.GetOutputPort("psm.position_measured").Eval(context).round(3).tolist()
+        [0.1, 0.2, 0.1, 0.0, 0.0, 0.0, 0.5]
     """
 
     def __init__(

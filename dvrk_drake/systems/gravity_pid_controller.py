@@ -65,9 +65,16 @@ class GravityPidController(LeafSystem):
     Before any finite pose was seen it is zero. Regulation resumes by itself, with an empty integrator, when
     the inputs are finite again.
 
-    To compensate with a plant's own gravity, nothing identified, use the model that the arm's SDF states::
+    To compensate with a plant's own gravity, nothing identified, use the model that the arm's SDF states, as here.
 
-        GravityPidController(IdentifiedModel.from_arm(load_arm("mtml")))
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtml"))
+        >>> controller = dvrk.GravityPidController(model, mode="gravity")
+        >>> context = controller.CreateDefaultContext()
+        >>> controller.SetMode(context, "damped")
+        >>> controller.GetMode(context)
+        'damped'
     """
 
     def __init__(

@@ -44,6 +44,12 @@ class TeleoperatedArms(Diagram):
       nobody touches the master.
     - `engaged`, `jaw_angle`, `desired_state`, `following`, `fault`: those of `Teleoperation`.
     - `state_estimated`: those of the two stations.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> arms = dvrk.TeleoperatedArms(dvrk.load_arm("mtml"), dvrk.load_arm("psm"), scale=1 / 3)
+        >>> arms.X_MG(arms.CreateDefaultContext()).translation().shape  # [m] handle in the master's base
+        (3,)
     """
 
     def __init__(
