@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, ValueProducer
 
+from dvrk_drake.dynamics.codegen import entry_point
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import Gains
-from dvrk_drake.systems.gravity_pid_step import compile_step, entry_point
+from dvrk_drake.systems.gravity_pid_step import compile_step
 
 #: "hold" regulates a pose, "gravity" only carries the arm's weight and leaves it free to move, "damped" also brakes it.
 Mode = Literal["hold", "gravity", "damped"]

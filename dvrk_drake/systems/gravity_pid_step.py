@@ -8,8 +8,8 @@ from functools import cache
 import numba
 import numpy as np
 
-#: No joint is there or that fast [rad, m, rad/s, m/s]; and products of such numbers with gains stay finite.
-ABSURD = 1e6
+from dvrk_drake.models.arm_schema import IMPLAUSIBLE
+
 #: Values of `mode`: indices into `gravity_pid_controller.Mode`.
 HOLD, GRAVITY, DAMPED = 0, 1, 2
 
@@ -53,12 +53,12 @@ def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
             integral[:] = 0.0
         faulty = False
         for i in range(2 * n):
-            faulty |= not abs(state[i]) < ABSURD  # also true of NaN
+            faulty |= not abs(state[i]) < IMPLAUSIBLE  # also true of NaN
         if not faulty:
             last_q[:] = state[:n]
         if hold and has_desired:
             for i in range(2 * n):
-                faulty |= not abs(desired[i]) < ABSURD
+                faulty |= not abs(desired[i]) < IMPLAUSIBLE
         fault[0] = 1.0 if faulty else 0.0
 
         if np.isnan(last_q[0]):
@@ -98,12 +98,3 @@ def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
     memory = (array,) * 6
     signature = numba.void(view, view, flag, flag, numba.float64, numba.int64, matrix, array, *memory)
     return numba.njit(signature)(step)
-
-
-def entry_point(dispatcher: Callable[..., None]) -> Callable[..., None]:
-    """The only signature of a compiled function, without the choice between signatures (4 us a call here).
-
-    Its types are not checked any more: the arrays must be what the signature says. Drake's always are.
-    """
-    (overload,) = dispatcher.overloads.values()  # type: ignore[attr-defined]
-    return overload.entry_point

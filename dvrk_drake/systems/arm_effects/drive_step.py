@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
 
 from dvrk_drake.dynamics.actuator_effects import effect_step
+from dvrk_drake.dynamics.codegen import entry_point
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.systems.arm_effects.motors import in_steps
 from dvrk_drake.systems.arm_effects.plant_effects import PlantEffects
-from dvrk_drake.systems.gravity_pid_step import entry_point
 
 
 class DriveStep(LeafSystem):
