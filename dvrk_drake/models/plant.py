@@ -8,7 +8,7 @@ from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.multibody.parsing import Parser
+from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context
@@ -17,6 +17,16 @@ from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.loop_closure import Closure, pin_loop, remove_loop_mimics
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
+
+
+def package_map() -> PackageMap:
+    """Returns a map with Drake's own packages and `dvrk_drake`, for URLs such as package://dvrk_drake/sdf/mtml.sdf.
+
+    With it Drake's parser finds the models: `Parser(plant).package_map().AddMap(package_map())`.
+    """
+    packages = PackageMap()
+    packages.AddPackageXml(str(MODELS_FOLDER / "package.xml"))
+    return packages
 
 
 def add_arm(
@@ -41,7 +51,7 @@ def add_arm(
     if plant.time_step() > 0:
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
     parser = Parser(plant)
-    parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))
+    parser.package_map().AddMap(package_map())
     model = compose_sdf(arm.sdf, arm.mirrored_links)
     if closure == "ball":
         remove_loop_mimics(model, arm)
