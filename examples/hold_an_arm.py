@@ -22,8 +22,8 @@ builder.Connect(station.GetOutputPort("mtml.state_estimated"), controller.GetInp
 builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort("mtml.effort_commanded"))
 simulator = Simulator(builder.Build())
 context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-station.set_positions(context, [0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5])  # held where it is put
+station.SetPositions(context, [0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5])  # held where it is put
 simulator.AdvanceTo(2.0)
-print("holds", np.round(station.get_positions(context), 4))
+print("holds", np.round(station.GetPositions(context), 4))
 if sys.stdin.isatty():  # the page ends with this script
     input(f"{meshcat.web_url()} shows the arm; press Enter to end ")

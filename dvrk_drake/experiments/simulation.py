@@ -92,7 +92,7 @@ def simulate(
     hand = _add_hand(builder, station, scenario)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    station.set_positions(context, poses[0])
+    station.SetPositions(context, poses[0])
     if meshcat is not None:
         simulator.set_target_realtime_rate(1.0)
         meshcat.StartRecording()

@@ -130,7 +130,7 @@ class ArmStation(Diagram):
             modify_plant: called with the plant before it is finalized, e.g. to add a payload, damping or
             other effort limits.
                 Drake can change the inertia of links that are already there only in a Context:
-                `set_link_inertias`.
+                `SetLinkInertias`.
             effects: of the real arm that the simulation shall have, e.g. `arm.effects` or
             `arm.effects.only(["friction"])`; none by default.
             seed: of the effects' noise.
@@ -233,7 +233,7 @@ class ArmStation(Diagram):
             raise StationError("this station is the hardware: it has no plant, and its state cannot be set")
         return self._plant
 
-    def set_positions(self, context: Context, q: ArrayLike) -> None:
+    def SetPositions(self, context: Context, q: ArrayLike) -> None:
         """Puts the arm at the pose q (n,) of its independent joints, linkage included, at rest.
 
         Args:
@@ -253,16 +253,16 @@ class ArmStation(Diagram):
             self._parts.drive.set_positions(q_plant, q)
         self.plant.SetPositions(plant_context, q_plant)
         if self._drive_step is not None:
-            self._drive_step.set_at_rest(self.GetMutableSubsystemContext(self._drive_step, context), q)
+            self._drive_step.SetAtRest(self.GetMutableSubsystemContext(self._drive_step, context), q)
         self.plant.SetVelocities(plant_context, np.zeros(self.plant.num_velocities()))
 
-    def get_positions(self, context: Context) -> NDArray[np.float64]:
+    def GetPositions(self, context: Context) -> NDArray[np.float64]:
         """Pose (n,) of the independent joints in this station's context."""
         plant_context = self.GetSubsystemContext(self.plant, context)
         q: NDArray[np.float64] = self.plant.GetPositions(plant_context)[self._joints.index]
         return q
 
-    def set_link_inertias(self, context: Context, inertias: Mapping[str, SpatialInertia]) -> None:
+    def SetLinkInertias(self, context: Context, inertias: Mapping[str, SpatialInertia]) -> None:
         """Gives links another inertia in this station's context: an arm that differs from its model.
 
         Args:

@@ -34,7 +34,7 @@ class SimulatedArm:
         lcm.Subscribe(f"DVRK_STATUS_{self.arm.name}", lambda data: self.statuses.append(Status.decode(data)))
         self.simulator = Simulator(builder.Build())
         self.context = self.station.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
-        self.station.set_positions(self.context, POSES[name])
+        self.station.SetPositions(self.context, POSES[name])
         self.simulator.Initialize()
         self.tick = 0
 
@@ -47,7 +47,7 @@ class SimulatedArm:
         return self.driver.GetGuard(self.driver.GetMyContextFromRoot(self.simulator.get_context()))
 
     def drift(self):
-        return np.abs(self.station.get_positions(self.context) - POSES[self.arm.name.lower()]).max()
+        return np.abs(self.station.GetPositions(self.context) - POSES[self.arm.name.lower()]).max()
 
 
 class Controller:
