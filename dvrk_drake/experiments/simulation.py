@@ -18,7 +18,7 @@ from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
 from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
@@ -74,7 +74,7 @@ def simulate(
     station = ArmStation(
         arm,
         closure=cast(Closure, scenario.closure),
-        time_step=scenario.time_step,
+        plant_config=arm_plant_config(scenario.time_step),
         meshcat=meshcat,
         effects=scenario.all_effects,
         seed=scenario.seed,

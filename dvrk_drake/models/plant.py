@@ -34,8 +34,9 @@ def add_arm(
 ) -> ModelInstanceIndex:
     """Adds `arm` to a plant that is not finalized, welds its base to the world and sets gravity and limits.
 
-    A discrete plant gets the SAP solver, which all of Drake's joint couplings and pins need. A continuous one can only
-    be simulated with the integrator CENIC (its pins need drake 1.56 or newer).
+    Drake's joint couplings and pins need the SAP solver, that of the contact approximations sap, similar and lagged. A
+    discrete plant with tamsi gets sap. A continuous one can only be simulated with the integrator CENIC (its pins need
+    drake 1.56 or newer).
 
     Args:
         plant: with or without a scene graph.
@@ -48,7 +49,8 @@ def add_arm(
     """
     if closure not in get_args(Closure):
         raise ArmError(f'unknown closure "{closure}"; known: {", ".join(get_args(Closure))}')
-    if plant.time_step() > 0:
+    tamsi = DiscreteContactApproximation.kTamsi
+    if plant.time_step() > 0 and plant.get_discrete_contact_approximation() == tamsi:
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
     parser = Parser(plant)
     parser.package_map().AddMap(package_map())

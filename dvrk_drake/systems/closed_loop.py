@@ -7,11 +7,12 @@ from pydrake.systems.framework import DiagramBuilder, System
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 
 
 def add_closed_loop(
     builder: DiagramBuilder,
-    station: ArmStation,
+    station: ArmStation | HardwareArmStation,
     controller: GravityPidController,
     desired: System | None = None,
     friction: FrictionCompensator | None = None,
@@ -31,7 +32,7 @@ def add_closed_loop(
 
 def connect_controller(
     builder: DiagramBuilder,
-    station: ArmStation,
+    station: ArmStation | HardwareArmStation,
     controller: GravityPidController,
     desired: System | None = None,
     friction: FrictionCompensator | None = None,

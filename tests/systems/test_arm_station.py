@@ -7,7 +7,7 @@ import pytest
 from pydrake.geometry import HalfSpace, Meshcat, Role
 from pydrake.lcm import DrakeLcm
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import CoulombFriction
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlantConfig
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -16,9 +16,9 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import tree_selector
-from dvrk_drake.systems.arm_station import ArmStation, station_ports
+from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, station_ports
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 
 ARM = load_arm("mtml")
 MODEL = IdentifiedModel.from_arm(ARM)
@@ -76,12 +76,10 @@ def test_port_names_and_sizes(name):
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_hardware_has_exactly_the_ports_of_the_arm(name):
     arm = load_arm(name)
-    station = ArmStation(arm, hardware=True, lcm=DrakeLcm("memq://"))
+    station = HardwareArmStation(arm, lcm=DrakeLcm("memq://"))
     inputs = {p.get_name(): p.size() for p in map(station.get_input_port, range(station.num_input_ports()))}
     outputs = {p.get_name(): p.size() for p in map(station.get_output_port, range(station.num_output_ports()))}
     assert (inputs, outputs) == (station_ports(arm).inputs, station_ports(arm).outputs)
-    with pytest.raises(StationError, match="it has no plant"):
-        station.SetPositions(station.CreateDefaultContext(), np.zeros(7))
 
 
 @pytest.mark.parametrize("q", POSES)
@@ -113,7 +111,7 @@ def test_energy_never_grows_without_effort_and_its_loss_vanishes_with_the_step()
     q = np.array([0.1, 0.4, -0.2, 0.3, 0.5, 0.1, 0.0])
     losses = []
     for time_step in (1e-3, 2.5e-4):
-        station = ArmStation(ARM, time_step=time_step)
+        station = ArmStation(ARM, plant_config=arm_plant_config(time_step))
         simulator = Simulator(station)
         context = simulator.get_mutable_context()
         station.SetPositions(context, q)
@@ -182,7 +180,7 @@ def test_efforts_act_on_their_own_joint_through_the_linkage(j):
         inputs = {"mtml.effort_commanded": tau, "mtml.effort_disturbance": np.zeros(N)}
         inputs[name] = inputs[name] + extra
         # Ten short steps: SAP's couplers give by 0.2 % in the first step, and are stiff after a few.
-        measured = acceleration_of(ArmStation(ARM, time_step=1e-4), q, inputs)
+        measured = acceleration_of(ArmStation(ARM, plant_config=arm_plant_config(1e-4)), q, inputs)
         np.testing.assert_allclose(measured, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
 
 
@@ -296,13 +294,15 @@ def test_collision_shapes_are_there_when_something_can_be_touched():
 
 
 def test_errors_say_what_to_do():
-    for of_a_simulation in ({"plant_arm": ARM}, {"closure": "ball"}, {"time_step": 2e-3}, {"effects": ARM.effects}):
-        with pytest.raises(StationError, match="modify_plant and effects are of a simulation"):
-            ArmStation(ARM, hardware=True, **of_a_simulation)
-    with pytest.raises(StationError, match="driver and lcm are of hardware"):
-        ArmStation(ARM, driver=DvrkDriver())
     with pytest.raises(StationError, match=r"time_step must be above 0 and at most 0.01 s"):
-        ArmStation(ARM, time_step=0.0)
+        ArmStation(ARM, plant_config=arm_plant_config(0.0))
+    with pytest.raises(StationError, match='discrete_contact_approximation is "tamsi"; a linkage needs sap'):
+        ArmStation(
+            ARM,
+            plant_config=MultibodyPlantConfig(discrete_contact_approximation="tamsi", use_sampled_output_ports=False),
+        )
+    with pytest.raises(StationError, match="use_sampled_output_ports must be false"):
+        ArmStation(ARM, plant_config=MultibodyPlantConfig())
     with pytest.raises(StationError, match="plant_arm must have the joints of MTML"):
         ArmStation(ARM, plant_arm=dataclasses.replace(ARM, joint_names=ARM.joint_names[::-1]))
     station = ArmStation(ARM)
