@@ -16,8 +16,8 @@ station = dvrk.ArmStation(arm, meshcat=meshcat)
 dvrk.add_closed_loop(builder, station, dvrk.GravityPidController(model))
 simulator = Simulator(builder.Build())
 context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-station.set_positions(context, [0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5])  # held where it is put
+station.SetPositions(context, [0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5])  # held where it is put
 simulator.AdvanceTo(2.0)
-print("holds", np.round(station.get_positions(context), 4))
+print("holds", np.round(station.GetPositions(context), 4))
 if sys.stdin.isatty():  # the page ends with this script
     input(f"{meshcat.web_url()} shows the arm; press Enter to end ")

@@ -22,7 +22,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
@@ -131,7 +131,7 @@ def _simulate(
     station = ArmStation(
         arm,
         closure=cast(Closure, scenario.closure),
-        time_step=scenario.time_step,
+        plant_config=arm_plant_config(scenario.time_step),
         meshcat=meshcat,
         effects=scenario.all_effects,
         seed=scenario.seed,
@@ -149,7 +149,7 @@ def _simulate(
     hand = _add_hand(builder, station, scenario)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    station.set_positions(context, poses[0])
+    station.SetPositions(context, poses[0])
     if meshcat is not None:
         simulator.set_target_realtime_rate(1.0)
         meshcat.StartRecording()

@@ -160,7 +160,7 @@ def feel(
     builder.Connect(hand.GetOutputPort("effort_disturbance"), station.GetInputPort(f"{name}.effort_disturbance"))
     simulator = Simulator(builder.Build())
     root = simulator.get_mutable_context()
-    station.set_positions(station.GetMyMutableContextFromRoot(root), path.value(0.0).ravel())
+    station.SetPositions(station.GetMyMutableContextFromRoot(root), path.value(0.0).ravel())
     simulator.Initialize()
     # Multiples, not sums: where rounding tells the time from that of a step, the step would count or not by chance.
     times = SAMPLE_PERIOD * np.arange(1, int(path.end_time() / SAMPLE_PERIOD), dtype=np.float64)

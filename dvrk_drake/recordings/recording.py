@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.csv_rows import CsvReader, is_number, parse_finite, parse_or_nan, skipped_note
@@ -27,8 +28,6 @@ Coordinates = Literal["joint", "actuator"]
 
 #: A pose further than this outside the limits is refused [rad], [m]; nearer ones are real: stops give way.
 LIMIT_TOLERANCE = 0.2, 0.02
-#: No position, speed or effort of these arms is larger, in whatever unit it may be by mistake.
-LARGEST = 1e6
 #: Most rows of a CSV; 15 min at 1 kHz. With these, `check` takes 1.5 GB.
 LARGEST_COUNT = 900_000
 #: RMS joint speed above which a recording counts as a motion [rad/s], [m/s].
@@ -186,11 +185,11 @@ class Recording:
 
     def _check_sizes(self) -> None:
         for name, values in (("q", self.q), ("qd", self.qd), ("tau", self.tau)):
-            if values is not None and np.any(np.abs(values) > LARGEST):
-                row, joint = np.argwhere(np.abs(values) > LARGEST)[0]
+            if values is not None and np.any(np.abs(values) > IMPLAUSIBLE):
+                row, joint = np.argwhere(np.abs(values) > IMPLAUSIBLE)[0]
                 raise RecordingError(
                     f"{self.where(int(row))}: {name}{joint + 1} = {values[row, joint]:g} is no reading of an arm; "
-                    f"at most {LARGEST:g}"
+                    f"at most {IMPLAUSIBLE:g}"
                 )
 
     def _check_joint_count(self, arm: Arm) -> None:

@@ -6,11 +6,12 @@ from pydrake.systems.framework import DiagramBuilder, System
 
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
+from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 
 
 def add_closed_loop(
     builder: DiagramBuilder,
-    station: ArmStation,
+    station: ArmStation | HardwareArmStation,
     controller: System,
     desired: System | None = None,
     friction: FrictionCompensator | None = None,
@@ -35,7 +36,7 @@ def add_closed_loop(
         >>> dvrk.add_closed_loop(builder, station, controller)
         >>> simulator = Simulator(builder.Build())
         >>> status = simulator.AdvanceTo(0.1)
-        >>> q = station.get_positions(station.GetMyContextFromRoot(simulator.get_context()))
+        >>> q = station.GetPositions(station.GetMyContextFromRoot(simulator.get_context()))
         >>> bool(abs(q).max() < 1e-3)  # holds its home pose
         True
     """
@@ -45,7 +46,7 @@ def add_closed_loop(
 
 def connect_controller(
     builder: DiagramBuilder,
-    station: ArmStation,
+    station: ArmStation | HardwareArmStation,
     controller: System,
     desired: System | None = None,
     friction: FrictionCompensator | None = None,

@@ -216,7 +216,7 @@ def _closed_loop(
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     true_arm.prepare(station, context)
-    station.set_positions(context, q_start)
+    station.SetPositions(context, q_start)
     return simulator, station, controller, desired
 
 
@@ -278,7 +278,7 @@ def _sample(
     q = []
     for t in times:
         simulator.AdvanceTo(t)
-        q.append(station.get_positions(context))
+        q.append(station.GetPositions(context))
         at(t)
         progress(t / duration)
     return times, np.array(q)

@@ -47,7 +47,7 @@ class TrueArm:
 
     def prepare(self, station: ArmStation, context: Context) -> None:
         """Puts the true inertias into a station's context."""
-        station.set_link_inertias(context, self.inertias)
+        station.SetLinkInertias(context, self.inertias)
 
     def _damp(self, plant: MultibodyPlant) -> None:
         set_joint_damping(plant, self.arm, self.damping)
