@@ -212,7 +212,7 @@ def test_a_named_link_is_compared_with_all_others(tmp_path, capsys):
     command = ["payload", *paths, "--model", str(tmp_path / "model.yaml"), "--link"]
     assert main([*command, "insertion_link"]) == 0
     said = capsys.readouterr()
-    assert said.err.startswith("dvrk-drake: warning: insertion_link does not explain the change best")
+    assert said.err.startswith("dvrk-drake: warning: insertion_link: does not explain the change best")
     assert said.err.count("\n") == 1 and "end_link" in said.err
     assert "Where the payload may be" in said.out and "below" not in said.out
     assert main([*command, link]) == 0
