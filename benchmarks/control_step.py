@@ -129,7 +129,7 @@ def restart(simulator: Simulator, station: ArmStation) -> None:
     context = simulator.get_mutable_context()
     context.SetTime(0.0)
     simulator.get_system().SetDefaultContext(context)
-    station.set_positions(station.GetMyMutableContextFromRoot(context), START)
+    station.SetPositions(station.GetMyMutableContextFromRoot(context), START)
     simulator.Initialize()
 
 
@@ -161,7 +161,7 @@ def main() -> None:
                 times[row].append((time.process_time() - before) / arguments.seconds * 1e3)
     for row in ("python", "cpp"):
         simulator, station = rows[row][:2]
-        q = station.get_positions(station.GetMyContextFromRoot(simulator.get_context()))
+        q = station.GetPositions(station.GetMyContextFromRoot(simulator.get_context()))
         assert np.abs(q - GOAL).max() < 0.02, f"{row} is not where it should be: {q}"
 
     median = {row: float(np.median(values)) for row, values in times.items()}

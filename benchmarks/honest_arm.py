@@ -59,7 +59,7 @@ def start(arm: Arm, effects: ArmEffects | None, closure: Closure) -> Simulator:
     controller = GravityPidController(IdentifiedModel.from_arm(arm))
     add_closed_loop(builder, station, controller, TrajectorySource(trajectory, output_derivative_order=1))
     simulator = Simulator(builder.Build())
-    station.set_positions(station.GetMyMutableContextFromRoot(simulator.get_mutable_context()), ends[:, 0])
+    station.SetPositions(station.GetMyMutableContextFromRoot(simulator.get_mutable_context()), ends[:, 0])
     simulator.Initialize()
     simulator.AdvanceTo(0.1)
     return simulator

@@ -20,7 +20,7 @@ from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.payload.payload import Payload, estimate_payload
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
-from dvrk_drake.analysis.recalibration import predict_other_phases, recalibrate
+from dvrk_drake.analysis.recalibration import predict_other_phases, refit_friction
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -106,7 +106,7 @@ def _print_seconds(model: IdentifiedModel, whole: Recording) -> None:
     print(f"before    {percent(model)}")
     for seconds in SECONDS:
         assert whole.t is not None
-        result = recalibrate(model, _rows(whole, slice(0, int(np.searchsorted(whole.t, seconds)))))
+        result = refit_friction(model, _rows(whole, slice(0, int(np.searchsorted(whole.t, seconds)))))
         left = [a.name for a in result.actuators if not a.kept]
         print(f"{seconds:5.1f} s   {percent(result.model)}   left alone: {', '.join(left) or 'none'}")
 
@@ -121,7 +121,7 @@ def _print_phases(model: IdentifiedModel, whole: Recording) -> None:
     before, after = predict_other_phases(model, whole, 2)
     for name, values in (
         ("same phases, second half of the time: before", errors(model)),
-        ("same phases, refitted to the first half of the time", errors(recalibrate(model, first).model)),
+        ("same phases, refitted to the first half of the time", errors(refit_friction(model, first).model)),
         ("other phases: before", list(before)),
         ("other phases, each half refitted to the other half", list(after)),
     ):

@@ -104,11 +104,11 @@ class StationRow:
 
     def set_start(self, root: Context, q: np.ndarray) -> None:
         """Puts the arm at q, at rest."""
-        self.station.set_positions(self.station.GetMyMutableContextFromRoot(root), q)
+        self.station.SetPositions(self.station.GetMyMutableContextFromRoot(root), q)
 
     def get_positions(self, root: Context) -> np.ndarray:
         """Pose of the seven joints."""
-        return self.station.get_positions(self.station.GetMyContextFromRoot(root))
+        return self.station.GetPositions(self.station.GetMyContextFromRoot(root))
 
 
 class CenicRow:

@@ -18,7 +18,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from dvrk_drake.analysis.static.static_identification import identify_static
-from dvrk_drake.analysis.static.validation import validate
+from dvrk_drake.analysis.static.validation import validate_static
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.recording import Recording, read_recording
@@ -70,7 +70,7 @@ def main() -> int:
         for other_name, other in recordings.items():
             if other_name == name:
                 continue
-            by_ours, by_paper = validate(ours.model, other).joints, validate(paper.model, other).joints
+            by_ours, by_paper = validate_static(ours.model, other).joints, validate_static(paper.model, other).joints
             table.add_row(other_name, "zero", *(f"{j.rms_torque_undoubted:.4f}" for j in by_ours))
             table.add_row("", "paper", *(f"{j.rms_error_undoubted:.4f}" for j in by_paper))
             table.add_row("", "ours", *(f"{j.rms_error_undoubted:.4f}" for j in by_ours))

@@ -1,1 +1,90 @@
-"""Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."""
+"""Model, identify, compensate and simulate da Vinci Research Kit arms with Drake.
+
+The public API: `import dvrk_drake as dvrk`, then `dvrk.load_arm`, `dvrk.identify` and the other names of `__all__`.
+Modules are loaded when a name of theirs is used, because drake and numba take seconds.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dvrk_drake.analysis.check.recording_check import check
+    from dvrk_drake.analysis.identification import identify
+    from dvrk_drake.analysis.payload.payload import payload
+    from dvrk_drake.analysis.recalibration import recalibrate
+    from dvrk_drake.analysis.validation import predict, validate
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.errors import DvrkDrakeError
+    from dvrk_drake.experiments.scenario import Scenario, load_scenario
+    from dvrk_drake.experiments.simulation import simulate
+    from dvrk_drake.export.model_export import export_model
+    from dvrk_drake.models.arm import Arm, load_arm
+    from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
+    from dvrk_drake.systems.arm_station import ArmStation
+    from dvrk_drake.systems.arm_view import start_meshcat
+    from dvrk_drake.systems.closed_loop import add_closed_loop
+    from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+    from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
+
+#: Public name -> the module that defines it.
+_MODULES = {
+    "Arm": "models.arm",
+    "ArmStation": "systems.arm_station",
+    "DvrkDrakeError": "errors",
+    "GravityPidController": "systems.gravity_pid_controller",
+    "IdentifiedModel": "dynamics.identified_model",
+    "Recording": "recordings.recording",
+    "Scenario": "experiments.scenario",
+    "TeleoperatedArms": "systems.teleoperated_arms",
+    "add_closed_loop": "systems.closed_loop",
+    "check": "analysis.check.recording_check",
+    "export_model": "export.model_export",
+    "identify": "analysis.identification",
+    "load_arm": "models.arm",
+    "load_scenario": "experiments.scenario",
+    "payload": "analysis.payload.payload",
+    "predict": "analysis.validation",
+    "read_recording": "recordings.recording",
+    "recalibrate": "analysis.recalibration",
+    "simulate": "experiments.simulation",
+    "start_meshcat": "systems.arm_view",
+    "validate": "analysis.validation",
+    "write_recording": "recordings.recording",
+}
+
+__all__ = [
+    "Arm",
+    "ArmStation",
+    "DvrkDrakeError",
+    "GravityPidController",
+    "IdentifiedModel",
+    "Recording",
+    "Scenario",
+    "TeleoperatedArms",
+    "add_closed_loop",
+    "check",
+    "export_model",
+    "identify",
+    "load_arm",
+    "load_scenario",
+    "payload",
+    "predict",
+    "read_recording",
+    "recalibrate",
+    "simulate",
+    "start_meshcat",
+    "validate",
+    "write_recording",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

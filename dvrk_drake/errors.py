@@ -1,8 +1,24 @@
 """Errors that a user can act on: each message says what is wrong, where, and what is allowed."""
 
+from __future__ import annotations
+
 
 class DvrkDrakeError(Exception):
-    """Base of every error that this package raises on purpose; the command line turns it into exit code 2."""
+    """Base of every error that this package raises on purpose; the command line turns it into exit code 2.
+
+    Attributes:
+        findings: what `check` found in the recording that the error is about; `str` of each is one line.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> try:
+        ...     dvrk.load_arm("mtmx")
+        ... except dvrk.DvrkDrakeError as error:
+        ...     print(error)
+        unknown arm "mtmx"; known arms: mtml, mtmr, psm
+    """
+
+    findings: tuple[object, ...] = ()
 
 
 class ArmError(DvrkDrakeError):

@@ -1,4 +1,4 @@
-"""Hold a simulated master arm at a pose: gravity feedforward + PID, in Meshcat."""
+"""Hold a simulated master arm at a pose: gravity feedforward + PID in a Drake Diagram, shown in Meshcat."""
 
 import sys
 
@@ -6,24 +6,18 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.arm import load_arm
-from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.arm_view import framing, start_meshcat
-from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+import dvrk_drake as dvrk
 
-arm = load_arm("mtml")
-model = IdentifiedModel.from_arm(arm)  # or IdentifiedModel.load("model.yaml"), from dvrk-drake identify
+arm = dvrk.load_arm("mtml")
+model = dvrk.IdentifiedModel.from_arm(arm)  # or dvrk.IdentifiedModel.load("model.yaml"), from dvrk-drake identify
+meshcat = dvrk.start_meshcat(arm)
 builder = DiagramBuilder()
-meshcat = start_meshcat(*framing(arm))
-station = builder.AddSystem(ArmStation(arm, meshcat=meshcat))
-controller = builder.AddSystem(GravityPidController(model))
-builder.Connect(station.GetOutputPort("mtml.state_estimated"), controller.GetInputPort("state_estimated"))
-builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort("mtml.effort_commanded"))
+station = dvrk.ArmStation(arm, meshcat=meshcat)
+dvrk.add_closed_loop(builder, station, dvrk.GravityPidController(model))
 simulator = Simulator(builder.Build())
 context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-station.set_positions(context, [0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5])  # held where it is put
+station.SetPositions(context, [0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5])  # held where it is put
 simulator.AdvanceTo(2.0)
-print("holds", np.round(station.get_positions(context), 4))
+print("holds", np.round(station.GetPositions(context), 4))
 if sys.stdin.isatty():  # the page ends with this script
     input(f"{meshcat.web_url()} shows the arm; press Enter to end ")

@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from dvrk_drake.dynamics.static_model import compile_static_model
-from dvrk_drake.models.arm import load_arm
+import dvrk_drake as dvrk
 
-arm = load_arm("mtmr")
-model = compile_static_model(arm)
+arm = dvrk.load_arm("mtmr")
+model = dvrk.IdentifiedModel.from_arm(arm).static_model
 q = arm.sample_poses(200, np.random.default_rng(0), margin=0.05)
 
 Y = model.regressor(q)  # (200, 7, 12), N m per kg m

@@ -7,16 +7,16 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from dvrk_drake.experiments.demo.teleoperation import START_FOLLOWER, START_MASTER, start_scene
-from dvrk_drake.models.arm import load_arm
-from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
+import dvrk_drake as dvrk
 
-meshcat = start_scene()
-arms = TeleoperatedArms(load_arm("mtml"), load_arm("psm"), scale=1 / 3, meshcat=meshcat)
+meshcat = dvrk.start_meshcat(camera=[1.7, 0.45, 0.5], target=[0, -0.12, 0.08])
+meshcat.SetTransform("mtml", RigidTransform([0, 0.45, 0.05]))  # where the bases stand [m]
+meshcat.SetTransform("psm", RigidTransform([0, -0.22, 0]))
+arms = dvrk.TeleoperatedArms(dvrk.load_arm("mtml"), dvrk.load_arm("psm"), scale=1 / 3, meshcat=meshcat)
 simulator = Simulator(arms)
 context = simulator.get_mutable_context()
-arms.set_positions(context, START_MASTER, START_FOLLOWER)
-X_MG0, X_FT0 = arms.X_MG(context), arms.X_FT(context)
+arms.SetPositions(context, [0, 0.25, -0.1, 0, 1.2, 0, 0], [0, 0, 0.13, 0, 0, 0, 0.5])
+X_MG0, X_FT0 = arms.CalcX_MG(context), arms.CalcX_FT(context)
 
 arms.GetInputPort("engaged").FixValue(context, [1.0])
 arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(X_MG0))
@@ -26,7 +26,7 @@ for t in np.arange(0.1, 3.0, 0.01):  # the hand moves the handle up by 6 cm
     arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(target))
     simulator.AdvanceTo(t)
 
-print("handle moved [mm]", np.round(1e3 * (arms.X_MG(context).translation() - X_MG0.translation()), 2))
-print("tip moved    [mm]", np.round(1e3 * (arms.X_FT(context).translation() - X_FT0.translation()), 2))
+print("handle moved [mm]", np.round(1e3 * (arms.CalcX_MG(context).translation() - X_MG0.translation()), 2))
+print("tip moved    [mm]", np.round(1e3 * (arms.CalcX_FT(context).translation() - X_FT0.translation()), 2))
 if sys.stdin.isatty():  # the page ends with this script
     input(f"{meshcat.web_url()} shows both arms; press Enter to end ")

@@ -40,6 +40,12 @@ def test_every_script_is_tested():
     }
 
 
+@pytest.mark.parametrize("script", sorted(path.name for path in EXAMPLES.glob("*.py")))
+def test_a_script_has_one_import_of_ours(script):
+    lines = (EXAMPLES / script).read_text().splitlines()
+    assert [line for line in lines if "import" in line and "dvrk_drake" in line] == ["import dvrk_drake as dvrk"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("script", [*SHOWS_A_PAGE, "regressor_in_numpy.py"])
 def test_a_script_writes_nothing_and_names_no_dead_page(script, tmp_path):

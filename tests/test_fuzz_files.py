@@ -276,7 +276,7 @@ WORK = (
     "dvrk_drake.experiments.tuning.tuning.tune_arm",
     "dvrk_drake.experiments.study.study.run_study_locally",
     "dvrk_drake.experiments.transparency.feel",
-    "dvrk_drake.analysis.dynamic.dynamic_identification.identify_dynamic",
+    "dvrk_drake.analysis.identification.identify_dynamic",
     "dvrk_drake.analysis.payload.payload.estimate_payload",
 )
 #: Command with its options -> the files that are damaged, in turn; its outputs begin with "out".
@@ -329,10 +329,10 @@ def short_work():
         simulation = importlib.import_module("dvrk_drake.experiments.simulation")
         simulate = simulation.simulate
 
-        def briefly(scenario, *rest):
+        def briefly(scenario, **rest):
             brief = replace(scenario, duration=0.02, sample_period=0.01, targets=[])
             brief.check()
-            return simulate(brief, *rest)
+            return simulate(brief, **rest)
 
         patch.setattr(simulation, "simulate", briefly)
         yield

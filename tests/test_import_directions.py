@@ -18,8 +18,8 @@ ALLOWED = {
 }
 ALLOWED["reports"] = ALLOWED.keys() - {"reports"}
 ALLOWED["cli"] = ALLOWED.keys() - {"cli"}
-#: What every package may import, and what imports no package: errors, generated messages.
-COMMON = {"errors", "lcmtypes"}
+#: What every package may import, and what imports no package: errors, progress, generated messages.
+COMMON = {"errors", "progress", "lcmtypes"}
 PACKAGE = ROOT / "dvrk_drake"
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path

@@ -72,7 +72,7 @@ def scene(options: Namespace) -> Meshcat:
     role = Role.kProximity if options.collision else Role.kIllustration
     arm = load_arm(options.arm)
     camera, target = framing(arm)
-    meshcat = start_meshcat(options.camera or camera, options.target or target, options.zoom)
+    meshcat = start_meshcat(camera=options.camera or camera, target=options.target or target, zoom=options.zoom)
     ArmView(arm, meshcat, role).show(options.pose)
     return meshcat
 

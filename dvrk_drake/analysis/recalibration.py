@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.check.recording_check import require_usable
 from dvrk_drake.analysis.signals.drive_efforts import (
     FRICTION_PARTS,
     FrictionPart,
@@ -21,6 +24,8 @@ from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.files import refuse_existing
+from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: Parts of the motion, cut by its phase where it repeats, each predicted from the others to decide what is kept.
@@ -68,15 +73,67 @@ class Recalibration:
         actuators: in the arm's order.
         shared: scales of friction at places that several actuators move, e.g. "finger_1 dry".
         seconds: of the motion that were used, a second at each end left out.
+        warnings: what `check` found in the recording; `str` of each is one line.
     """
 
     model: IdentifiedModel
     actuators: list[RecalibratedActuator]
     shared: dict[str, float]
     seconds: float
+    warnings: tuple[Finding, ...] = ()
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Writes the model file, at once or not at all.
+
+        Args:
+            path: the YAML file to write.
+            overwrite: replace an existing file.
+
+        Raises:
+            DvrkDrakeError: the file exists, or cannot be written.
+        """
+        refuse_existing(path, overwrite)
+        self.model.save(path)
 
 
-def recalibrate(model: IdentifiedModel, recording: Recording) -> Recalibration:
+def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progress | None = None) -> Recalibration:
+    """Checks a short motion and refits a model's friction and offsets to it: what `dvrk-drake recalibrate` does.
+
+    The gain is for motions like that one; at other positions and speeds it can be much smaller.
+
+    Args:
+        model: identified from a motion.
+        recording: a motion with efforts (m, n), in joint or actuator coordinates, of another day.
+        progress: called with the step, "checking the recording" or "refitting friction", and its finished share 0..1.
+
+    Returns:
+        The new model as `model`, each actuator's error before and after as `actuators`, and `warnings`.
+
+    Raises:
+        RecordingError: `check` refuses the recording, it is of another arm, or no actuator moves both ways.
+        ModelError: the model has no dynamics.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> arm = dvrk.load_arm("psm")
+        >>> model, today = (dvrk.IdentifiedModel.from_arm(arm, dynamics=True) for _ in range(2))
+        >>> for effect in today.dynamics.effects:
+        ...     effect.value *= 1.5 if effect.kind == "presliding" else 1.0
+        >>> t, w, reach = np.arange(0, 12, 0.01)[:, None], 1 + 0.25 * np.arange(7), 0.3 * arm.position_upper
+        >>> q, v, vd = reach * (1 + np.sin(w * t)), reach * w * np.cos(w * t), -reach * w**2 * np.sin(w * t)
+        >>> tau = arm.transmission.pull_back_effort(today.dynamic_model.effort(q, v, vd))
+        >>> result = dvrk.recalibrate(model, dvrk.Recording(q=q, qd=v, tau=tau, t=t[:, 0]))
+        >>> round(result.actuators[0].dry, 2), bool(result.actuators[0].after < 0.1 * result.actuators[0].before)
+        (1.5, True)
+    """
+    dynamics = model.dynamic_model
+    report = require_usable(recording, dynamics.arm, progress)
+    result = refit_friction(model, recording)
+    step_progress(progress, "refitting friction")(1.0)
+    return replace(result, warnings=report.warnings)
+
+
+def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibration:
     """Fits one scale of dry and one of viscous friction at every coordinate of the drive, and an offset an actuator.
 
     Rigid bodies, springs and cables stay. Each of `FOLDS` parts of the motion is predicted from the others: where an

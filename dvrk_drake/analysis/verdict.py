@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 
 Requirement = Literal["good", "usable"]
@@ -67,6 +68,19 @@ def unfit(verdicts: Mapping[str, str], required: Requirement) -> list[str]:
     """Joints that do not fulfil a requirement, each with its verdict. A joint without torque fulfils all."""
     accepted = ("good", "off") if required == "good" else ("good", "usable", "off")
     return [f"{name} ({verdict})" for name, verdict in verdicts.items() if verdict not in accepted]
+
+
+def unexplained_effort(errors: Mapping[str, float | None]) -> tuple[Finding, ...]:
+    """Returns a warning that names the joints in motion whose efforts the model does not explain.
+
+    Args:
+        errors: relative error of each joint [1]; None where nothing was measured.
+    """
+    bad = [f"{name} ({e:.0%})" for name, e in errors.items() if e is not None and e > USABLE_RATIO_IN_MOTION]
+    if not bad:
+        return ()
+    advice = "is a sign, a unit or --coordinates wrong, or is it another arm? Do not use the model for these"
+    return (Finding("warning", "unexplained effort", ", ".join(bad), "most of the effort is not explained", advice),)
 
 
 def cross_validated_verdicts(model: IdentifiedModel) -> dict[str, Verdict]:

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 
-from dvrk_drake.cli.support import ProgressBar, add_overwrite, add_recording, check_output, made_folder
+import dvrk_drake as dvrk
+from dvrk_drake.cli.support import (
+    ProgressBar,
+    add_overwrite,
+    add_recording,
+    check_output,
+    made_folder,
+    write_json,
+)
 from dvrk_drake.errors import RecordingError
 
 
@@ -25,32 +32,21 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.check.recording_check import check_for_identification
-    from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.recordings.recording import read_recording
     from dvrk_drake.reports.recording_check import plot_report, print_report
     from dvrk_drake.reports.terminal_tables import make_console
 
-    arm = load_arm(options.arm)
+    arm = dvrk.load_arm(options.arm)
     if options.json is not None:
         check_output(options.json, options.recording, overwrite=options.overwrite)
     plots = None if options.plots is None else made_folder(options.plots)
-    with ProgressBar("reading") as (progress, task):
-        recording = read_recording(
-            options.recording, arm, options.coordinates, lambda share: progress.update(task, completed=100 * share)
-        )
-    with ProgressBar("checking"):
-        report = check_for_identification(recording, arm)
+    with ProgressBar("reading") as bar:
+        recording = dvrk.read_recording(options.recording, arm, options.coordinates, progress=bar)
+        bar("checking the recording", 0.0)
+        report = dvrk.check(recording, arm, progress=bar)
     print_report(make_console(), report)
     if options.json is not None:
-        with atomic_write(options.json) as stream:
-            json.dump(report.as_dict(), stream, indent=2)
-            stream.write("\n")
+        write_json(options.json, report.as_dict())
     if plots is not None and not plot_report(plots, report, recording, arm):
         print("no plots: spectra need a motion with efforts at a known rate", file=sys.stderr)
     if report.refusals:
-        first, *others = report.refusals
-        reasons = f"refused for {len(others) + 1} reasons, the first: " if others else "refused: "
-        where = "" if first.where == report.source else f"{first.where}: "
-        raise RecordingError(f"{options.recording}: {reasons}{where}{first.what}; {first.advice}")
+        raise RecordingError(report.refusal)

@@ -40,15 +40,11 @@ def _demo(options: argparse.Namespace) -> None:
 
     quiet_drake()
     output = made_folder(options.output)
-    with ProgressBar("") as (progress, task):
-
-        def show(what: str, share: float) -> None:
-            progress.update(task, description=what, completed=100 * share)
-
-        result = run_demo(output, options.arm, options.seed, show)
-        show("drawing", 0.0)
+    with ProgressBar("") as bar:
+        result = run_demo(output, options.arm, options.seed, bar)
+        bar("drawing", 0.0)
         plot_demo(output, result)
-        show("drawing", 1.0)
+        bar("drawing", 1.0)
     print_demo(make_console(), result, output)
 
 
@@ -69,8 +65,8 @@ def _teleop(options: argparse.Namespace) -> None:
         return
     check_output(options.html, overwrite=options.overwrite)
     meshcat = start_scene(options.port)
-    with ProgressBar("playing") as (progress, task):
-        result = play_teleoperation(meshcat, progress=lambda share: progress.update(task, completed=100 * share))
+    with ProgressBar("playing") as bar:
+        result = play_teleoperation(meshcat, progress=bar.share)
     with atomic_write(options.html) as stream:
         stream.write(meshcat.StaticHtml())
     print_teleoperation(make_console(), result, options.html)

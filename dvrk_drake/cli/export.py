@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from dvrk_drake.cli.support import add_overwrite, check_output
+from dvrk_drake.cli.support import add_overwrite, check_output, load_model, write_json
 from dvrk_drake.errors import DvrkDrakeError, ModelError
 
 if TYPE_CHECKING:
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.export.model_export import Format
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -58,108 +56,42 @@ def _add_gc_options(group: argparse._ArgumentGroup) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    writers = {"sdf": _sdf_writer, "urdf": _urdf_writer, "dvrk_gc": _gc_writer, "dvrk_kinematic_gc": _kinematic_writer}
-    outputs = {name: path for name in writers if (path := getattr(options, name)) is not None}
-    if not outputs and not options.diff:
-        raise DvrkDrakeError(f"nothing to write; name {' or '.join('--' + name.replace('_', '-') for name in writers)}")
-    model = _load_model(options.model)
-    for path in outputs.values():
-        check_output(path, options.model, overwrite=options.overwrite)
-    # All are computed before the first is written: one that is refused leaves no other behind.
-    for write in [writers[name](model, path, options) for name, path in outputs.items()]:
-        write()
-    if options.diff:
-        _print_difference(model)
-
-
-def _sdf_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
     from dvrk_drake.dynamics.model_links import model_bodies
-    from dvrk_drake.export.sdf import changed_links, write_sdf
-    from dvrk_drake.reports.export import print_changed_links
-    from dvrk_drake.reports.terminal_tables import make_console
-
-    arm, bodies = model.load_arm(), model_bodies(model)
-
-    def write() -> None:
-        write_sdf(arm, bodies.links, path, options.model, bodies.rotors)
-        console = make_console()
-        print_changed_links(console, changed_links(arm, bodies.links), bodies)
-        console.print(f"SDF: {path}", soft_wrap=True)
-
-    return write
-
-
-def _urdf_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
-    from dvrk_drake.dynamics.model_links import model_bodies
-    from dvrk_drake.export.urdf import write_urdf
-
-    bodies = model_bodies(model)
-
-    def write() -> None:
-        write_urdf(model.load_arm(), bodies.links, path, options.model, bodies.rotors)
-        print(f"URDF: {path}")
-
-    return write
-
-
-def _print_difference(model: IdentifiedModel) -> None:
-    from dvrk_drake.dynamics.model_links import model_bodies
+    from dvrk_drake.export.model_export import prepare_export
     from dvrk_drake.export.sdf import sdf_difference
-
-    bodies = model_bodies(model)
-    sys.stdout.write(sdf_difference(model.load_arm(), bodies.links, bodies.rotors))
-
-
-def _gc_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
-    from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
-        CompensationOptions,
-        compensation_from_model,
-        dry_friction,
-        largest_differences,
-    )
-    from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-    from dvrk_drake.reports.export import print_compensation
+    from dvrk_drake.reports.export import print_export
     from dvrk_drake.reports.terminal_tables import make_console
 
+    formats: tuple[Format, ...] = ("sdf", "urdf", "dvrk-gc", "dvrk-kinematic-gc")
+    named = [(format, getattr(options, format.replace("-", "_"))) for format in formats]
+    outputs = [(format, path) for format, path in named if path is not None]
+    if not outputs and not options.diff:
+        raise DvrkDrakeError(f"nothing to write; name {' or '.join('--' + format for format in formats)}")
     if options.friction and options.coulomb is not None:
         raise DvrkDrakeError("--friction and --coulomb both say how large friction is; give one")
-    given = {
+    model = load_model(options.model)
+    for _, path in outputs:
+        check_output(path, options.model, overwrite=options.overwrite)
+    settings = {
         "tolerance": options.gc_tolerance,
-        "coulomb": dry_friction(model) if options.friction else options.coulomb,
+        "friction": options.friction if options.coulomb is None else options.coulomb,
         "friction_ratio": options.friction_ratio,
         "dead_band": options.dead_band,
         "saturation": options.saturation,
     }
-    file = compensation_from_model(model, CompensationOptions(**{k: v for k, v in given.items() if v is not None}))
-    arm = model.load_arm()
-
-    def write() -> None:
-        file.save(path, arm.name, f"dvrk-drake export of {options.model}")
-        written = GravityCompensationFile.load(path)
-        print_compensation(make_console(), path, arm, written, largest_differences(written, model))
-
-    return write
-
-
-def _kinematic_writer(model: IdentifiedModel, path: str, options: argparse.Namespace) -> Callable[[], None]:
-    from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation
-    from dvrk_drake.reports.export import print_kinematic_compensation
-    from dvrk_drake.reports.terminal_tables import make_console
-
-    given = {} if options.gc_tolerance is None else {"tolerance": options.gc_tolerance}
-    file = kinematic_compensation(model, **given)
-
-    def write() -> None:
-        file.save(path)
-        print_kinematic_compensation(make_console(), path, file)
-
-    return write
+    # All are computed before the first is written: one that is refused leaves no other behind.
+    exports = [prepare_export(model, format, origin=options.model, **settings) for format, _ in outputs]
+    for (_, path), export in zip(outputs, exports, strict=True):
+        export.write(path)
+        print_export(make_console(), path, export)
+    if options.diff:
+        bodies = model_bodies(model)
+        sys.stdout.write(sdf_difference(model.load_arm(), bodies.links, bodies.rotors))
 
 
 def _compare(options: argparse.Namespace) -> None:
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-    from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.export import plot_compensation, print_comparison
     from dvrk_drake.reports.terminal_tables import make_console
 
@@ -167,7 +99,7 @@ def _compare(options: argparse.Namespace) -> None:
         if path is not None:
             check_output(path, options.file, options.model, overwrite=options.overwrite)
     file = GravityCompensationFile.load(options.file)
-    model = _load_model(options.model)
+    model = load_model(options.model)
     try:
         comparison = compare_compensation(file, model)
     except ModelError as error:
@@ -185,29 +117,7 @@ def _compare(options: argparse.Namespace) -> None:
         plot_compensation(options.plot, comparison, f"{options.file} and {options.model} over the joint box, at rest")
         console.print(f"plot: {options.plot}", soft_wrap=True)
     if options.json is not None:
-        with atomic_write(options.json) as stream:
-            json.dump(comparison.as_dict(), stream, indent=2)
-            stream.write("\n")
-
-
-def _load_model(name: str) -> IdentifiedModel:
-    """The model of a file, or what the SDF of an arm states, known or of an arm's own file."""
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.models.arm import known_arms, load_arm
-
-    if name.lower() in known_arms() or _is_arm_file(name):
-        return IdentifiedModel.from_arm(load_arm(name))
-    return IdentifiedModel.load(name)
-
-
-def _is_arm_file(name: str) -> bool:
-    """An arm's YAML names its mechanism; a model's has no such field."""
-    from dvrk_drake.models.files import read_text_input
-
-    try:
-        return any(line.startswith("mechanism:") for line in read_text_input(name, DvrkDrakeError).splitlines())
-    except DvrkDrakeError:
-        return False
+        write_json(options.json, comparison.as_dict())
 
 
 _export_help = "Writes a model for other programs; several files at once if several are named."

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING
 
-from dvrk_drake.cli.dynamics import identify_motion, refuse_unusable, show_motion_validation
+import dvrk_drake as dvrk
 from dvrk_drake.cli.support import (
     ProgressBar,
     add_gravity,
@@ -19,13 +14,11 @@ from dvrk_drake.cli.support import (
     made_folder,
     mounted,
     print_notes,
+    print_warnings,
+    write_json,
     write_tables,
 )
-
-if TYPE_CHECKING:
-    from dvrk_drake.analysis.static.validation import Validation
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.errors import ModelError
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -99,177 +92,90 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _identify(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.check.recording_check import check_with_channels
-    from dvrk_drake.analysis.signals.static_segments import find_poses
-    from dvrk_drake.analysis.static.static_identification import identify_static
-    from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.recordings.recording import read_recording
-    from dvrk_drake.reports.figures import plot_identification
-    from dvrk_drake.reports.terminal_tables import make_console, print_doubts, print_model
+    from dvrk_drake.reports.identification import plot_identification, print_identification
+    from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(options.output, options.recording, overwrite=options.overwrite)
     if options.tables is not None:
         check_output(options.tables, options.recording, options.output, overwrite=options.overwrite)
-    arm = mounted(load_arm(options.arm), options.gravity)
-    recording = read_recording(options.recording, arm, options.coordinates)
+    arm = mounted(dvrk.load_arm(options.arm), options.gravity)
+    recording = dvrk.read_recording(options.recording, arm, options.coordinates)
     print_notes(options.recording, recording.notes)
     plots = None if options.plots is None else made_folder(options.plots)
+    with ProgressBar("identifying") as bar:
+        result = dvrk.identify(recording, arm, method=options.method, slow_parts=options.slow_parts, progress=bar)
     console = make_console()
-    recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
-    refuse_unusable(console, recording, arm, warn=True, check=check_with_channels)
-    if moves:
-        identify_motion(options, recording, arm, plots)
-        return
-    if note:
-        console.print(note)
-    with ProgressBar("identifying") as (progress, task):
-        result = identify_static(
-            recording, arm, options.method, lambda share: progress.update(task, completed=100 * share), measured
-        )
-    print_doubts(console, result.doubts)
-    print_model(console, result.model)
-    if options.tables is not None:
-        write_tables(options.tables, lambda file: print_model(file, result.model))
-        console.print(f"all parameters: {options.tables}")
-    if len(result.recording) < len(recording):
-        console.print(
-            f"{len(recording)} rows are {len(result.recording)} distinct poses; samples of a pose are averaged"
-        )
-    result.model.save(options.output)
+    print_warnings(console, result.warnings)
+    if result.note:
+        console.print(result.note)
+    print_identification(console, result)
+    result.save(options.output, overwrite=True)
     console.print(f"model: {options.output}")
-    commanded = [joint.name for joint in result.model.joints if joint.trust > 0]
-    if measured is not None and commanded:
-        print(
-            f"dvrk-drake: warning: {options.recording}: friction in low-speed segments can look like gravity, also in "
-            f"the ten-fold error; the torque on {', '.join(commanded)} may be worse than zero torque elsewhere: "
-            "validate the model on static poses before it commands an arm",
-            file=sys.stderr,
-        )
+    if options.tables is not None:
+        write_tables(options.tables, lambda file: print_identification(file, result, full=True))
+        console.print(f"all parameters: {options.tables}")
     if plots is not None:
         plot_identification(plots, result)
         console.print(f"plots: {options.plots}")
 
 
 def _validate(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.dynamic.validation import DynamicValidation, validate_motion
-    from dvrk_drake.analysis.signals.static_segments import find_poses
-    from dvrk_drake.analysis.static.validation import validate
-    from dvrk_drake.analysis.verdict import unfit
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary
-    from dvrk_drake.errors import ModelError
-    from dvrk_drake.recordings.recording import read_recording
+    from dvrk_drake.reports.identification import plot_validation, print_validation
     from dvrk_drake.reports.terminal_tables import make_console
 
     if options.json is not None:
         check_output(options.json, options.recording, options.model, overwrite=options.overwrite)
-    model = IdentifiedModel.load(options.model)
-    arm = model.load_arm()
-    recording = read_recording(options.recording, arm, options.coordinates)
+    model = dvrk.IdentifiedModel.load(options.model)
+    recording = dvrk.read_recording(options.recording, model.load_arm(), options.coordinates)
     print_notes(options.recording, recording.notes)
     plots = None if options.plots is None else made_folder(options.plots)
-    console = make_console()
-    sha256, source = recording.sha256, recording.source
-    same = bool(sha256) and sha256 == model.provenance.sha256
     if options.save:
         check_output(options.model, options.recording, overwrite=True)
-        if same:
-            raise ModelError(f"{source}: --save needs a recording that the model was not identified from")
+        if recording.sha256 and recording.sha256 == model.provenance.sha256:
+            raise ModelError(f"{recording.source}: --save needs a recording that the model was not identified from")
         if model.validation is not None and not options.overwrite:
             saved = model.validation.recording
             raise ModelError(f"{options.model}: has verdicts from {saved} already; replace them with --overwrite")
-    recording, measured, note, moves = find_poses(recording, arm, options.slow_parts)
-    warnings = refuse_unusable(console, recording, arm)
-    in_motion = moves and model.dynamics is not None
-    validation = validate_motion(model, recording) if in_motion else validate(model, recording, measured)
+    with ProgressBar("validating") as bar:
+        validation = dvrk.validate(model, recording, slow_parts=options.slow_parts, progress=bar)
     # Before anything is printed: whoever reads the output may close it (head).
     if options.save:
-        summary = ValidationSummary(source, sha256, dict(validation.verdicts))
-        replace(model, validation=summary).save(options.model)
-    failed = [] if options.require is None else unfit(validation.verdicts, options.require)
-    if isinstance(validation, DynamicValidation):
-        show_motion_validation(options, validation, model, source, plots)
-    else:
-        _show_validation(options, validation, model, recording, plots)
-        if note:
-            console.print(note)
-    for warning in warnings:
-        console.print(warning, style="yellow", markup=False, soft_wrap=True)
+        validation.save(options.model, overwrite=True)
+    if options.json is not None:
+        write_json(options.json, validation.as_dict())
+    console = make_console()
+    print_validation(console, validation)
+    if plots is not None:
+        plot_validation(plots, validation)
+        console.print(f"plots: {options.plots}")
+    if validation.note:
+        console.print(validation.note)
+    print_warnings(console, validation.warnings)
     if options.save:
         console.print(f"verdicts saved: {options.model}")
-    if same:
-        print(
-            f"dvrk-drake: warning: {source}: the model was identified from this recording, so these are errors of the "
-            "fit; validate with another one",
-            file=sys.stderr,
-        )
-    if failed:
+    if options.require is not None and (failed := validation.unfit(options.require)):
         raise ModelError(
-            f"{options.model}: not {options.require} on {source}: {', '.join(failed)}; identify from a recording with "
-            "more varied poses, or recalibrate"
+            f"{options.model}: not {options.require} on {recording.source}: {', '.join(failed)}; identify from a "
+            "recording with more varied poses, or recalibrate"
         )
-
-
-def _show_validation(
-    options: argparse.Namespace,
-    validation: Validation,
-    model: IdentifiedModel,
-    recording: Recording,
-    plots: Path | None,
-) -> None:
-    """Writes the JSON of a model compared with poses, prints verdicts and errors, writes the plots."""
-    from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.reports.figures import plot_validation
-    from dvrk_drake.reports.terminal_tables import make_console, print_doubts, print_validation
-
-    console, arm = make_console(), model.load_arm()
-    if options.json is not None:
-        with atomic_write(options.json) as stream:
-            json.dump(validation.as_dict(), stream, indent=2)
-            stream.write("\n")
-    print_validation(console, validation)
-    if motion := recording.motion(arm):
-        console.print(
-            f"the arm moves in this recording ({motion}): the model holds poses, and "
-            "knows nothing of inertia and of moving friction",
-            style="yellow",
-            soft_wrap=True,
-        )
-    print_doubts(console, validation.doubts)
-    if plots is not None:
-        plot_validation(plots, model, validation, recording.in_joint_coordinates(arm))
-        console.print(f"plots: {options.plots}")
 
 
 def _predict(options: argparse.Namespace) -> None:
-    import numpy as np
-
-    from dvrk_drake.analysis.dynamic.validation import predict_motion
-    from dvrk_drake.analysis.signals.static_segments import find_poses
-    from dvrk_drake.analysis.static.validation import predict
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.recordings.recording import read_recording, write_csv
+    from dvrk_drake.recordings.recording import write_csv
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(options.output, options.recording, options.model, overwrite=options.overwrite)
-    model = IdentifiedModel.load(options.model)
-    arm = model.load_arm()
-    recording = read_recording(options.recording, arm, options.coordinates)
+    model = dvrk.IdentifiedModel.load(options.model)
+    recording = dvrk.read_recording(options.recording, model.load_arm(), options.coordinates)
     print_notes(options.recording, recording.notes)
-    # Positions and velocities suffice, but what judges a motion wants efforts.
-    measured = recording if recording.tau is not None else replace(recording, tau=np.zeros_like(recording.q))
-    if model.dynamics is not None and find_poses(measured, arm).moves:
-        of_efforts = () if recording.tau is not None else ("no effort",)
-        refuse_unusable(make_console(), measured, arm, warn=True, apart_from=of_efforts)
-        tau = predict_motion(model, recording)
-        if recording.coordinates == "joint":
-            tau = arm.transmission.pull_back_effort(tau)
-    else:
-        tau = predict(model, recording)
+    with ProgressBar("predicting") as bar:
+        prediction = dvrk.predict(model, recording, progress=bar)
+    print_warnings(make_console(), prediction.warnings)
+    tau = prediction.tau
     write_csv(options.output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
 
 
 def _convert(options: argparse.Namespace) -> None:
-    from dvrk_drake.models.arm import load_arm
     from dvrk_drake.recordings.conversion import convert
     from dvrk_drake.reports.terminal_tables import make_console
 
@@ -282,7 +188,7 @@ def _convert(options: argparse.Namespace) -> None:
         coordinates=options.coordinates,
         variable=options.variable,
         rate=options.rate,
-        arm=None if options.arm is None else load_arm(options.arm),
+        arm=None if options.arm is None else dvrk.load_arm(options.arm),
         skip_invalid=options.skip_invalid,
     )
     for note in recording.notes:

@@ -71,14 +71,14 @@ def _view(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.control import ArmLink
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.live_view import show_status
-    from dvrk_drake.systems.arm_view import ArmView, framing, start_meshcat
+    from dvrk_drake.systems.arm_view import ArmView, start_meshcat
 
     quiet_drake()
     if options.lcm_url is not None and not options.live:
         raise DvrkDrakeError("--lcm-url is of --live")
     arm = load_arm(options.arm)
     url = open_lcm(options.lcm_url or "").get_lcm_url() if options.live else ""
-    meshcat = start_meshcat(*framing(arm), port=options.port)
+    meshcat = start_meshcat(arm, port=options.port)
     view = ArmView(arm, meshcat)
     if options.live:
         link = ArmLink(arm, url, replays=True)

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 
-from dvrk_drake.cli.dynamics import refuse_unusable
-from dvrk_drake.cli.support import ProgressBar, add_gravity, add_overwrite, check_output, mounted, print_notes
+import dvrk_drake as dvrk
+from dvrk_drake.cli.support import (
+    ProgressBar,
+    add_gravity,
+    add_overwrite,
+    check_output,
+    mounted,
+    print_notes,
+    print_warnings,
+    write_json,
+)
+from dvrk_drake.errors import ModelError
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -31,51 +39,25 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _payload(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-    from dvrk_drake.analysis.payload.payload import check_links, estimate_payload
-    from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.errors import ModelError
-    from dvrk_drake.models.arm import load_arm
-    from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.recordings.recording import read_recording
-    from dvrk_drake.reports.payload import describe_better_links, print_links, print_payload
+    from dvrk_drake.reports.payload import print_links, print_payload
     from dvrk_drake.reports.terminal_tables import make_console
 
-    model = None if options.model is None else IdentifiedModel.load(options.model)
+    model = None if options.model is None else dvrk.IdentifiedModel.load(options.model)
     if model is not None and options.gravity is not None:
         raise ModelError(f"{options.model}: states its gravity; --gravity is for --arm")
-    arm = mounted(load_arm(options.arm), options.gravity) if model is None else model.load_arm()
-    check_links(DynamicRegressor(arm), [] if options.link is None else [options.link])
+    arm = mounted(dvrk.load_arm(options.arm), options.gravity) if model is None else model.load_arm()
     if options.json is not None:
         check_output(options.json, options.reference, options.loaded, overwrite=options.overwrite)
+    reference, loaded = (dvrk.read_recording(p, arm, options.coordinates) for p in (options.reference, options.loaded))
+    for recording in (reference, loaded):
+        print_notes(recording.source, recording.notes)
+    with ProgressBar("estimating") as bar:
+        result = dvrk.payload(reference, loaded, model or arm, options.link, progress=bar)
     console = make_console()
-    recordings = []
-    for path in (options.reference, options.loaded):
-        recordings.append(read_recording(path, arm, options.coordinates))
-        print_notes(path, recordings[-1].notes)
-        refuse_unusable(console, recordings[-1], arm)
-    reference, loaded = recordings
-    with ProgressBar("estimating") as (progress, task):
-        if model is None:
-            share = 50.0
-            model = identify_dynamic(reference, arm, lambda done: progress.update(task, completed=50 * done)).model
-        else:
-            share = 0.0
-        estimates = estimate_payload(
-            reference,
-            loaded,
-            model.dynamic_model,
-            progress=lambda done: progress.update(task, completed=share + (100 - share) * done),
-        )
-    chosen = estimates if options.link is None else [p for p in estimates if p.link == options.link]
-    warning = describe_better_links(chosen[0], estimates)
-    if options.link is None or warning is not None:
-        print_links(console, estimates)
-    if warning is not None:
-        print(f"dvrk-drake: warning: {warning}", file=sys.stderr, flush=True)
-    print_payload(console, chosen[0], estimates)
+    other_link = [warning for warning in result.warnings if warning.kind == "other link"]
+    if options.link is None or other_link:
+        print_links(console, result.estimates)
+    print_warnings(console, other_link)
+    print_payload(console, result.payload, result.estimates)
     if options.json is not None:
-        with atomic_write(options.json) as stream:
-            json.dump([payload.as_dict(estimates) for payload in chosen], stream, indent=2)
-            stream.write("\n")
+        write_json(options.json, result.as_dicts())

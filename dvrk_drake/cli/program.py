@@ -51,6 +51,7 @@ def run(arguments: Sequence[str] | None) -> int:
         with folders_only_for_results():
             options.run(options)
     except DvrkDrakeError as error:
+        _print_findings(error)
         print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except BrokenPipeError:
@@ -61,6 +62,16 @@ def run(arguments: Sequence[str] | None) -> int:
         print("dvrk-drake: interrupted", file=sys.stderr)
         return 130
     return 0
+
+
+def _print_findings(error: DvrkDrakeError) -> None:
+    """What `check` found in the recording that the error is about, on stdout."""
+    if error.findings:
+        from dvrk_drake.reports.terminal_tables import make_console
+
+        console = make_console()
+        for finding in error.findings:
+            console.print(str(finding), style="yellow", markup=False, soft_wrap=True)
 
 
 class _Parser(argparse.ArgumentParser):

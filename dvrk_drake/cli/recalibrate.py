@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from dvrk_drake.cli.dynamics import refuse_unusable
-from dvrk_drake.cli.support import add_overwrite, add_recording, check_output, print_notes
+import dvrk_drake as dvrk
+from dvrk_drake.cli.support import ProgressBar, add_overwrite, add_recording, check_output, print_notes
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -24,19 +24,16 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _recalibrate(options: argparse.Namespace) -> None:
-    from dvrk_drake.analysis.recalibration import recalibrate
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.recordings.recording import read_recording
-    from dvrk_drake.reports.dynamic_identification import print_recalibration
+    from dvrk_drake.reports.identification import print_recalibration
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(options.output, options.recording, options.model, overwrite=options.overwrite)
-    model = IdentifiedModel.load(options.model)
-    recording = read_recording(options.recording, model.load_arm(), options.coordinates)
+    model = dvrk.IdentifiedModel.load(options.model)
+    recording = dvrk.read_recording(options.recording, model.load_arm(), options.coordinates)
     print_notes(options.recording, recording.notes)
+    with ProgressBar("recalibrating") as bar:
+        result = dvrk.recalibrate(model, recording, progress=bar)
     console = make_console()
-    refuse_unusable(console, recording, model.load_arm())
-    result = recalibrate(model, recording)
     print_recalibration(console, result)
-    result.model.save(options.output)
+    result.save(options.output, overwrite=True)
     console.print(f"model: {options.output}")

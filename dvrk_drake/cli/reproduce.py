@@ -36,12 +36,6 @@ def _reproduce(options: argparse.Namespace) -> None:
         _ = recordings.poses  # refuses before a folder is made
     output = made_folder(options.output)
     names = NAMES if options.what == "all" else (options.what,)
-    with ProgressBar("") as (progress, task):
-        page = reproduce(
-            names,
-            output,
-            recordings,
-            lambda what, share: progress.update(task, description=what, completed=100 * share),
-            seed=options.seed,
-        )
+    with ProgressBar("") as bar:
+        page = reproduce(names, output, recordings, bar, seed=options.seed)
     print(f"written: {page}")

@@ -3,15 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
+import dvrk_drake as dvrk
 from dvrk_drake.cli.support import ProgressBar, add_overwrite, check_output, made_folder, quiet_drake, until_stopped
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from dvrk_drake.experiments.scenario import Scenario
-    from dvrk_drake.experiments.simulation import Simulation
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -33,39 +27,26 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    from dvrk_drake.experiments.scenario import load_scenario
-    from dvrk_drake.experiments.simulation import simulate
-    from dvrk_drake.recordings.recording import write_recording
+    from dvrk_drake.reports.figures import plot_simulation
     from dvrk_drake.reports.terminal_tables import make_console, print_simulation
-    from dvrk_drake.systems.arm_view import framing, start_meshcat
 
     quiet_drake()
-    scenario = load_scenario(options.scenario, options.set)
+    scenario = dvrk.load_scenario(options.scenario, options.set)
     plots = None if options.plots is None else made_folder(options.plots)
     if options.output is not None:
         check_output(options.output, options.scenario, scenario.controller.model, overwrite=options.overwrite)
-    meshcat = start_meshcat(*framing(scenario.mounted_arm)) if options.meshcat else None
+    meshcat = dvrk.start_meshcat(scenario.mounted_arm) if options.meshcat else None
     if meshcat is not None:
         print(f"{scenario.mounted_arm.name} at {meshcat.web_url()}", flush=True)
-    with ProgressBar("simulating") as (progress, task):
-        simulation = simulate(scenario, meshcat, lambda share: progress.update(task, completed=100 * share))
+    with ProgressBar("simulating") as bar:
+        simulation = dvrk.simulate(scenario, meshcat=meshcat, progress=bar)
     print_simulation(make_console(), simulation, scenario.mounted_arm)
     if options.output is not None:
-        write_recording(simulation.recording, options.output)
+        dvrk.write_recording(simulation.recording, options.output)
         print(f"recording: {options.output}, {len(simulation.recording)} rows")
     if plots is not None:
-        _plot(plots / "positions.png", simulation, scenario)
+        plot_simulation(plots / "positions.png", simulation, scenario)
         print(f"plots: {plots}")
     if meshcat is not None:
         print("the page can play the motion again; end with Stop, Escape or Ctrl-C", flush=True)
         until_stopped(meshcat)
-
-
-def _plot(path: Path, simulation: Simulation, scenario: Scenario) -> None:
-    from dvrk_drake.reports.figures import plot_positions
-
-    curves = {"simulated": simulation.recording.q}
-    if simulation.desired is not None:
-        curves["desired"] = simulation.desired
-    arm = scenario.mounted_arm
-    plot_positions(path, arm, simulation.time, curves, f"{arm.name}, simulated, mode {scenario.controller.mode}")

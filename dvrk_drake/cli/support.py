@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import logging
 import math
 import os
@@ -26,6 +27,8 @@ from dvrk_drake.errors import DvrkDrakeError
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
+    from dvrk_drake.analysis.check.findings import Finding
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.lcm_messages import MessageKey
 
@@ -171,6 +174,44 @@ def seconds(text: str) -> float:
     return value
 
 
+def load_model(name: str) -> IdentifiedModel:
+    """Returns the model of a file, or what the SDF of an arm states; the arm by name or by its own file."""
+    from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.models.arm import known_arms, load_arm
+
+    if name.lower() in known_arms() or _is_arm_file(name):
+        return IdentifiedModel.from_arm(load_arm(name))
+    return IdentifiedModel.load(name)
+
+
+def _is_arm_file(name: str) -> bool:
+    """An arm's YAML names its mechanism; a model's has no such field."""
+    from dvrk_drake.models.files import read_text_input
+
+    try:
+        return any(line.startswith("mechanism:") for line in read_text_input(name, DvrkDrakeError).splitlines())
+    except DvrkDrakeError:
+        return False
+
+
+def print_warnings(console: Console, warnings: Sequence[Finding]) -> None:
+    """Prints one line per warning; those of results that look better than they are go to stderr."""
+    for warning in warnings:
+        if warning.kind in ("low-speed segments", "same recording", "other link"):
+            print(f"dvrk-drake: {warning}", file=sys.stderr, flush=True)
+        else:
+            console.print(str(warning), style="yellow", markup=False, soft_wrap=True)
+
+
+def write_json(path: str, content: object) -> None:
+    """Writes the file of an option --json."""
+    from dvrk_drake.models.files import atomic_write
+
+    with atomic_write(path) as stream:
+        json.dump(content, stream, indent=2)
+        stream.write("\n")
+
+
 def print_notes(path: str, notes: Sequence[str]) -> None:
     """Says on stderr what a user must know of a recording, a line each."""
     for note in notes:
@@ -230,9 +271,17 @@ class ProgressBar:
         )
         self._task = self._progress.add_task(what, total=100)
 
-    def __enter__(self):
+    def __enter__(self) -> ProgressBar:
         self._progress.start()
-        return self._progress, self._task
+        return self
+
+    def __call__(self, step: str, share: float) -> None:
+        """Shows a step and its finished share, 0..1; see `dvrk_drake.progress`."""
+        self._progress.update(self._task, description=step, completed=100 * share)
+
+    def share(self, share: float) -> None:
+        """Shows the finished share of the step that is shown."""
+        self._progress.update(self._task, completed=100 * share)
 
     def __exit__(self, *_: object) -> None:
         self._progress.stop()

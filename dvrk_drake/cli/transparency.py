@@ -68,17 +68,8 @@ def _transparency(options: argparse.Namespace) -> None:
     folder = None if options.output is None else made_folder(options.output)
     felt = []
     for compensation in compensations:
-        with ProgressBar(compensation.name) as (progress, task):
-            felt.append(
-                feel(
-                    arm,
-                    path,
-                    compensation,
-                    effects=effects,
-                    frame_name=options.frame,
-                    progress=lambda share: progress.update(task, completed=100 * share),
-                )
-            )
+        with ProgressBar(compensation.name) as bar:
+            felt.append(feel(arm, path, compensation, effects=effects, frame_name=options.frame, progress=bar.share))
     print_transparency(make_console(), arm, felt)
     if folder is not None:
         write_transparency(folder / "transparency.csv", felt)

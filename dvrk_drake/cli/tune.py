@@ -36,8 +36,8 @@ def _tune(options: argparse.Namespace) -> None:
         check_output(options.output, options.arm, overwrite=options.overwrite)
     plots = None if options.plots is None else made_folder(options.plots)
     methods: list[Method] = ["paper", "model"] if options.method == "both" else [options.method]
-    with ProgressBar(f"tuning {arm.name}") as (progress, task):
-        tuning = tune_arm(options.arm, methods, lambda share: progress.update(task, completed=100 * share))
+    with ProgressBar(f"tuning {arm.name}") as bar:
+        tuning = tune_arm(options.arm, methods, bar.share)
     print_tuning(make_console(), tuning)
     best = tuning.comparison.best(tuning.found)
     print(f"of the gains found, those of method {best} settle most often, and then fastest")

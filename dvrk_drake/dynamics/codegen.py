@@ -97,6 +97,15 @@ def compile_batch(function: Callable[..., None], num_arguments: int, shape: tupl
     return evaluate
 
 
+def entry_point(dispatcher: Callable[..., None]) -> Callable[..., None]:
+    """The only signature of a compiled function, without the choice between signatures (4 us a call here).
+
+    Its types are not checked any more: the arrays must be what the signature says. Drake's always are.
+    """
+    (overload,) = dispatcher.overloads.values()  # type: ignore[attr-defined]
+    return overload.entry_point
+
+
 def is_scalar(name: str, symbols: Sequence[sympy.Symbol]) -> bool:
     """Whether an argument is a number: one symbol, of the same name."""
     return len(symbols) == 1 and symbols[0].name == name

@@ -20,6 +20,9 @@ from dvrk_drake.dynamics.dynamic_section import (
     STANDARD_ERRORS,
     ActuatorEffectEstimate,
     DynamicSection,
+    LinkEstimate,
+    RotorEstimate,
+    SignalSettings,
 )
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
@@ -111,6 +114,14 @@ class IdentifiedModel:
     are those of a model identified from poses, of position alone. One identified from a motion has `dynamics`, with
     effects of all kinds; its base parameters are those of the links there. `validation` is what `validate --save`
     stored.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("psm"))
+        >>> model.save("psm.yaml")
+        >>> tau = dvrk.IdentifiedModel.load("psm.yaml").holding_torque(np.zeros((5, 7)))
+        >>> tau.shape, [joint.name for joint in model.joints][1]
+        ((5, 7), 'pitch')
     """
 
     format: str = "dvrk_drake identified model 2"
@@ -124,11 +135,19 @@ class IdentifiedModel:
     validation: ValidationSummary | None = None
 
     @classmethod
-    def from_arm(cls, arm: Arm, effects: Sequence[DriveEffect] = ()) -> "IdentifiedModel":
-        """The model that the arm's SDF states: its own inertias, and `effects` of position if any are given.
+    def from_arm(cls, arm: Arm, effects: Sequence[DriveEffect] = (), *, dynamics: bool = False) -> "IdentifiedModel":
+        """Returns the model that the arm's own files state, without identification.
 
-        E.g. `arm.effects.cables + arm.effects.springs`, what the arm's files know of them.
+        Args:
+            arm: whose SDF states the inertias.
+            effects: of position, e.g. `arm.effects.cables + arm.effects.springs`; not with `dynamics`.
+            dynamics: state the dynamics in motion too: rotors, and the friction, cables and springs of `arm.effects`.
+
+        Raises:
+            ModelError: `effects` beside `dynamics`.
         """
+        if dynamics and effects:
+            raise ModelError("a model with dynamics has all effects of the arm; give either effects or dynamics")
         gravity = derive_gravity(arm)
         return cls(
             arm=arm.source,
@@ -140,6 +159,7 @@ class IdentifiedModel:
             effects=[ActuatorEffectEstimate(e.coordinate, e.kind, e.scale, e.coefficient, 0.0) for e in effects],
             joints=[JointStatistics(name=name) for name in arm.joint_names],
             provenance=Provenance(recording=" ".join(arm.sdf), method="nominal"),
+            dynamics=_nominal_dynamics(arm) if dynamics else None,
         )
 
     @classmethod
@@ -281,3 +301,23 @@ class ControlModel:
     def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the mass matrix (n, n) of the independent joints at q (n,) [rad, m], rotors included."""
         return self._regressor.mass_matrix(q[None], self._parameters)[0]
+
+
+def _nominal_dynamics(arm: Arm) -> DynamicSection:
+    """What the arm's files state of its dynamics."""
+    regressor = DynamicRegressor(arm)
+    rotors = regressor.rotors[: arm.num_joints]
+    drive = [*arm.effects.friction, *arm.effects.cables, *arm.effects.springs]
+    gravity = [float(x) for x in arm.gravity]
+    return DynamicSection(
+        gravity=gravity,
+        links=[LinkEstimate(link.link, link.parameters.tolist()) for link in regressor.links],
+        rotors=[RotorEstimate(name, rotor.value) for name, rotor in zip(arm.joint_names, rotors, strict=True)],
+        effects=[ActuatorEffectEstimate(e.coordinate, e.kind, e.scale, e.coefficient) for e in drive],
+        signals=SignalSettings(
+            acceleration_cut_off=list(arm.motion.acceleration_cut_off),
+            effort_cut_off=arm.effort_cut_off,
+            effort_delay=list(arm.motion.effort_delay),
+        ),
+        gravity_expected=gravity,
+    )

@@ -102,7 +102,7 @@ def collect_static_poses(
     add_closed_loop(builder, station, GravityPidController(model), desired)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    station.set_positions(context, poses[0])
+    station.SetPositions(context, poses[0])
     position = station.GetOutputPort(f"{name}.position_measured")
     effort = station.GetOutputPort(f"{name}.effort_measured")
     q, tau = np.zeros_like(poses), np.zeros_like(poses)

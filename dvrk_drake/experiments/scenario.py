@@ -13,19 +13,17 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
 from dvrk_drake.dynamics.friction_compensation import LARGEST_HYSTERESIS_RATIO, LARGEST_RATIO
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import ArmFrame
-from dvrk_drake.errors import ArmError, ScenarioError
-from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.arm_schema import GRAVITIES, Gains, load_gains
-from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
-from dvrk_drake.models.loop_closure import Closure
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.errors import ScenarioError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_schema import Gains, load_gains
+from dvrk_drake.models.schema_fault import within
 from dvrk_drake.models.typed_yaml import load_yaml, parse_yaml, typed_content
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.hand import Grip
+from dvrk_drake.systems.station_config import ArmConfig
 
 #: Longest simulation [s] and finest recording that are taken for meant.
 LONGEST, LEAST_SAMPLE_PERIOD = 3600.0, 1e-3
@@ -91,13 +89,12 @@ class HandScenario:
 
 
 @dataclass
-class Scenario:
+class Scenario(ArmConfig):
     """Schema of a scenario file. One scenario gives one result, bit for bit.
 
+    The fields of `ArmConfig` state the arm; `seed` is that of the controller's parameter error as well.
+
     Attributes:
-        arm: name, or path of an arm's YAML file; paths are relative to the folder that the command runs in.
-        closure: how the linkage's loops are held: "ball" or "mimic".
-        gravity: (3,) in the base frame [m/s^2]; the arm's own if left out.
         time_step: of the plant and period of the controller [s].
         duration: of the simulation [s].
         sample_period: of the recording [s].
@@ -105,16 +102,17 @@ class Scenario:
         start: pose at the start, at rest; zero, or the nearest pose inside the limits, if left out.
         targets: where the arm shall be when; before, between and after them it is at rest at each. Mode "hold" only.
         hand: a person who moves the arm.
-        effects: more of them in the drive of the simulated arm, of position alone; the controller does not know them.
-        stretch: actuator -> cable of the simulated arm that stretches, beside those of `real_arm`.
-        real_arm: parts of the arm's own `effects` that the simulation has, by name; ["all"] for all of them.
         effort_noise: standard deviation of recorded efforts, as a share of the effort limits.
-        seed: of all noise, and of the controller's parameter error.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> scenario = dvrk.Scenario(arm="psm", duration=0.1, real_arm=["friction"])
+        >>> scenario.controller.mode = "gravity"
+        >>> dvrk.simulate(scenario).recording.measured_effort().shape
+        (11, 7)
     """
 
-    arm: str = ""
     closure: str = "ball"
-    gravity: list[float] | None = field(default=None, metadata=GRAVITIES)
     time_step: float = field(default=1e-3, metadata=within(1e-5, 0.01, "s"))
     duration: float = field(default=5.0, metadata=within(LEAST_SAMPLE_PERIOD, LONGEST, "s"))
     sample_period: float = field(default=0.01, metadata=within(LEAST_SAMPLE_PERIOD, LONGEST, "s"))
@@ -122,17 +120,7 @@ class Scenario:
     start: list[float] | None = field(default=None, metadata=_POSITIONS)
     targets: list[Target] = field(default_factory=list)
     hand: HandScenario = field(default_factory=HandScenario)
-    effects: list[DriveEffect] = field(default_factory=list)
-    stretch: dict[str, Cable] = field(default_factory=dict)
-    real_arm: list[str] = field(default_factory=list)
     effort_noise: float = field(default=0.0, metadata=within(0.0, 1.0))
-    seed: int = field(default=0, metadata=within(0, 2**63 - 1))
-
-    @cached_property
-    def mounted_arm(self) -> Arm:
-        """The arm, with gravity from where the scenario says."""
-        arm = load_arm(self.arm)
-        return arm if self.gravity is None else arm.with_gravity(self.gravity)
 
     @cached_property
     def model(self) -> IdentifiedModel:
@@ -145,18 +133,6 @@ class Scenario:
         # A stream of its own: the seed alone is the noise's.
         generator = np.random.default_rng([self.seed, 1])
         return model.with_scaled_parameters(generator.uniform(1 - error, 1 + error, len(model.base_parameters)))
-
-    @property
-    def all_effects(self) -> ArmEffects | None:
-        """What the simulated arm has beside its links: `real_arm`, `effects` and `stretch`; None if there is nothing.
-
-        Raises:
-            ArmError: a name that is no part.
-        """
-        if not (self.real_arm or self.effects or self.stretch):
-            return None
-        own = self.mounted_arm.effects.only(self.real_arm)
-        return own.joined(ArmEffects(cables=self.effects, stretch=self.stretch))
 
     def knots(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Times (m,) and poses (m, n) that the arm shall rest at: the start, then the targets."""
@@ -172,20 +148,12 @@ class Scenario:
             ScenarioError: names the field, its value, and what is allowed.
             ArmError, ModelError: the arm or the controller's model cannot be loaded.
         """
-        if not self.arm:
-            raise ScenarioError("arm is missing; give an arm's name, or the path of its YAML file")
-        arm = self.mounted_arm
-        _check_choice("closure", self.closure, get_args(Closure))
-        _check_choice("controller.mode", self.controller.mode, get_args(Mode))
-        if fault := number_fault(self):
+        if fault := self.arm_fault():
             raise ScenarioError(fault)
+        arm = self.mounted_arm
+        _check_choice("controller.mode", self.controller.mode, get_args(Mode))
         if self.duration < self.sample_period:
             raise ScenarioError(f"duration is {self.duration:g}; allowed: {self.sample_period:g}..{LONGEST:g} s")
-        try:
-            arm.effects.only(self.real_arm)
-            ArmEffects(stretch=self.stretch).check(arm.joint_names)
-        except ArmError as error:
-            raise ScenarioError(f"simulated arm: {error}") from error
         if self.start is not None:
             check_pose("start", self.start, arm)
         self._check_targets("targets", self.targets, 0.0)
@@ -202,10 +170,6 @@ class Scenario:
                 raise ScenarioError(f'controller.{name} needs mode "gravity"; it is "{self.controller.mode}"')
         if self.targets and self.controller.mode != "hold":
             raise ScenarioError(f'targets need controller.mode "hold"; it is "{self.controller.mode}"')
-        for i, effect in enumerate(self.effects):
-            law = ActuatorEffect(effect.coordinate, effect.kind, effect.scale)
-            if fault := effect_fault(arm, law, POSITION_KINDS):
-                raise ScenarioError(f"effects[{i}].{fault}")
         if self.model.load_arm().name != arm.name:
             raise ScenarioError(f"controller.model {self.controller.model} is of {self.model.arm}, not of {self.arm}")
 
@@ -263,6 +227,12 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
 
     Raises:
         ScenarioError: the file cannot be read, has an unknown key, or asks for what makes no sense.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> scenario = dvrk.load_scenario("mtml", ["duration=2", "controller.mode=damped"])
+        >>> scenario.duration, scenario.controller.mode
+        (2.0, 'damped')
     """
     path = Path(arm_or_file)
     if path.suffix in (".yaml", ".yml"):

@@ -1,25 +1,29 @@
-"""Runs a scenario: an arm under control, simulated and recorded; and samples of any simulation."""
+"""Simulation of an arm under control, with a recording of it; and samples of any simulation."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, System
 from pydrake.systems.primitives import LogVectorOutput, TrajectorySource, VectorLogSink
 from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
-from dvrk_drake.experiments.scenario import Scenario
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ScenarioError
+from dvrk_drake.experiments.scenario import Scenario, Target
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.loop_closure import Closure
+from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
@@ -28,7 +32,7 @@ from dvrk_drake.systems.hand import Hand, HandPath
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """What a scenario gave.
+    """Result of `simulate`.
 
     Attributes:
         recording: t, q, qd, tau (m, n) as the arm measures them: exact without `real_arm`, but for the scenario's noise
@@ -52,34 +56,87 @@ class Simulation:
 
 
 def simulate(
-    scenario: Scenario, meshcat: Meshcat | None = None, progress: Callable[[float], None] = lambda share: None
+    what: Arm | Scenario,
+    *,
+    controller: IdentifiedModel | System | None = None,
+    effects: bool | Sequence[str] | None = None,
+    duration: float | None = None,
+    start: ArrayLike | None = None,
+    targets: Sequence[tuple[float, ArrayLike]] | None = None,
+    sample_period: float | None = None,
+    seed: int | None = None,
+    meshcat: Meshcat | None = None,
+    progress: Progress | None = None,
 ) -> Simulation:
-    """Simulates and records; the same scenario gives the same numbers, bit for bit.
+    """Simulates an arm under control and records it; the same arguments give the same numbers, bit for bit.
 
     Between two poses the arm is led along a cubic in time, straight in joint space, so it stays inside linear limits.
 
     Args:
-        scenario: what to do.
+        what: an arm that holds a pose or moves to `targets`; or a scenario, which states all of the following itself.
+        controller: model of a `GravityPidController`, by default what the arm's SDF states; or a System with an input
+            port `state_estimated` (2n) and an output port `effort` (n), e.g. a `GravityPidController`. It moves to
+            `targets` only if it has an input port `desired_state` (2n). A System can be used once.
+        effects: whether the simulated arm has the effects of a real one, friction, cables, stops, encoders and motors;
+            or the names of those that it has. Default: True.
+        duration: of the simulation [s]. Default: 5.
+        start: (n,) pose at the start, at rest [rad, m]. Default: zero, or the nearest pose inside the limits.
+        targets: times [s] and poses (n,) [rad, m] at which the arm shall be at rest.
+        sample_period: of the recording [s]. Default: 0.01.
+        seed: of the effects' noise. Default: 0.
         meshcat: draws the arm there, in real time, and has the recording at the end.
-        progress: called with the finished share, 0..1.
+        progress: called with the step, "simulating", and its finished share 0..1.
+
+    Returns:
+        Times, positions, velocities and efforts as measured in `recording`, the true state as `state_true`.
 
     Raises:
-        ScenarioError: the scenario asks for what cannot be simulated.
+        ScenarioError: what cannot be simulated, e.g. a pose outside the limits, or an argument beside a scenario.
+        ArmError: an effect that does not exist.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> arm = dvrk.load_arm("mtmr")
+        >>> run = dvrk.simulate(arm, controller=dvrk.IdentifiedModel.from_arm(arm), effects=False, duration=0.5)
+        >>> run.recording.q.shape, bool(abs(run.recording.q).max() < 1e-3)  # holds its home pose
+        ((51, 7), True)
     """
+    given: dict[str, Any] = {"duration": duration, "sample_period": sample_period, "seed": seed}
+    if isinstance(what, Arm):
+        scenario = scenario_of_arm(what, True if effects is None else effects, start, targets or ())
+        for name, value in given.items():
+            if value is not None:
+                setattr(scenario, name, value)
+        scenario.mounted_arm = what
+        if isinstance(controller, IdentifiedModel):
+            scenario.model = controller
+    else:
+        given |= {"controller": controller, "effects": effects, "start": start, "targets": targets}
+        if beside := [name for name, value in given.items() if value is not None]:
+            raise ScenarioError(f"a scenario states {beside[0]} itself; change the scenario, or give an arm")
+        scenario = what
+    return _simulate(scenario, controller if isinstance(controller, System) else None, meshcat, progress)
+
+
+def _simulate(
+    scenario: Scenario, system: System | None, meshcat: Meshcat | None, progress: Progress | None
+) -> Simulation:
+    """Simulates a scenario, with `system` instead of the controller that it states."""
+    report = step_progress(progress, "simulating")
     scenario.check()
     arm = scenario.mounted_arm
     name = arm.name.lower()
     times, poses = scenario.knots()
-    holds = scenario.controller.mode == "hold"
+    holds = scenario.controller.mode == "hold" and (system is None or system.HasInputPort("desired_state"))
     station = ArmStation(
         arm,
         closure=cast(Closure, scenario.closure),
-        time_step=scenario.time_step,
+        plant_config=arm_plant_config(scenario.time_step),
         meshcat=meshcat,
         effects=scenario.all_effects,
         seed=scenario.seed,
     )
-    controller = GravityPidController(
+    controller = system or GravityPidController(
         scenario.model,
         period=scenario.time_step,
         gains=scenario.controller.gains,
@@ -96,12 +153,12 @@ def simulate(
     logs = [LogVectorOutput(output, builder, scenario.sample_period) for output in outputs]
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    station.set_positions(context, poses[0])
+    station.SetPositions(context, poses[0])
     if meshcat is not None:
         simulator.set_target_realtime_rate(1.0)
     t = sample_times(scenario.duration, scenario.sample_period)
     with recorded_in(meshcat):
-        advance(simulator, t, progress)
+        advance(simulator, t, report)
     estimated, tau, state_true, *hand_forces = (samples(log, simulator) for log in logs)
     q, qd = np.hsplit(estimated, 2)
     noise = np.random.default_rng(scenario.seed).normal(size=tau.shape)
@@ -118,7 +175,7 @@ def sample_times(duration: float, period: float) -> NDArray[np.float64]:
 
 
 def advance(
-    simulator: Simulator, times: NDArray[np.float64], progress: Callable[[float], None] = lambda share: None
+    simulator: Simulator, times: NDArray[np.float64], progress: Callable[[float], object] = lambda share: None
 ) -> None:
     """Advances a simulation to each of `times` (m,) [s]; `progress` is called with the finished share of the last."""
     for t in times:
@@ -143,6 +200,20 @@ def recorded_in(meshcat: Meshcat | None, **options: Any) -> Iterator[None]:
     if meshcat is not None:
         meshcat.StopRecording()
         meshcat.PublishRecording()
+
+
+def scenario_of_arm(
+    arm: Arm, effects: bool | Sequence[str], start: ArrayLike | None, targets: Sequence[tuple[float, ArrayLike]]
+) -> Scenario:
+    """Returns the scenario of `simulate` for an arm; arguments as there."""
+    parts = ["all"] if effects is True else [] if effects is False else list(effects)
+    return Scenario(
+        arm=arm.source,
+        gravity=arm.gravity.tolist(),
+        start=None if start is None else np.asarray(start, float).tolist(),
+        targets=[Target(float(time), np.asarray(pose, float).tolist()) for time, pose in targets],
+        real_arm=parts,
+    )
 
 
 def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration: float) -> PiecewisePolynomial:

@@ -164,7 +164,7 @@ def feel(
     logs = [LogVectorOutput(output, builder, SAMPLE_PERIOD) for output in outputs]
     simulator = Simulator(builder.Build())
     root = simulator.get_mutable_context()
-    station.set_positions(station.GetMyMutableContextFromRoot(root), path.value(0.0).ravel())
+    station.SetPositions(station.GetMyMutableContextFromRoot(root), path.value(0.0).ravel())
     times = SAMPLE_PERIOD * np.arange(1, int(path.end_time() / SAMPLE_PERIOD), dtype=np.float64)
     advance(simulator, times, progress)
     forces, state = (samples(log, simulator)[1:] for log in logs)

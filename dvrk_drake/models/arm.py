@@ -71,6 +71,16 @@ class Arm:
         effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].
         bounding_shapes: where the mass of the links of each file of `sdf` can be, see `bounding_boxes`.
         effects: what the real arm has beside all that; only a simulation that asks for them has them.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> arm = dvrk.load_arm("mtmr")
+        >>> arm.num_joints, arm.joint_names[:3]
+        (7, ('outer_yaw', 'shoulder_pitch', 'elbow_pitch'))
+        >>> arm.limit_violations([0, 0.5, 0.3, 0, 0, 0, 0])
+        ['parallelogram = 0.8 is outside -0.33..0.68']
+        >>> arm.sample_poses(2, np.random.default_rng(0)).shape
+        (2, 7)
     """
 
     name: str
@@ -242,6 +252,13 @@ def load_arm(name: str) -> Arm:
 
     Raises:
         ArmError: no such arm, or its files contradict each other.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> arm = dvrk.load_arm("psm")
+        >>> on_its_side = arm.with_gravity([0, -9.81, 0])  # [m/s^2] in the base frame
+        >>> int(arm.prismatic.argmax()), arm.joint_names[2]
+        (2, 'insertion')
     """
     if "\0" in name:
         raise ArmError(f"{name!r}: is not the name of a file")

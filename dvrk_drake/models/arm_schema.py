@@ -22,6 +22,9 @@ EFFORTS = Range(0.001, 2000.0, "N m or N")
 _POSITIONS = within(-1e4, 1e4, "rad or m")
 #: Of one joint or actuator in the position of another: 0.6..1.6 on a dVRK, 32..48 with the gears of a TX40.
 COUPLINGS = within(0.001, 1000.0, also=(0.0,), either_sign=True)
+#: No position, speed or effort of an arm has this size, in whatever unit it may be by mistake [rad, m, rad/s, m/s, N m,
+#: N]; and products of smaller numbers with gains stay finite. Inputs and recordings beyond it are refused.
+IMPLAUSIBLE = 1e6
 #: 9.81 m/s^2 in any direction; `Arm` checks the length of the vector.
 GRAVITIES = within(-30.0, 30.0, "m/s^2")
 _CUT_OFFS = within(0.1, 1000.0, "Hz")

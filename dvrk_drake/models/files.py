@@ -111,6 +111,12 @@ def read_json_input(path: str | Path, error: type[DvrkDrakeError], largest: int 
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
+def refuse_existing(path: str | Path, overwrite: bool) -> None:
+    """Raises DvrkDrakeError if a file exists at `path`, unless it may be replaced."""
+    if os.path.exists(path) and not overwrite:
+        raise DvrkDrakeError(f"{path}: exists already; name another file, or replace it with overwrite=True")
+
+
 @contextmanager
 def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO]:
     """A stream into a temporary file that replaces `path` if the block ends well, and vanishes if not.

@@ -8,7 +8,7 @@ from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.multibody.parsing import Parser
+from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context
@@ -19,13 +19,24 @@ from dvrk_drake.models.loop_closure import Closure, pin_loop, remove_loop_mimics
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 
 
+def package_map() -> PackageMap:
+    """Returns a map with Drake's own packages and `dvrk_drake`, for URLs such as package://dvrk_drake/sdf/mtml.sdf.
+
+    With it Drake's parser finds the models: `Parser(plant).package_map().AddMap(package_map())`.
+    """
+    packages = PackageMap()
+    packages.AddPackageXml(str(MODELS_FOLDER / "package.xml"))
+    return packages
+
+
 def add_arm(
     plant: MultibodyPlant, arm: Arm, closure: Closure = "mimic", collision_shapes: bool = True
 ) -> ModelInstanceIndex:
     """Adds `arm` to a plant that is not finalized, welds its base to the world and sets gravity and limits.
 
-    A discrete plant gets the SAP solver, which all of Drake's joint couplings and pins need. A continuous one can only
-    be simulated with the integrator CENIC (its pins need drake 1.56 or newer).
+    Drake's joint couplings and pins need the SAP solver, that of the contact approximations sap, similar and lagged. A
+    discrete plant with tamsi gets sap. A continuous one can only be simulated with the integrator CENIC (its pins need
+    drake 1.56 or newer).
 
     Args:
         plant: with or without a scene graph.
@@ -38,10 +49,11 @@ def add_arm(
     """
     if closure not in get_args(Closure):
         raise ArmError(f'unknown closure "{closure}"; known: {", ".join(get_args(Closure))}')
-    if plant.time_step() > 0:
+    tamsi = DiscreteContactApproximation.kTamsi
+    if plant.time_step() > 0 and plant.get_discrete_contact_approximation() == tamsi:
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
     parser = Parser(plant)
-    parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))
+    parser.package_map().AddMap(package_map())
     model = compose_sdf(arm.sdf, arm.mirrored_links)
     if closure == "ball":
         remove_loop_mimics(model, arm)

@@ -79,8 +79,8 @@ def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | Non
         mirrored: URL -> links of that file that are taken as their mirror image (`mirror_links`).
 
     Raises:
-        ArmError: a file is not an SDF with one model, gives a link that is already there more than shapes, or lacks one
-            that is to be mirrored.
+        ArmError: a file is not an SDF with one model, gives a link that is already there more than shapes and a mass
+            of 0, or lacks one that is to be mirrored.
     """
     root, *others = (_read(Path(str(url).replace(PACKAGE_URL, f"{MODELS_FOLDER}/", 1))) for url in urls)
     for url, part in zip(urls, (root, *others), strict=True):
@@ -156,6 +156,11 @@ def _read(path: Path) -> ElementTree.Element:
         raise ArmError(f"{path}: not a readable SDF: {error}") from error
     if root.find("model") is None or [e.tag for e in root.iter() if e.tag in ("model", "include")] != ["model"]:
         raise ArmError(f"{path}: must hold one <model> in <sdf>, with no <model> or <include> in it")
+    for link in root.iterfind("model/link"):
+        # Written for Drake's parser, which takes 1 kg for a link without <inertial>.
+        for inertial in link.findall("inertial"):
+            if _number(inertial.findtext("mass") or "") == 0:
+                link.remove(inertial)
     _check_numbers(path, root)
     for uri in root.iter("uri"):
         # Composed, a model has no folder of its own that Drake could look in.

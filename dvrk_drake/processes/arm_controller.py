@@ -90,7 +90,7 @@ class ArmController:
     @property
     def ramped(self) -> bool:
         """Whether they have become the wanted ones in full."""
-        return self._acting and self._ramp.share(self._ramp_context) >= 1
+        return self._acting and self._ramp.GetShare(self._ramp_context) >= 1
 
     def answer(
         self, status: lcmt_dvrk_status, time: float, desired_state: NDArray[np.float64] | None = None

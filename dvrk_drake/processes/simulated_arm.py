@@ -100,7 +100,7 @@ class SimulatedArm:
         )
         self._simulator = Simulator(builder.Build())
         context = self._simulator.get_mutable_context()
-        station.set_positions(station.GetMyMutableContextFromRoot(context), q)
+        station.SetPositions(station.GetMyMutableContextFromRoot(context), q)
         self._simulator.Initialize()
 
     @property

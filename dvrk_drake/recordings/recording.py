@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.files import atomic_write
+from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.csv_rows import CsvReader, is_number, parse_finite, parse_or_nan, skipped_note
 from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
 
@@ -25,8 +27,6 @@ Coordinates = Literal["joint", "actuator"]
 
 #: A pose further than this outside the limits is refused [rad], [m]; nearer ones are real: stops give way.
 LIMIT_TOLERANCE = 0.2, 0.02
-#: No position, speed or effort of these arms is larger, in whatever unit it may be by mistake.
-LARGEST = 1e6
 #: Most rows of a CSV; 15 min at 1 kHz. With these, `check` takes 1.5 GB.
 LARGEST_COUNT = 900_000
 #: Fewest rows of a motion, and the median interval below which rows are samples of one [s].
@@ -39,7 +39,7 @@ SAME_POSE = 0.01, 0.001
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One row a sample; rad and N m, m and N on a prismatic joint, s.
+    """Positions of an arm with efforts, one row per sample or pose [rad, rad/s, N m, s; m, m/s, N if prismatic].
 
     Attributes:
         q: (m, n) positions.
@@ -51,6 +51,13 @@ class Recording:
         lines: (m,) line of each row in the source, of an LCM log the event's number, for messages.
         sha256: of the source's bytes, or "".
         notes: what a user must know of how it was read, a line each: damage, messages left out.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> poses = dvrk.Recording(q=np.zeros((8, 7)), tau=np.ones((8, 7)), coordinates="actuator")
+        >>> joints = poses.in_joint_coordinates(dvrk.load_arm("mtmr"))
+        >>> joints.tau[0].round(2).tolist()  # tau_joint = J' tau_actuator
+        [1.0, 2.0, 1.67, 1.0, 1.0, 1.0, 1.0]
     """
 
     q: NDArray[np.float64]
@@ -193,11 +200,11 @@ class Recording:
 
     def _check_sizes(self) -> None:
         for name, values in (("q", self.q), ("qd", self.qd), ("tau", self.tau)):
-            if values is not None and np.any(np.abs(values) > LARGEST):
-                row, joint = np.argwhere(np.abs(values) > LARGEST)[0]
+            if values is not None and np.any(np.abs(values) > IMPLAUSIBLE):
+                row, joint = np.argwhere(np.abs(values) > IMPLAUSIBLE)[0]
                 raise RecordingError(
                     f"{self.where(int(row))}: {name}{joint + 1} = {values[row, joint]:g} is no reading of an arm; "
-                    f"at most {LARGEST:g}"
+                    f"at most {IMPLAUSIBLE:g}"
                 )
 
     def _check_joint_count(self, arm: Arm) -> None:
@@ -212,9 +219,9 @@ def read_recording(
     path: str | Path,
     arm: Arm | None = None,
     coordinates: Coordinates = "joint",
-    progress: Callable[[float], object] = lambda share: None,
     *,
     skip_invalid: bool = False,
+    progress: Progress | None = None,
 ) -> Recording:
     """Reads a CSV, or an LCM log with the DVRK_STATUS messages of an arm; the file's first bytes tell which.
 
@@ -226,12 +233,23 @@ def read_recording(
         arm: whose joints are counted and named in messages, and whose statuses are read of a log; without it a CSV has
             7 joints, as all arms have so far, and a log statuses of one arm only.
         coordinates: what q, qd and tau are of; a log's are of the joints.
-        progress: called with the share 0..1 of a CSV that was read.
         skip_invalid: leave out rows of a CSV with an empty cell, a NaN or an infinity, and note them, instead of
             refusing the file.
+        progress: called with the step, "reading", and the share 0..1 of a CSV that was read.
+
+    Returns:
+        The recording, with its SHA-256 and with line numbers for messages; `notes` state what was left out.
 
     Raises:
         RecordingError: names the file, the line and the column of what is wrong.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> arm = dvrk.load_arm("mtmr")
+        >>> dvrk.write_recording(dvrk.Recording(q=np.zeros((8, 7)), tau=np.ones((8, 7))), "poses.csv")
+        >>> recording = dvrk.read_recording("poses.csv", arm)
+        >>> len(recording), recording.coordinates, recording.where(0)
+        (8, 'joint', 'poses.csv:2')
     """
     if coordinates not in get_args(Coordinates):
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
@@ -241,7 +259,7 @@ def read_recording(
             raise RecordingError(f"{path}: an LCM log is in joint coordinates, not {coordinates}")
         log = read_status_log(path, arm)
         return Recording(log.q, log.tau, log.qd, log.t, "joint", str(path), log.events, log.sha256, log.notes)
-    return _read_csv(path, arm, coordinates, progress, skip_invalid)
+    return _read_csv(path, arm, coordinates, step_progress(progress, "reading"), skip_invalid)
 
 
 def _read_csv(
@@ -344,7 +362,21 @@ def column_names(prefix: str, num_joints: int) -> list[str]:
 
 
 def write_recording(recording: Recording, path: str | Path) -> None:
-    """Writes the CSV that `read_recording` reads, at once or not at all, with every digit of every number."""
+    """Writes the CSV that `read_recording` reads, at once or not at all, with every digit of every number.
+
+    Args:
+        recording: in the coordinates that the file shall have; a CSV does not state them.
+        path: the file; an existing one is replaced.
+
+    Raises:
+        DvrkDrakeError: the folder does not exist or cannot be written.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> dvrk.write_recording(dvrk.Recording(q=np.zeros((8, 7)), t=np.arange(8.0)), "positions.csv")
+        >>> open("positions.csv").readline().rstrip()
+        't,q1,q2,q3,q4,q5,q6,q7'
+    """
     columns, header = [], []
     for prefix, block in (
         ("t", recording.t),

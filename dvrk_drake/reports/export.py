@@ -14,13 +14,29 @@ from rich.markup import escape
 from rich.table import Table
 
 from dvrk_drake.dynamics.model_links import ModelBodies
-from dvrk_drake.export.dvrk_mtm_gravity_compensation import MTM_JOINTS
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import MTM_JOINTS, largest_differences
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import CompensationComparison
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import ARM_JOINTS, NAMES, KinematicCompensation
-from dvrk_drake.export.sdf import LinkChange
+from dvrk_drake.export.model_export import ModelExport
+from dvrk_drake.export.sdf import LinkChange, changed_links
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.figures import MODEL_COLOUR, save_figure
+
+
+def print_export(console: Console, path: str, export: ModelExport) -> None:
+    """Prints what a file has of a model, what it cannot state, and its name."""
+    arm = export.model.load_arm()
+    if export.format == "sdf" and export.bodies is not None:
+        print_changed_links(console, changed_links(arm, export.bodies.links), export.bodies)
+        console.print(f"SDF: {path}", soft_wrap=True)
+    elif export.format == "urdf":
+        console.print(f"URDF: {path}", soft_wrap=True)
+    elif isinstance(export.compensation, KinematicCompensation):
+        print_kinematic_compensation(console, path, export.compensation)
+    else:
+        written = GravityCompensationFile.load(path)
+        print_compensation(console, path, arm, written, largest_differences(written, export.model))
 
 
 def print_changed_links(console: Console, changes: Sequence[LinkChange], bodies: ModelBodies) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.static.doubts import Doubt, usable_measurements
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
-from dvrk_drake.analysis.static.validation import Validation
+from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.demo.demo import (
     HELD_UNTIL,
@@ -20,6 +20,8 @@ from dvrk_drake.experiments.demo.demo import (
     RELEASED_UNTIL,
     DemoResult,
 )
+from dvrk_drake.experiments.scenario import Scenario
+from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.recording import Recording
@@ -117,7 +119,7 @@ def plot_measured_against_predicted(
     save_figure(figure, path)
 
 
-def plot_identification(folder: Path, result: StaticIdentification) -> None:
+def plot_static_identification(folder: Path, result: StaticIdentification) -> None:
     """Writes torque_error.png and predicted.png of an identification."""
     recording = result.recording
     joints = result.model.joints
@@ -134,11 +136,14 @@ def plot_identification(folder: Path, result: StaticIdentification) -> None:
     plot_measured_against_predicted(folder / "predicted.png", result.model, recording, result.measured, result.doubts)
 
 
-def plot_validation(folder: Path, model: IdentifiedModel, validation: Validation, recording: Recording) -> None:
-    """Writes torque_error.png and predicted.png of a validation; `recording` in joint coordinates."""
+def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
+    """Writes torque_error.png and predicted.png of a validation."""
+    model = validation.model
+    arm = model.load_arm()
+    recording = validation.recording.in_joint_coordinates(arm)
     plot_torque_error(
         folder / "torque_error.png",
-        model.load_arm(),
+        arm,
         np.array([j.rms_torque for j in validation.joints]),
         {"model": np.array([j.rms_error for j in validation.joints])},
         f"{model.arm}: all {validation.poses} poses of {Path(recording.source).name}",
@@ -173,6 +178,15 @@ def plot_positions(
     save_figure(figure, path)
 
 
+def plot_simulation(path: Path, simulation: Simulation, scenario: Scenario) -> None:
+    """Writes a PNG of the simulated positions, beside the desired ones if there are any."""
+    curves = {"simulated": simulation.recording.q}
+    if simulation.desired is not None:
+        curves["desired"] = simulation.desired
+    arm = scenario.mounted_arm
+    plot_positions(path, arm, simulation.time, curves, f"{arm.name}, simulated, mode {scenario.controller.mode}")
+
+
 def save_figure(figure: plt.Figure, path: Path) -> None:
     """Writes a PNG at once or not at all, and closes the figure."""
     with atomic_write(path, "wb") as stream:
@@ -183,7 +197,7 @@ def save_figure(figure: plt.Figure, path: Path) -> None:
 def plot_demo(output: Path, result: DemoResult) -> None:
     """Writes torque_error.png, predicted.png, fresh_torque_error.png, release.png and step.png into `output`."""
     arm = result.arm
-    plot_identification(output, result.identification)
+    plot_static_identification(output, result.identification)
     plot_torque_error(
         output / "fresh_torque_error.png",
         arm,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.markup import escape
 
-from dvrk_drake.analysis.payload.payload import CONFIDENCE, Payload, as_good, better_links, shown_elsewhere
+from dvrk_drake.analysis.payload.payload import CONFIDENCE, Payload, as_good, shown_elsewhere
 from dvrk_drake.analysis.payload.point_mass import LARGEST_MASS
 from dvrk_drake.reports.terminal_tables import make_table
 
@@ -34,21 +34,6 @@ def print_links(console: Console, estimates: Sequence[Payload]) -> None:
             style="yellow",
             soft_wrap=True,
         )
-
-
-def describe_better_links(payload: Payload, estimates: Sequence[Payload]) -> str | None:
-    """Returns one line that names the links that explain the change better than that of `payload`; None if none do."""
-    better = better_links(payload, estimates)
-    if not better:
-        return None
-    first = better[0]
-    same = [other.link for other in as_good(estimates)]
-    mass = f", {first.body.mass:.3g} +- {first.mass_error:.2g} kg" if first.found else ""
-    return (
-        f"{payload.link} does not explain the change best: left-out error {payload.left_out:.1%}, but "
-        f"{first.left_out:.1%} with a payload on {' or '.join(same)}{mass}. Use this result only if the payload is "
-        f"certainly on {payload.link}; else repeat with --link {first.link}"
-    )
 
 
 def print_payload(console: Console, payload: Payload, estimates: Sequence[Payload] = ()) -> None:

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dvrk_drake.analysis.static.doubts import Doubt
-from dvrk_drake.analysis.static.validation import Validation
+from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.analysis.verdict import rule_text, worst
 from dvrk_drake.dynamics.gravity_regressor import SymbolicGravity, derive_gravity
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
@@ -244,7 +244,7 @@ def print_rule(console: Console, in_motion: bool) -> None:
     console.print(rule_text(in_motion) + "\n", style="dim", width=min(console.width, RULE_WIDTH))
 
 
-def print_validation(console: Console, validation: Validation) -> None:
+def print_static_validation(console: Console, validation: StaticValidation) -> None:
     """Verdict and error beside zero torque, joint by joint."""
     print_verdict(console, validation.verdicts)
     title = f"RMS torque error, {validation.poses} poses [N m; N if prismatic]"

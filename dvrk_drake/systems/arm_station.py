@@ -1,4 +1,4 @@
-"""One arm behind the ports that its driver has: the same names in simulation and on hardware."""
+"""One simulated arm behind the ports that its driver has: the same names as those of the hardware."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role
-from pydrake.lcm import DrakeLcmInterface
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
@@ -23,8 +22,6 @@ from dvrk_drake.systems.arm_effects.drive_step import DriveStep
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 from dvrk_drake.systems.arm_effects.real_drive import RealDrive, add_real_drive
 from dvrk_drake.systems.ideal_drive import DrivePorts, PlantJoints, add_ideal_drive
-from dvrk_drake.systems.lcm.arm_connection import connect_arm
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 
 @dataclass(frozen=True)
@@ -53,8 +50,15 @@ def station_ports(arm: Arm) -> StationPorts:
     )
 
 
+def arm_plant_config(time_step: float = 1e-3) -> MultibodyPlantConfig:
+    """Returns the configuration of a station's plant: the SAP solver, and a state that is read before the step [s]."""
+    return MultibodyPlantConfig(
+        time_step=time_step, discrete_contact_approximation="sap", use_sampled_output_ports=False
+    )
+
+
 class ArmStation(Diagram):
-    """An arm with the ports of its driver: simulated, or the arm itself over LCM.
+    """A simulated arm with the ports of its driver. `HardwareArmStation` is the arm itself, over LCM.
 
     .. pydrake_system::
 
@@ -81,8 +85,8 @@ class ArmStation(Diagram):
       zero.
     - `effort_measured`: what the motors apply, the command after the clamp.
     - `state_true` (2n): q, then v as they are, whatever `effects` make of what is measured.
-    - `plant_state`, `body_poses`, `query_object`: the plant's own, of the whole tree. Simulation only, as are
-      `state_true` and `effort_disturbance`; all others are those of `station_ports`.
+    - `plant_state`, `body_poses`, `query_object`: the plant's own, of the whole tree. The hardware does not have them,
+      nor `state_true` and `effort_disturbance`; all others are those of `station_ports`.
 
     Without `effects` all of it is C++ and has no state but the plant's, and measured values are exact and undelayed.
     `effects` are those of a real arm, see `ArmEffects`: friction, cables, stops, encoders, motors and delays as
@@ -93,34 +97,33 @@ class ArmStation(Diagram):
     limits; the coupled limits of the linkage are there with the effect `stops`. An arm's shapes never touch each other:
     they are collision shapes only where `modify_plant` adds one that they can touch.
 
-    **On hardware** the ports of `station_ports` are all there are. Measured values are those of the last DVRK_STATUS
-    message, NaN before the first. Efforts go out in DVRK_COMMAND messages every `driver.status_period` and on forced
-    publishing, and the arm's command guard decides what becomes of them; unconnected, the arm is told to hold. After
-    the guard's watchdog took over, e.g. because this process was stopped for 50 ms, efforts act again only when an
-    operator resumes: end this process, look at the arm, run `dvrk-drake run --reset`, end that, start this one again.
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> arm = dvrk.load_arm("psm")
+        >>> station = dvrk.ArmStation(arm, effects=arm.effects.only(["friction"]))
+        >>> context = station.CreateDefaultContext()
+        >>> station.SetPositions(context, [0.1, 0.2, 0.1, 0, 0, 0, 0.5])
+        >>> station.GetOutputPort("psm.position_measured").Eval(context).round(3).tolist()
+        [0.1, 0.2, 0.1, 0.0, 0.0, 0.0, 0.5]
     """
 
     def __init__(
         self,
         arm: Arm,
         *,
-        hardware: bool = False,
-        time_step: float = 1e-3,
+        plant_config: MultibodyPlantConfig | None = None,
         meshcat: Meshcat | None = None,
         closure: Closure = "mimic",
         plant_arm: Arm | None = None,
         modify_plant: Callable[[MultibodyPlant], None] | None = None,
         effects: ArmEffects | None = None,
         seed: int = 0,
-        driver: DvrkDriver | None = None,
-        lcm: DrakeLcmInterface | None = None,
     ) -> None:
         """Builds the station; the arm starts at zero, or at the nearest pose inside its limits.
 
         Args:
             arm: names the ports, and is the arm that controllers of this station know.
-            hardware: the arm itself instead of its simulation: of the other arguments only `driver` and `lcm` count.
-            time_step: of the plant [s].
+            plant_config: time step, contact model and so on of the plant; `arm_plant_config()` by default.
             meshcat: draws the arm there, below the path of its lower-case name: `SetTransform("mtml", X_WB)` places
             it.
             closure: how the linkage's loops are held, see `add_arm`.
@@ -129,92 +132,53 @@ class ArmStation(Diagram):
             modify_plant: called with the plant before it is finalized, e.g. to add a payload, damping or
             other effort limits.
                 Drake can change the inertia of links that are already there only in a Context:
-                `set_link_inertias`.
+                `SetLinkInertias`.
             effects: of the real arm that the simulation shall have, e.g. `arm.effects` or
             `arm.effects.only(["friction"])`; none by default.
             seed: of the effects' noise.
-            driver: how the hardware is driven; `DvrkDriver()` by default.
-            lcm: whose `HandleSubscriptions` somebody else calls, for loops that are driven by messages; by default one
-                at `driver.lcm_url` that a Simulator of this station handles.
 
         Raises:
-            StationError: something that only a simulation has is asked of the hardware or the other way round, the time
-            step is not positive, or `plant_arm` has other joints.
+            StationError: the plant's configuration is not one of an arm, or `plant_arm` has other joints.
         """
         super().__init__()
         self._arm = arm
         self._true_arm = plant_arm or arm
-        self._plant: MultibodyPlant | None = None
         self._parts: PlantEffects | None = None
         self._drive_step: DriveStep | None = None
-        builder = DiagramBuilder()
-        if hardware:
-            of_a_simulation = (time_step, meshcat, closure, plant_arm, modify_plant, effects)
-            if of_a_simulation != (1e-3, None, "mimic", None, None, None):
-                raise StationError(
-                    "time_step, meshcat, closure, plant_arm, modify_plant and effects are of a simulation: "
-                    "use hardware=False"
-                )
-            self._connect_hardware(builder, driver or DvrkDriver(), lcm)
-        else:
-            if driver is not None or lcm is not None:
-                raise StationError("driver and lcm are of hardware; apply_driver_config puts a simulation behind LCM")
-            self._simulate(builder, time_step, meshcat, closure, modify_plant, effects, seed)
-        builder.BuildInto(self)
-        self.set_name(f"{arm.name.lower()}_station")
-
-    def _connect_hardware(self, builder: DiagramBuilder, driver: DvrkDriver, lcm: DrakeLcmInterface | None) -> None:
-        receiver, sender = connect_arm(builder, self._arm, driver, lcm)
-        name, ports = self._arm.name.lower(), station_ports(self._arm)
-        builder.ExportInput(sender.GetInputPort("effort"), f"{name}.effort_commanded")
-        for port in ports.outputs:
-            builder.ExportOutput(receiver.GetOutputPort(port.removeprefix(f"{name}.")), port)
-
-    def _simulate(
-        self,
-        builder: DiagramBuilder,
-        time_step: float,
-        meshcat: Meshcat | None,
-        closure: Closure,
-        modify_plant: Callable[[MultibodyPlant], None] | None,
-        effects: ArmEffects | None,
-        seed: int,
-    ) -> None:
-        arm, true_arm = self._arm, self._true_arm
-        if not 0 < time_step <= 0.01:
-            raise StationError(
-                f"time_step must be above 0 and at most 0.01 s: the wrist is lost above; got {time_step}"
-            )
-        if true_arm.joint_names != arm.joint_names:
+        plant_config = plant_config or arm_plant_config()
+        if fault := plant_config_fault(plant_config):
+            raise StationError(fault)
+        if self._true_arm.joint_names != arm.joint_names:
             raise StationError(
                 f"plant_arm must have the joints of {arm.name}: {', '.join(arm.joint_names)}; "
-                f"{true_arm.name} has {', '.join(true_arm.joint_names)}"
+                f"{self._true_arm.name} has {', '.join(self._true_arm.joint_names)}"
             )
-        self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=time_step)
+        builder = DiagramBuilder()
+        self._plant, self._scene_graph = AddMultibodyPlant(plant_config, builder)
         # Nothing else is in the plant, so nothing touches the arm unless somebody adds it.
-        self._instance = add_arm(self.plant, true_arm, closure, collision_shapes=modify_plant is not None)
+        self._instance = add_arm(self._plant, self._true_arm, closure, collision_shapes=modify_plant is not None)
         if modify_plant is not None:
-            modify_plant(self.plant)
-        # Otherwise Drake steps the plant before all discrete updates, and what they measure is from after the step.
-        self.plant.SetUseSampledOutputPorts(False)
+            modify_plant(self._plant)
         if effects is not None:
-            self._parts = PlantEffects(self.plant, true_arm, self._instance, effects)
-        self.plant.Finalize()
+            self._parts = PlantEffects(self._plant, self._true_arm, self._instance, effects)
+        self._plant.Finalize()
         self._drop_idle_shapes()
-        self._joints = PlantJoints(self.plant, true_arm, self._instance)
+        self._joints = PlantJoints(self._plant, self._true_arm, self._instance)
         self._set_default_pose()
         if meshcat is not None:
             # The visualizer deletes its prefix when it starts: one level down, so that a SetTransform stays.
             parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
             MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
         if effects is None or self._parts is None:
-            ports = add_ideal_drive(builder, self.plant, self._joints, self._instance)
+            ports = add_ideal_drive(builder, self._plant, self._joints, self._instance)
         else:
             drive = RealDrive(
-                true_arm, self.plant, self._instance, self._joints, self._parts, effects, seed, self._home()
+                self._true_arm, self._plant, self._instance, self._joints, self._parts, effects, seed, self._home()
             )
             ports, self._drive_step = add_real_drive(builder, drive)
         self._export(builder, ports)
+        builder.BuildInto(self)
+        self.set_name(f"{arm.name.lower()}_station")
 
     @property
     def arm(self) -> Arm:
@@ -223,16 +187,10 @@ class ArmStation(Diagram):
 
     @property
     def plant(self) -> MultibodyPlant:
-        """The simulated plant.
-
-        Raises:
-            StationError: this station is the hardware, which has none.
-        """
-        if self._plant is None:
-            raise StationError("this station is the hardware: it has no plant, and its state cannot be set")
+        """The simulated plant."""
         return self._plant
 
-    def set_positions(self, context: Context, q: ArrayLike) -> None:
+    def SetPositions(self, context: Context, q: ArrayLike) -> None:
         """Puts the arm at the pose q (n,) of its independent joints, linkage included, at rest.
 
         Args:
@@ -240,7 +198,7 @@ class ArmStation(Diagram):
             q: pose; it need not be inside the limits.
 
         Raises:
-            StationError: q is not n finite numbers, or this station is the hardware.
+            StationError: q is not n finite numbers.
         """
         q = np.asarray(q, float)
         if q.shape != (self._arm.num_joints,) or not np.all(np.isfinite(q)):
@@ -252,16 +210,16 @@ class ArmStation(Diagram):
             self._parts.drive.set_positions(q_plant, q)
         self.plant.SetPositions(plant_context, q_plant)
         if self._drive_step is not None:
-            self._drive_step.set_at_rest(self.GetMutableSubsystemContext(self._drive_step, context), q)
+            self._drive_step.SetAtRest(self.GetMutableSubsystemContext(self._drive_step, context), q)
         self.plant.SetVelocities(plant_context, np.zeros(self.plant.num_velocities()))
 
-    def get_positions(self, context: Context) -> NDArray[np.float64]:
+    def GetPositions(self, context: Context) -> NDArray[np.float64]:
         """Pose (n,) of the independent joints in this station's context."""
         plant_context = self.GetSubsystemContext(self.plant, context)
         q: NDArray[np.float64] = self.plant.GetPositions(plant_context)[self._joints.index]
         return q
 
-    def set_link_inertias(self, context: Context, inertias: Mapping[str, SpatialInertia]) -> None:
+    def SetLinkInertias(self, context: Context, inertias: Mapping[str, SpatialInertia]) -> None:
         """Gives links another inertia in this station's context: an arm that differs from its model.
 
         Args:
@@ -270,7 +228,7 @@ class ArmStation(Diagram):
             m^2].
 
         Raises:
-            StationError: a link that the arm does not have, or this station is the hardware.
+            StationError: a link that the arm does not have.
         """
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
         bodies = {self.plant.get_body(i).name(): i for i in self.plant.GetBodyIndices(self._instance)}
@@ -315,3 +273,15 @@ class ArmStation(Diagram):
         builder.ExportOutput(self.plant.get_state_output_port(), "plant_state")
         builder.ExportOutput(self.plant.get_body_poses_output_port(), "body_poses")
         builder.ExportOutput(self._scene_graph.get_query_output_port(), "query_object")
+
+
+def plant_config_fault(config: MultibodyPlantConfig) -> str:
+    """Why a station's plant cannot have this configuration, or ""."""
+    if not 0 < config.time_step <= 0.01:
+        return f"time_step must be above 0 and at most 0.01 s: the wrist is lost above; got {config.time_step}"
+    if config.discrete_contact_approximation == "tamsi":
+        return 'discrete_contact_approximation is "tamsi"; a linkage needs sap, similar or lagged'
+    if config.use_sampled_output_ports:
+        # Drake then steps the plant before all discrete updates, and what they measure is from after the step.
+        return "use_sampled_output_ports must be false, so that a command acts after its measurement"
+    return ""

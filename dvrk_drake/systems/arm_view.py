@@ -71,21 +71,35 @@ def geometry_corners(arm: Arm) -> NDArray[np.float64]:
 
 
 def start_meshcat(
+    arm: Arm | None = None,
+    *,
     camera: ArrayLike = (2.0, 2.0, 1.0),
     target: ArrayLike = (0.0, 0.0, 0.0),
     zoom: float = ZOOM,
     port: int | None = None,
 ) -> Meshcat:
-    """A Meshcat on localhost with a light ground; a free port unless one is given.
+    """Starts Meshcat, Drake's 3D view in a browser, on localhost with a light background.
 
     Args:
-        camera, target: where the camera stands and what it looks at (3,) [m]; `*framing(arm)` gives both for an arm.
-        zoom: magnification of Meshcat's 75 degree view.
-        port: 1024..65535.
+        arm: which the view shall frame; the caller draws it, e.g. with `ArmStation(arm, meshcat=meshcat)`.
+        camera, target: without an arm: where the camera stands and what it looks at (3,) [m].
+        zoom: magnification of Meshcat's 75 degree view [1].
+        port: 1024..65535; by default a free one.
 
     Raises:
         DvrkDrakeError: the port cannot be opened.
+        ArmError: the arm has no visual geometry.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> arm = dvrk.load_arm("psm")
+        >>> meshcat = dvrk.start_meshcat(arm)
+        >>> station = dvrk.ArmStation(arm, meshcat=meshcat)  # drawn when it is simulated
+        >>> meshcat.web_url().startswith("http://localhost:")
+        True
     """
+    if arm is not None:
+        camera, target = framing(arm)
     if port is not None and not 1024 <= port <= 65535:
         raise DvrkDrakeError(f"port {port} cannot be opened; allowed: 1024..65535")
     try:

@@ -6,24 +6,39 @@ from pydrake.systems.framework import DiagramBuilder, System
 
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
-from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 
 
 def add_closed_loop(
     builder: DiagramBuilder,
-    station: ArmStation,
-    controller: GravityPidController,
+    station: ArmStation | HardwareArmStation,
+    controller: System,
     desired: System | None = None,
     friction: FrictionCompensator | None = None,
 ) -> None:
-    """Adds all that is given to `builder` and connects it.
+    """Adds a station and its controller to a Diagram and connects them.
 
     Args:
         builder: of the diagram that they become part of.
         station: the arm.
-        controller: of an arm with the same joints.
+        controller: of an arm with the same joints: a `GravityPidController`, or a System with an input port
+            `state_estimated` (2n) and an output port `effort` (n).
         desired: a source with one output port: q_d, then v_d (2n,). Without it the controller holds where it starts.
         friction: takes a share of the arm's friction off a hand.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> from pydrake.systems.analysis import Simulator
+        >>> from pydrake.systems.framework import DiagramBuilder
+        >>> arm, builder = dvrk.load_arm("mtml"), DiagramBuilder()
+        >>> station = dvrk.ArmStation(arm)
+        >>> controller = dvrk.GravityPidController(dvrk.IdentifiedModel.from_arm(arm))
+        >>> dvrk.add_closed_loop(builder, station, controller)
+        >>> simulator = Simulator(builder.Build())
+        >>> status = simulator.AdvanceTo(0.1)
+        >>> q = station.GetPositions(station.GetMyContextFromRoot(simulator.get_context()))
+        >>> bool(abs(q).max() < 1e-3)  # holds its home pose
+        True
     """
     builder.AddSystem(station)
     connect_controller(builder, station, controller, desired, friction)
@@ -31,8 +46,8 @@ def add_closed_loop(
 
 def connect_controller(
     builder: DiagramBuilder,
-    station: ArmStation,
-    controller: GravityPidController,
+    station: ArmStation | HardwareArmStation,
+    controller: System,
     desired: System | None = None,
     friction: FrictionCompensator | None = None,
 ) -> None:

@@ -48,17 +48,17 @@ class EffortRamp(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         self.DeclareForcedDiscreteUpdateEvent(self._update)
 
-    def share(self, context: Context) -> float:
+    def GetShare(self, context: Context) -> float:
         """How much of the way is done, 0..1."""
         return float(context.get_discrete_state(int(self._share)).get_value()[0])
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         if self._enabled.Eval(context)[0]:
-            state.set_value(int(self._share), [min(1.0, self.share(context) + self._increment)])
+            state.set_value(int(self._share), [min(1.0, self.GetShare(context) + self._increment)])
         else:
             state.set_value(int(self._share), [0.0])
             state.set_value(int(self._start), self._measured.Eval(context))
 
     def _calc_effort(self, context: Context, output: BasicVector) -> None:
         start = context.get_discrete_state(int(self._start)).get_value()
-        output.SetFromVector(start + self.share(context) * (self._wanted.Eval(context) - start))
+        output.SetFromVector(start + self.GetShare(context) * (self._wanted.Eval(context) - start))

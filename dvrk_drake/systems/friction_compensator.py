@@ -10,7 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, effect_step
 from dvrk_drake.dynamics.friction_compensation import Friction, check_ratios, safe_ratios
 from dvrk_drake.errors import ControllerError
-from dvrk_drake.systems.gravity_pid_step import ABSURD
+from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 
 
 class FrictionCompensator(LeafSystem):
@@ -137,7 +137,7 @@ def _advance(
     known = memory[-1] == 1.0
     memory[-1] = 0.0
     for i in range(2 * n):
-        if not abs(state[i]) < ABSURD:  # also true of NaN
+        if not abs(state[i]) < IMPLAUSIBLE:  # also true of NaN
             return
     memory[-1] = 1.0
     for j in range(k):

@@ -7,12 +7,14 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, ValueProducer
 
+from dvrk_drake.dynamics.codegen import entry_point
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import Gains
-from dvrk_drake.systems.gravity_pid_step import compile_step, entry_point
+from dvrk_drake.systems.gravity_pid_step import compile_step
 
 #: "hold" regulates a pose, "gravity" only carries the arm's weight and leaves it free to move, "damped" also brakes it.
 Mode = Literal["hold", "gravity", "damped"]
@@ -52,7 +54,7 @@ class GravityPidController(LeafSystem):
     also empties the integrator and latches the pose. Beside a discrete plant of the same period without sampled
     output ports, as that of ArmStation, the command is therefore one period late, as it is on hardware; beside one that
     has them, Drake's default, it is not: such a plant steps first. A forced discrete update is the same step, for loops
-    that are driven by messages. Gains and mode are part of the Context and can be changed while running.
+    that are driven by messages. Gains and mode are numeric parameters of the Context and can be changed while running.
 
     **Saturation.** `effort` is clamped to the effort limits. Anti-windup is by conditional integration
     (Astrom and Hagglund, Advanced PID Control, 2006, chapter 3): a joint's integrator stands still while its
@@ -65,9 +67,16 @@ class GravityPidController(LeafSystem):
     Before any finite pose was seen it is zero. Regulation resumes by itself, with an empty integrator, when
     the inputs are finite again.
 
-    To compensate with a plant's own gravity, nothing identified, use the model that the arm's SDF states::
+    To compensate with a plant's own gravity, nothing identified, use the model that the arm's SDF states, as here.
 
-        GravityPidController(IdentifiedModel.from_arm(load_arm("mtml")))
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtml"))
+        >>> controller = dvrk.GravityPidController(model, mode="gravity")
+        >>> context = controller.CreateDefaultContext()
+        >>> controller.SetMode(context, "damped")
+        >>> controller.GetMode(context)
+        'damped'
     """
 
     def __init__(
@@ -106,22 +115,29 @@ class GravityPidController(LeafSystem):
 
         self.DeclareVectorInputPort(name="state_estimated", size=2 * n)
         self.DeclareVectorInputPort(name="desired_state", size=2 * n)
-        effort = self.DeclareDiscreteState(num_state_variables=n)
-        # Gains and mode are kept with the memory, not as numeric parameters: reading those from Python would
-        # cost 4-8 us an update.
-        initial = np.concatenate([self._checked(gains or arm.gains), [self._mode_number(mode)], np.zeros(4 * n + 3)])
-        memory = self.DeclareDiscreteState(model_vector=BasicVector(initial))
-        self.DeclareStateOutputPort(name="effort", state_index=effort)
-        ticket = self.discrete_state_ticket(memory)
-        self.DeclareVectorOutputPort(
-            name="gravity_effort", size=n, calc=self._calc_gravity_effort, prerequisites_of_calc={ticket}
+        gains = gains or arm.gains
+        self._check_gains(gains)
+        self._gains = [self.DeclareNumericParameter(BasicVector(k)) for k in (gains.kp, gains.kd, gains.ki)]
+        self._mode = self.DeclareNumericParameter(BasicVector([self._mode_number(mode)]))
+        # In the order of the compiled step's arguments. NaN: no pose yet.
+        effort, gravity_effort, fault, *_ = (
+            self.DeclareDiscreteState(BasicVector(np.full(size, value)))
+            for size, value in [(n, 0.0), (n, 0.0), (1, 0.0), (n, 0.0), (n, np.nan), (n, np.nan)]
         )
-        self.DeclareVectorOutputPort(name="fault", size=1, calc=self._calc_fault, prerequisites_of_calc={ticket})
-        constants = np.concatenate([[self._period], model.trust, limits, model.theta])
+        self.DeclareStateOutputPort(name="effort", state_index=effort)
+        self.DeclareStateOutputPort(name="gravity_effort", state_index=gravity_effort)
+        self.DeclareStateOutputPort(name="fault", state_index=fault)
+        self._trust_and_limits = np.array([model.trust, limits])
+        # Reading each parameter at each update costs 5 us; a cache entry that holds them as one array costs 1 us.
+        self._settings = self.DeclareCacheEntry(
+            "settings",
+            ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((5, n)), 0)), calc=self._calc_settings),
+            {self.all_parameters_ticket()},
+        )
         self._dispatcher = compile_step(model.static_model.torque_into)  # owns the compiled code
         step = entry_point(self._dispatcher)
-        update = self._make_update(step, constants, restart=False)
-        restart = self._make_update(step, constants, restart=True)
+        update = self._make_update(step, model.theta.copy(), restart=False)
+        restart = self._make_update(step, model.theta.copy(), restart=True)
         self.DeclareInitializationDiscreteUpdateEvent(update=restart)
         self.DeclarePeriodicDiscreteUpdateEvent(period_sec=self._period, offset_sec=0.0, update=update)
         self.DeclareForcedDiscreteUpdateEvent(update=update)
@@ -137,14 +153,13 @@ class GravityPidController(LeafSystem):
         Raises:
             ControllerError: a gain that is not for this arm, see `Arm.gains_fault`.
         """
-        values = self._checked(gains)
-        context.get_mutable_discrete_state(_MEMORY).get_mutable_value()[: values.size] = values
+        self._check_gains(gains)
+        for index, values in zip(self._gains, (gains.kp, gains.kd, gains.ki), strict=True):
+            context.get_mutable_numeric_parameter(index).SetFromVector(values)
 
     def GetGains(self, context: Context) -> Gains:
         """The gains in use."""
-        n = len(self._joint_names)
-        kp, kd, ki = context.get_discrete_state(_MEMORY).get_value()[: 3 * n].reshape(3, n).tolist()
-        return Gains(kp=kp, kd=kd, ki=ki)
+        return Gains(*(context.get_numeric_parameter(index).get_value().tolist() for index in self._gains))
 
     def SetMode(self, context: Context, mode: Mode) -> None:
         """Changes the mode from the next update on.
@@ -152,18 +167,15 @@ class GravityPidController(LeafSystem):
         Raises:
             ControllerError: none of `Mode`.
         """
-        mode_index = 3 * len(self._joint_names)
-        context.get_mutable_discrete_state(_MEMORY).get_mutable_value()[mode_index] = self._mode_number(mode)
+        context.get_mutable_numeric_parameter(self._mode).SetAtIndex(0, self._mode_number(mode))
 
     def GetMode(self, context: Context) -> Mode:
         """The mode in use."""
-        mode_index = 3 * len(self._joint_names)
-        return _MODES[int(context.get_discrete_state(_MEMORY).get_value()[mode_index])]
+        return _MODES[int(context.get_numeric_parameter(self._mode).GetAtIndex(0))]
 
-    def _checked(self, gains: Gains) -> NDArray[np.float64]:
+    def _check_gains(self, gains: Gains) -> None:
         if fault := self._arm.gains_fault(gains):
             raise ControllerError(fault)
-        return np.concatenate([gains.kp, gains.kd, gains.ki])
 
     @staticmethod
     def _mode_number(mode: Mode) -> float:
@@ -171,18 +183,20 @@ class GravityPidController(LeafSystem):
             raise ControllerError(f'unknown mode "{mode}"; known modes: {", ".join(_MODES)}')
         return float(_MODES.index(mode))
 
+    def _calc_settings(self, context: Context, settings: AbstractValue) -> None:
+        gains = [context.get_numeric_parameter(index).get_value() for index in self._gains]
+        mode = int(context.get_numeric_parameter(self._mode).GetAtIndex(0))
+        settings.set_value((np.vstack([gains, self._trust_and_limits]), mode))
+
     def _make_update(
-        self,
-        step: Callable[..., None],
-        constants: NDArray[np.float64],
-        restart: bool,
+        self, step: Callable[..., None], theta: NDArray[np.float64], restart: bool
     ) -> Callable[[Context, DiscreteValues], None]:
         """The handler of an update event.
 
         It runs between two steps of the plant, which leave nothing of Python in the processor's caches: what
         costs is each different thing that it touches. So its names are local and it touches few things.
         """
-        eval_vector_input = self.EvalVectorInput
+        eval_vector_input, settings, period = self.EvalVectorInput, self._settings, self._period
 
         def update(context: Context, discrete_state: DiscreteValues) -> None:
             measured = eval_vector_input(context, 0)
@@ -190,24 +204,23 @@ class GravityPidController(LeafSystem):
                 raise ControllerError("input port state_estimated is not connected")
             state = measured.get_value()
             desired = eval_vector_input(context, 1)
+            per_joint, mode = settings.Eval(context)
+            group = discrete_state.get_mutable_value
             step(
                 state,
                 state if desired is None else desired.get_value(),
                 desired is not None,
                 restart,
-                constants,
-                discrete_state.get_mutable_value(0),
-                discrete_state.get_mutable_value(1),
+                period,
+                mode,
+                per_joint,
+                theta,
+                group(0),
+                group(1),
+                group(2),
+                group(3),
+                group(4),
+                group(5),
             )
 
         return update
-
-    def _calc_gravity_effort(self, context: Context, output: BasicVector) -> None:
-        n = output.size()
-        output.SetFromVector(context.get_discrete_state(_MEMORY).get_value()[6 * n + 1 : 7 * n + 1])
-
-    def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, context.get_discrete_state(_MEMORY).get_value()[-1])
-
-
-_MEMORY = 1  # index of the discrete state group

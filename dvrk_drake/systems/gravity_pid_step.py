@@ -6,72 +6,77 @@ from collections.abc import Callable
 from functools import cache
 
 import numba
+import numpy as np
 
-#: No joint is there or that fast [rad, m, rad/s, m/s]; and products of such numbers with gains stay finite.
-ABSURD = 1e6
+from dvrk_drake.models.arm_schema import IMPLAUSIBLE
+
+#: Values of `mode`: indices into `gravity_pid_controller.Mode`.
+HOLD, GRAVITY, DAMPED = 0, 1, 2
 
 
 @cache
 def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
     """One update of the controller as one compiled function without allocation.
 
-    Arrays: state, desired (2n); constants: period, trust, effort limits
-    (n each), theta, in one array as each argument costs; in place: effort (n), memory: kp,
-    kd, ki (n each), mode, then integral, latched pose, last finite pose, gravity effort (n each), then three
-    flags: a pose is latched, a finite pose was seen, fault.
+    Arguments, vectors of n joints unless another size is stated:
+
+    - `state`, `desired` (2n) and `has_desired`: the inputs;
+    - `restart`: whether this is the update at initialization;
+    - `period` [s]; `mode`: index into `Mode`; `per_joint` (5, n): kp, kd, ki, trust, effort limits; `theta`;
+    - changed in place: `effort`, `gravity`, `fault` (1), `integral`, `latched_q` and `last_q`, the pose that is
+      regulated without `desired` and the last finite one. NaN: no such pose yet.
     """
 
-    def step(state, desired, has_desired, restart, constants, effort, memory):
+    def step(
+        state,
+        desired,
+        has_desired,
+        restart,
+        period,
+        mode,
+        per_joint,
+        theta,
+        effort,
+        gravity,
+        fault,
+        integral,
+        latched_q,
+        last_q,
+    ):
         n = effort.size
-        period, trust, limit, theta = (
-            constants[0],
-            constants[1 : n + 1],
-            constants[n + 1 : 2 * n + 1],
-            constants[2 * n + 1 :],
-        )
-        kp, kd, ki = memory[:n], memory[n : 2 * n], memory[2 * n : 3 * n]
-        hold, damped = memory[3 * n] == 0.0, memory[3 * n] == 2.0
-        rest = memory[3 * n + 1 :]
-        integral, latched_q, last_q, gravity = (
-            rest[:n],
-            rest[n : 2 * n],
-            rest[2 * n : 3 * n],
-            rest[3 * n : 4 * n],
-        )
-        LATCHED, SEEN, FAULT = 7 * n + 1, 7 * n + 2, 7 * n + 3
+        kp, kd, ki, trust, limit = per_joint[0], per_joint[1], per_joint[2], per_joint[3], per_joint[4]
+        hold, damped = mode == HOLD, mode == DAMPED
 
         if restart:
-            memory[LATCHED] = 0.0
-            memory[SEEN] = 0.0
+            latched_q[:] = np.nan
+            last_q[:] = np.nan
             integral[:] = 0.0
-        fault = False
+        faulty = False
         for i in range(2 * n):
-            fault |= not abs(state[i]) < ABSURD  # also true of NaN
-        if not fault:
+            faulty |= not abs(state[i]) < IMPLAUSIBLE  # also true of NaN
+        if not faulty:
             last_q[:] = state[:n]
-            memory[SEEN] = 1.0
         if hold and has_desired:
             for i in range(2 * n):
-                fault |= not abs(desired[i]) < ABSURD
-        memory[FAULT] = 1.0 if fault else 0.0
+                faulty |= not abs(desired[i]) < IMPLAUSIBLE
+        fault[0] = 1.0 if faulty else 0.0
 
-        if memory[SEEN] == 0.0:
+        if np.isnan(last_q[0]):
             gravity[:] = 0.0
         else:
             torque_into(last_q, theta, gravity)
             for i in range(n):
                 gravity[i] *= trust[i]
-        if fault or not hold:
-            memory[LATCHED] = 0.0
+        if faulty or not hold:
+            latched_q[:] = np.nan
             for i in range(n):
                 integral[i] = 0.0
-                braking = kd[i] * state[n + i] if damped and not fault else 0.0
+                braking = kd[i] * state[n + i] if damped and not faulty else 0.0
                 effort[i] = min(max(gravity[i] - braking, -limit[i]), limit[i])
             return
 
-        if memory[LATCHED] == 0.0:
+        if np.isnan(latched_q[0]):
             latched_q[:] = last_q
-            memory[LATCHED] = 1.0
         for i in range(n):
             e = (desired[i] if has_desired else latched_q[i]) - state[i]
             de = (desired[n + i] if has_desired else 0.0) - state[n + i]
@@ -87,16 +92,9 @@ def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
             effort[i] = min(max(without_integral + integral[i], -limit[i]), limit[i])
 
     array = numba.float64[::1]
+    matrix = numba.float64[:, ::1]
     view = numba.types.Array(numba.float64, 1, "C", readonly=True)  # what Drake gives of inputs
     flag = numba.boolean
-    signature = numba.void(view, view, flag, flag, array, array, array)
+    memory = (array,) * 6
+    signature = numba.void(view, view, flag, flag, numba.float64, numba.int64, matrix, array, *memory)
     return numba.njit(signature)(step)
-
-
-def entry_point(dispatcher: Callable[..., None]) -> Callable[..., None]:
-    """The only signature of a compiled function, without the choice between signatures (4 us a call here).
-
-    Its types are not checked any more: the arrays must be what the signature says. Drake's always are.
-    """
-    (overload,) = dispatcher.overloads.values()  # type: ignore[attr-defined]
-    return overload.entry_point

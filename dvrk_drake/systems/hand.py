@@ -14,8 +14,8 @@ from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.schema_fault import number_fault, within
-from dvrk_drake.systems.gravity_pid_step import ABSURD
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Hand(LeafSystem):
             return nothing
         q, v = np.split(self.get_input_port(0).Eval(context), 2)
         X_BG_desired = self.get_input_port(1).Eval(context)
-        if not all(np.all(np.abs(x) < ABSURD) for x in (q, v, X_BG_desired.GetAsMatrix34())):
+        if not all(np.all(np.abs(x) < IMPLAUSIBLE) for x in (q, v, X_BG_desired.GetAsMatrix34())):
             return nothing
         X_BG, J = self._frame.pose(q), self._frame.jacobian(q)
         turn = (X_BG_desired.rotation() @ X_BG.rotation().inverse()).ToAngleAxis()

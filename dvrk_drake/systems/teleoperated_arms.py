@@ -44,6 +44,12 @@ class TeleoperatedArms(Diagram):
       nobody touches the master.
     - `engaged`, `jaw_angle`, `desired_state`, `following`, `fault`: those of `Teleoperation`.
     - `state_estimated`: those of the two stations.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> arms = dvrk.TeleoperatedArms(dvrk.load_arm("mtml"), dvrk.load_arm("psm"), scale=1 / 3)
+        >>> arms.CalcX_MG(arms.CreateDefaultContext()).translation().shape  # [m] handle in the master's base
+        (3,)
     """
 
     def __init__(
@@ -106,20 +112,20 @@ class TeleoperatedArms(Diagram):
             builder.ExportOutput(self.teleoperation.GetOutputPort(name), name)
         builder.BuildInto(self)
 
-    def set_positions(self, context: Context, q_master: ArrayLike, q_follower: ArrayLike) -> None:
+    def SetPositions(self, context: Context, q_master: ArrayLike, q_follower: ArrayLike) -> None:
         """Puts both arms at poses, at rest. `context` is this system's own.
 
         Raises:
             StationError: poses that are none.
         """
         for station, q in ((self.master, q_master), (self.follower, q_follower)):
-            station.set_positions(self.GetMutableSubsystemContext(station, context), q)
+            station.SetPositions(self.GetMutableSubsystemContext(station, context), q)
 
-    def X_MG(self, context: Context) -> RigidTransform:
+    def CalcX_MG(self, context: Context) -> RigidTransform:
         """Pose of the master's handle in its base."""
         return self._pose(self.master, MASTER_FRAME, context)
 
-    def X_FT(self, context: Context) -> RigidTransform:
+    def CalcX_FT(self, context: Context) -> RigidTransform:
         """Pose of the follower's tip in its base."""
         return self._pose(self.follower, FOLLOWER_FRAME, context)
 

@@ -10,8 +10,8 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from dvrk_drake.dynamics.kinematics import ArmFrame, PsmInverseKinematics
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.plant import make_arm_plant
-from dvrk_drake.systems.gravity_pid_step import ABSURD
 
 #: Frames that lead and follow: the dVRK's measured_cp of the two arms, at the wrist centre and at the wrist yaw axis.
 MASTER_FRAME, FOLLOWER_FRAME = "dh_7", "dh_6"
@@ -193,7 +193,7 @@ _DESIRED, _FOLLOWING, _FAULT, _SCALE, _POSES = range(5)  # indices of the discre
 
 
 def _usable(values: NDArray[np.float64]) -> bool:
-    return bool(np.all(np.abs(values) < ABSURD))  # not so of NaN
+    return bool(np.all(np.abs(values) < IMPLAUSIBLE))  # not so of NaN
 
 
 def _velocity_limits(arm: Arm) -> NDArray[np.float64]:

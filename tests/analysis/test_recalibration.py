@@ -8,7 +8,7 @@ from loaded_arm import friction, other_day
 from motions import fourier_motion, recorded, true_dynamics
 
 from dvrk_drake.analysis.dynamic.validation import validate_motion
-from dvrk_drake.analysis.recalibration import predict_other_phases, recalibrate
+from dvrk_drake.analysis.recalibration import predict_other_phases, refit_friction
 from dvrk_drake.analysis.signals.drive_efforts import FRICTION_PARTS
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
@@ -47,7 +47,7 @@ def errors(model, recording):
 @pytest.mark.parametrize("name", ["psm", "mtmr"])
 def test_friction_and_offsets_of_the_second_day_are_found(name):
     model, truth, generator = days(name)
-    result = recalibrate(model, motion(truth, generator))
+    result = refit_friction(model, motion(truth, generator))
     other = motion(truth, generator, seconds=16.0, seed=6)
     before, after = errors(model, other), errors(result.model, other)
     # The friction of the second day has the shape of the first's, so that little more than noise is left.
@@ -65,7 +65,7 @@ def test_friction_and_offsets_of_the_second_day_are_found(name):
 
 def test_rigid_bodies_stay_and_offsets_count_in_motion_alone():
     model, truth, generator = days("psm")
-    result = recalibrate(model, motion(truth, generator))
+    result = refit_friction(model, motion(truth, generator))
     new, arm = result.model, model.load_arm()
     assert new.dynamics.links == model.dynamics.links and new.dynamics.rotors == model.dynamics.rotors
     assert new.base_parameters == model.base_parameters
@@ -81,7 +81,7 @@ def test_rigid_bodies_stay_and_offsets_count_in_motion_alone():
 def test_on_the_same_day_nothing_gets_worse():
     model, _, generator = days("psm")
     same = model.dynamic_model
-    result = recalibrate(model, motion(same, generator))
+    result = refit_friction(model, motion(same, generator))
     other = motion(same, generator, seconds=16.0, seed=6)
     np.testing.assert_allclose(errors(result.model, other), errors(model, other), atol=NOISE / 10)
     assert all(a.dry == pytest.approx(1, abs=0.1) and a.viscous == pytest.approx(1, abs=0.1) for a in result.actuators)
@@ -91,7 +91,7 @@ def test_a_joint_that_rests_is_left_alone():
     model, truth, generator = days("psm")
     t, q, v, vd = fourier_motion(truth.arm, np.random.default_rng(5), 8.0, 10.0, 1000.0)
     q[:, 0], v[:, 0], vd[:, 0] = q[0, 0], 0.0, 0.0
-    result = recalibrate(model, recorded(truth, (t, q, v, vd), NOISE, generator))
+    result = refit_friction(model, recorded(truth, (t, q, v, vd), NOISE, generator))
     yaw = result.actuators[0]
     assert (yaw.kept, yaw.reason, yaw.dry, yaw.offset) == (False, "does not move both ways", 1.0, 0.0)
     assert all(a.kept for a in result.actuators[1:])
@@ -105,7 +105,7 @@ def test_a_motion_in_one_direction_is_refused():
     start, v = truth.arm.sample_poses(1, generator, margin=0.4)[0], truth.arm.per_joint(0.06, 0.006)
     slow = (t, start + t[:, None] * v, np.tile(v, (len(t), 1)), np.zeros((len(t), 7)))
     with pytest.raises(RecordingError, match="no actuator moves both ways for 10% of the time"):
-        recalibrate(model, recorded(truth, slow, 0.0, generator))
+        refit_friction(model, recorded(truth, slow, 0.0, generator))
 
 
 @pytest.mark.parametrize(("ours", "theirs"), [("psm", "mtmr"), ("mtmr", "psm")])
@@ -113,7 +113,7 @@ def test_another_arm_is_refused(ours, theirs):
     model, *_ = days(ours)
     _, truth, generator = days(theirs)
     with pytest.raises(RecordingError, match=r"is it of this arm|outside|limits"):
-        recalibrate(model, motion(truth, generator))
+        refit_friction(model, motion(truth, generator))
 
 
 def test_efforts_of_something_else_are_refused():
@@ -122,7 +122,7 @@ def test_efforts_of_something_else_are_refused():
     noise = generator.normal(size=recording.tau.shape) * np.std(recording.tau, axis=0)
     other = dataclasses.replace(recording, tau=noise, source="noise.csv")
     with pytest.raises(RecordingError, match=r"noise.csv: efforts differ .* is it of this arm, in these coordinates"):
-        recalibrate(model, other)
+        refit_friction(model, other)
 
 
 @pytest.mark.parametrize(("name", "seconds"), [("psm", 6.0), ("mtmr", 8.0)])
@@ -133,8 +133,8 @@ def test_an_effort_of_the_wrong_sign_is_refused_however_short_the_recording(name
         tau = recording.tau.copy()
         tau[:, j] *= -1
         with pytest.raises(RecordingError, match=rf"efforts go against the model's \(correlation\): {joint} \(-"):
-            recalibrate(model, dataclasses.replace(recording, tau=tau))
-    assert recalibrate(model, recording).seconds > 0
+            refit_friction(model, dataclasses.replace(recording, tau=tau))
+    assert refit_friction(model, recording).seconds > 0
 
 
 def test_the_error_after_is_of_parts_that_were_not_fitted():
@@ -144,7 +144,7 @@ def test_the_error_after_is_of_parts_that_were_not_fitted():
     tau = recording.tau.copy()
     first = recording.t < 2.5
     tau[first, 3] += 2 * np.std(tau[:, 3]) * np.sign(recording.qd[first, 3])
-    result = recalibrate(model, dataclasses.replace(recording, tau=tau))
+    result = refit_friction(model, dataclasses.replace(recording, tau=tau))
     other = motion(truth, generator, seconds=16.0, seed=6)
     before, after = errors(model, other), errors(result.model, other)
     assert np.all(after[[0, 1, 2, 4, 5, 6]] < before[[0, 1, 2, 4, 5, 6]] + NOISE / 10)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.static.static_identification import LEAST_TORQUE
-from dvrk_drake.analysis.static.validation import validate
+from dvrk_drake.analysis.static.validation import validate_static
 from dvrk_drake.analysis.verdict import (
     GOOD_RATIO,
     SMALL_ERROR,
@@ -113,7 +113,7 @@ def test_a_switched_off_joint_is_off_and_a_wrong_one_fails(truth):
     tau = truth.holding_torque(recording.q)
     tau[:, 1] *= 0.3
     model = wrong_model(truth)
-    verdicts = validate(model, dataclasses.replace(recording, tau=tau)).verdicts
+    verdicts = validate_static(model, dataclasses.replace(recording, tau=tau)).verdicts
     assert verdicts == {
         "outer_yaw": "off",
         "shoulder_pitch": "do not use",
@@ -124,7 +124,7 @@ def test_a_switched_off_joint_is_off_and_a_wrong_one_fails(truth):
         "wrist_roll": "off",
     }
     tau[:, 4] = 0.0
-    assert validate(model, dataclasses.replace(recording, tau=tau)).verdicts["wrist_pitch"] == "not judged"
+    assert validate_static(model, dataclasses.replace(recording, tau=tau)).verdicts["wrist_pitch"] == "not judged"
 
 
 def test_measurements_at_a_stop_do_not_count(truth):
@@ -135,7 +135,7 @@ def test_measurements_at_a_stop_do_not_count(truth):
     q[3, 2] = 0.3
     tau = truth.holding_torque(q)
     tau[3, 1] = -3.0
-    validation = validate(truth, Recording(q=q, tau=tau))
+    validation = validate_static(truth, Recording(q=q, tau=tau))
     shoulder = validation.joints[1]
     assert shoulder.num_doubted >= 1
     assert shoulder.relative_error > GOOD_RATIO > shoulder.relative_error_undoubted
@@ -146,7 +146,7 @@ def test_actuators_that_off_joints_do_not_drive_are_judged(truth):
     recording = poses(truth)
     tau = truth.holding_torque(recording.q)
     given = Recording(q=recording.q, tau=tau).in_actuator_coordinates(ARM)
-    verdicts = validate(wrong_model(truth), given).verdicts
+    verdicts = validate_static(wrong_model(truth), given).verdicts
     assert [name for name, verdict in verdicts.items() if verdict == "off"] == ["outer_yaw", "wrist_roll"]
     assert verdicts["shoulder_pitch"] == verdicts["elbow_pitch"] == "good"
 

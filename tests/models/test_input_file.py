@@ -228,7 +228,7 @@ def test_a_large_csv_needs_little_more_than_its_numbers(tmp_path, monkeypatch):
     read_recording(path)
     tracemalloc.start()
     try:
-        read = read_recording(path, progress=shares.append)
+        read = read_recording(path, progress=lambda step, share: shares.append(share))
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

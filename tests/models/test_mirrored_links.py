@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.static.static_identification import identify_static
-from dvrk_drake.analysis.static.validation import validate
+from dvrk_drake.analysis.static.validation import validate_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, ModelError
@@ -67,7 +67,7 @@ def test_the_papers_recording_is_of_a_right_arm(shared_data):
     ).model
     poses = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
     mirrored = dataclasses.replace(poses, q=MIRROR * poses.q, tau=MIRROR * poses.measured_effort())
-    right, left = (validate(model, recording).joints[1:4] for recording in (poses, mirrored))
+    right, left = (validate_static(model, recording).joints[1:4] for recording in (poses, mirrored))
     for as_it_is, as_mirrored in zip(right, left, strict=True):
         assert as_it_is.rms_error_undoubted < 0.5 * as_mirrored.rms_error_undoubted
 

@@ -159,7 +159,7 @@ class FaultyArm:
             connect(hands.GetOutputPort("effort_disturbance"), push)
         self.simulator = Simulator(builder.Build())
         self.context = self.simulator.get_mutable_context()
-        self.station.set_positions(self.station.GetMyMutableContextFromRoot(self.context), self.start)
+        self.station.SetPositions(self.station.GetMyMutableContextFromRoot(self.context), self.start)
         self.simulator.Initialize()
         self.ticks = 0
 

@@ -11,6 +11,7 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.guard.settings import GuardSettings
+from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
@@ -34,7 +35,7 @@ class SimulatedArm:
         lcm.Subscribe(f"DVRK_STATUS_{self.arm.name}", lambda data: self.statuses.append(Status.decode(data)))
         self.simulator = Simulator(builder.Build())
         self.context = self.station.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
-        self.station.set_positions(self.context, POSES[name])
+        self.station.SetPositions(self.context, POSES[name])
         self.simulator.Initialize()
         self.tick = 0
 
@@ -47,7 +48,7 @@ class SimulatedArm:
         return self.driver.GetGuard(self.driver.GetMyContextFromRoot(self.simulator.get_context()))
 
     def drift(self):
-        return np.abs(self.station.get_positions(self.context) - POSES[self.arm.name.lower()]).max()
+        return np.abs(self.station.GetPositions(self.context) - POSES[self.arm.name.lower()]).max()
 
 
 class Controller:
@@ -56,7 +57,7 @@ class Controller:
     def __init__(self, lcm, name="mtml", driver=None):
         arm = load_arm(name)
         builder = DiagramBuilder()
-        station = builder.AddSystem(ArmStation(arm, hardware=True, driver=driver, lcm=lcm))
+        station = builder.AddSystem(HardwareArmStation(arm, driver=driver, lcm=lcm))
         controller = builder.AddSystem(GravityPidController(IdentifiedModel.from_arm(arm), mode="gravity"))
         builder.Connect(station.GetOutputPort(f"{name}.state_estimated"), controller.GetInputPort("state_estimated"))
         builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))

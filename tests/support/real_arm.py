@@ -26,7 +26,7 @@ class Run:
         self.station = ArmStation(arm, effects=effects, seed=seed)
         self.simulator = Simulator(self.station)
         self.context = self.simulator.get_mutable_context()
-        self.station.set_positions(self.context, middle(arm) if q is None else q)
+        self.station.SetPositions(self.context, middle(arm) if q is None else q)
         self.simulator.Initialize()
         self.tick = 0
 
@@ -42,7 +42,7 @@ class Run:
 
     @property
     def q(self):
-        return self.station.get_positions(self.context)
+        return self.station.GetPositions(self.context)
 
     @property
     def v(self):

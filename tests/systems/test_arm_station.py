@@ -7,7 +7,7 @@ import pytest
 from pydrake.geometry import HalfSpace, Meshcat, Role
 from pydrake.lcm import DrakeLcm
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import CoulombFriction
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlantConfig
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -16,9 +16,9 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import tree_selector
-from dvrk_drake.systems.arm_station import ArmStation, station_ports
+from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, station_ports
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 
 ARM = load_arm("mtml")
 MODEL = IdentifiedModel.from_arm(ARM)
@@ -44,7 +44,7 @@ def linkage_error(station, context):
     """Largest difference [rad] between the tree's joints and what the linkage makes of the arm's."""
     plant_context = station.GetSubsystemContext(station.plant, context)
     q_tree = station.plant.GetPositions(plant_context)[tree_selector(station.plant, ARM)]
-    return np.abs(q_tree - ARM.linkage.position(station.get_positions(context))).max()
+    return np.abs(q_tree - ARM.linkage.position(station.GetPositions(context))).max()
 
 
 def released(q, closure="mimic", **arguments):
@@ -55,7 +55,7 @@ def released(q, closure="mimic", **arguments):
     builder.Connect(station.GetOutputPort("mtml.state_estimated"), controller.GetInputPort("state_estimated"))
     builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort("mtml.effort_commanded"))
     simulator = Simulator(builder.Build())
-    station.set_positions(station.GetMyMutableContextFromRoot(simulator.get_mutable_context()), q)
+    station.SetPositions(station.GetMyMutableContextFromRoot(simulator.get_mutable_context()), q)
     return station, simulator
 
 
@@ -76,12 +76,10 @@ def test_port_names_and_sizes(name):
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_hardware_has_exactly_the_ports_of_the_arm(name):
     arm = load_arm(name)
-    station = ArmStation(arm, hardware=True, lcm=DrakeLcm("memq://"))
+    station = HardwareArmStation(arm, lcm=DrakeLcm("memq://"))
     inputs = {p.get_name(): p.size() for p in map(station.get_input_port, range(station.num_input_ports()))}
     outputs = {p.get_name(): p.size() for p in map(station.get_output_port, range(station.num_output_ports()))}
     assert (inputs, outputs) == (station_ports(arm).inputs, station_ports(arm).outputs)
-    with pytest.raises(StationError, match="it has no plant"):
-        station.set_positions(station.CreateDefaultContext(), np.zeros(7))
 
 
 @pytest.mark.parametrize("q", POSES)
@@ -90,7 +88,7 @@ def test_exact_gravity_compensation_holds_a_released_arm(q, closure):
     station, simulator = released(q, closure)
     simulator.AdvanceTo(2.0)
     context = station.GetMyContextFromRoot(simulator.get_context())
-    assert np.abs(station.get_positions(context) - q).max() < 1e-4
+    assert np.abs(station.GetPositions(context) - q).max() < 1e-4
     assert loop_gap(station, context) < GAP
 
 
@@ -99,12 +97,12 @@ def test_linkage_stays_closed_while_the_arm_falls(closure):
     station = ArmStation(ARM, closure=closure)
     simulator = Simulator(station)
     context = simulator.get_mutable_context()
-    station.set_positions(context, POSES[0])
+    station.SetPositions(context, POSES[0])
     worst = 0.0
     for t in np.arange(0.01, 0.5, 0.01):
         simulator.AdvanceTo(t)
         worst = max(worst, loop_gap(station, context))
-    assert np.abs(station.get_positions(context) - POSES[0]).max() > 0.1
+    assert np.abs(station.GetPositions(context) - POSES[0]).max() > 0.1
     assert worst < GAP
 
 
@@ -113,10 +111,10 @@ def test_energy_never_grows_without_effort_and_its_loss_vanishes_with_the_step()
     q = np.array([0.1, 0.4, -0.2, 0.3, 0.5, 0.1, 0.0])
     losses = []
     for time_step in (1e-3, 2.5e-4):
-        station = ArmStation(ARM, time_step=time_step)
+        station = ArmStation(ARM, plant_config=arm_plant_config(time_step))
         simulator = Simulator(station)
         context = simulator.get_mutable_context()
-        station.set_positions(context, q)
+        station.SetPositions(context, q)
         plant = station.plant
         plant_context = station.GetSubsystemContext(plant, context)
 
@@ -131,8 +129,8 @@ def test_energy_never_grows_without_effort_and_its_loss_vanishes_with_the_step()
             simulator.AdvanceTo(t)
             total.append(sum(energy()))
         A, lower, upper = ARM.limit_matrix()
-        assert np.all(A[:N] @ station.get_positions(context) > lower[:N])
-        assert np.all(A[:N] @ station.get_positions(context) < upper[:N])
+        assert np.all(A[:N] @ station.GetPositions(context) > lower[:N])
+        assert np.all(A[:N] @ station.GetPositions(context) < upper[:N])
         kinetic, _ = energy()
         assert kinetic > 0.05
         losses.append((total[0] - np.array(total)) / kinetic)
@@ -156,7 +154,7 @@ def acceleration_of(station, q, inputs):
     """Mean acceleration of the independent joints over the first millisecond."""
     simulator = Simulator(station)
     context = simulator.get_mutable_context()
-    station.set_positions(context, q)
+    station.SetPositions(context, q)
     for name, value in inputs.items():
         station.GetInputPort(name).FixValue(context, value)
     simulator.AdvanceTo(1e-3)
@@ -170,7 +168,7 @@ def test_efforts_act_on_their_own_joint_through_the_linkage(j):
     station = ArmStation(ARM)
     plant = station.plant
     context = station.CreateDefaultContext()
-    station.set_positions(context, q)
+    station.SetPositions(context, q)
     selection = tree_selector(plant, ARM)
     G = ARM.linkage.matrix
     M = plant.CalcMassMatrix(station.GetSubsystemContext(plant, context))
@@ -182,7 +180,7 @@ def test_efforts_act_on_their_own_joint_through_the_linkage(j):
         inputs = {"mtml.effort_commanded": tau, "mtml.effort_disturbance": np.zeros(N)}
         inputs[name] = inputs[name] + extra
         # Ten short steps: SAP's couplers give by 0.2 % in the first step, and are stiff after a few.
-        measured = acceleration_of(ArmStation(ARM, time_step=1e-4), q, inputs)
+        measured = acceleration_of(ArmStation(ARM, plant_config=arm_plant_config(1e-4)), q, inputs)
         np.testing.assert_allclose(measured, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
 
 
@@ -208,7 +206,7 @@ def test_unconnected_inputs_mean_a_limp_arm():
 def test_measurements_are_the_state_of_the_independent_joints():
     station = ArmStation(ARM)
     context = station.CreateDefaultContext()
-    station.set_positions(context, POSES[3])
+    station.SetPositions(context, POSES[3])
     plant_context = station.GetMutableSubsystemContext(station.plant, context)
     v = np.arange(1.0, 1 + N)
     v_plant = np.zeros(station.plant.num_velocities())
@@ -219,13 +217,13 @@ def test_measurements_are_the_state_of_the_independent_joints():
     np.testing.assert_array_equal(station.GetOutputPort("mtml.velocity_estimated").Eval(context), v)
     expected = np.concatenate([POSES[3], v])
     np.testing.assert_array_equal(station.GetOutputPort("mtml.state_estimated").Eval(context), expected)
-    np.testing.assert_array_equal(station.get_positions(context), POSES[3])
+    np.testing.assert_array_equal(station.GetPositions(context), POSES[3])
 
 
 def test_set_positions_closes_the_linkage_and_rests():
     station = ArmStation(ARM, closure="ball")
     context = station.CreateDefaultContext()
-    station.set_positions(context, POSES[4])
+    station.SetPositions(context, POSES[4])
     assert loop_gap(station, context) < 1e-12
     assert linkage_error(station, context) < 1e-12
     assert not np.any(station.GetOutputPort("mtml.velocity_estimated").Eval(context))
@@ -237,11 +235,11 @@ def test_link_inertias_change_one_context_only():
     payload = SpatialInertia(
         1.0, np.array([0, 0, -0.05]), UnitInertia.SolidSphere(0.03).ShiftFromCenterOfMass([0, 0, 0.05])
     )
-    station.set_link_inertias(heavy, {"wrist_roll_link": payload})
+    station.SetLinkInertias(heavy, {"wrist_roll_link": payload})
     mass = [station.plant.CalcTotalMass(station.GetSubsystemContext(station.plant, c)) for c in (heavy, nominal)]
     assert mass[0] - mass[1] == pytest.approx(1.0 - 0.06, abs=1e-12)
     with pytest.raises(StationError, match=r"unknown link hand; links: .*wrist_roll_link"):
-        station.set_link_inertias(heavy, {"hand": payload})
+        station.SetLinkInertias(heavy, {"hand": payload})
 
 
 def test_modify_plant_and_plant_arm():
@@ -254,9 +252,9 @@ def test_modify_plant_and_plant_arm():
     moved = []
     for station in (free, damped):
         simulator = Simulator(station)
-        station.set_positions(simulator.get_mutable_context(), q)
+        station.SetPositions(simulator.get_mutable_context(), q)
         simulator.AdvanceTo(0.2)
-        moved.append(np.abs(station.get_positions(simulator.get_context()) - q).max())
+        moved.append(np.abs(station.GetPositions(simulator.get_context()) - q).max())
     assert moved[1] < 0.5 * moved[0]
 
     weightless = ArmStation(ARM, plant_arm=ARM.with_gravity([0.0, 0.0, 0.0]))
@@ -288,26 +286,28 @@ def test_collision_shapes_are_there_when_something_can_be_touched():
     for modify_plant in (None, add_table):
         station = ArmStation(ARM, modify_plant=modify_plant)
         simulator = Simulator(station)
-        station.set_positions(simulator.get_mutable_context(), np.zeros(N))
+        station.SetPositions(simulator.get_mutable_context(), np.zeros(N))
         simulator.AdvanceTo(1.0)
-        fallen.append(station.get_positions(simulator.get_context()))
+        fallen.append(station.GetPositions(simulator.get_context()))
     assert proximity_shapes(station) > 10
     assert np.abs(fallen[0] - fallen[1]).max() > 0.1, "the arm lies on the table"
 
 
 def test_errors_say_what_to_do():
-    for of_a_simulation in ({"plant_arm": ARM}, {"closure": "ball"}, {"time_step": 2e-3}, {"effects": ARM.effects}):
-        with pytest.raises(StationError, match="modify_plant and effects are of a simulation"):
-            ArmStation(ARM, hardware=True, **of_a_simulation)
-    with pytest.raises(StationError, match="driver and lcm are of hardware"):
-        ArmStation(ARM, driver=DvrkDriver())
     with pytest.raises(StationError, match=r"time_step must be above 0 and at most 0.01 s"):
-        ArmStation(ARM, time_step=0.0)
+        ArmStation(ARM, plant_config=arm_plant_config(0.0))
+    with pytest.raises(StationError, match='discrete_contact_approximation is "tamsi"; a linkage needs sap'):
+        ArmStation(
+            ARM,
+            plant_config=MultibodyPlantConfig(discrete_contact_approximation="tamsi", use_sampled_output_ports=False),
+        )
+    with pytest.raises(StationError, match="use_sampled_output_ports must be false"):
+        ArmStation(ARM, plant_config=MultibodyPlantConfig())
     with pytest.raises(StationError, match="plant_arm must have the joints of MTML"):
         ArmStation(ARM, plant_arm=dataclasses.replace(ARM, joint_names=ARM.joint_names[::-1]))
     station = ArmStation(ARM)
     with pytest.raises(StationError, match="a pose of MTML is 7 finite numbers"):
-        station.set_positions(station.CreateDefaultContext(), np.zeros(6))
+        station.SetPositions(station.CreateDefaultContext(), np.zeros(6))
 
 
 def test_meshcat_is_given_the_arm():
@@ -325,7 +325,7 @@ def test_two_stations_in_one_diagram_and_again():
         simulator = Simulator(builder.Build())
         simulator.AdvanceTo(0.01)
         context = simulator.get_context()
-        q = [s.get_positions(s.GetMyContextFromRoot(context)) for s in (left, right)]
+        q = [s.GetPositions(s.GetMyContextFromRoot(context)) for s in (left, right)]
         # Mirror images, but for motor 4, which elbow and platform turn alike on both sides.
         np.testing.assert_allclose(q[0], np.array([-1, 1, 1, -1, 1, -1, -1]) * q[1], atol=2e-5)
         assert np.any(q[0])

@@ -37,7 +37,7 @@ def simulate(q0, q_desired, duration, gravity_factor=1.0):
     controller.GetInputPort("desired_state").FixValue(
         controller.GetMyMutableContextFromRoot(context), np.concatenate([q_desired, np.zeros(ARM.num_joints)])
     )
-    station.set_positions(station.GetMyMutableContextFromRoot(context), q0)
+    station.SetPositions(station.GetMyMutableContextFromRoot(context), q0)
     simulator.AdvanceTo(duration)
     log = positions.FindLog(context)
     return log.sample_times(), log.data().T - np.asarray(q_desired), efforts.FindLog(context).data().T
@@ -86,7 +86,7 @@ def test_steady_state_without_integral_is_the_gravity_error_over_kp():
     builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort("mtml.effort_commanded"))
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(8.0)  # holds the initial pose, zero
-    q = station.get_positions(station.GetMyContextFromRoot(simulator.get_context()))
+    q = station.GetPositions(station.GetMyContextFromRoot(simulator.get_context()))
     missing = NOMINAL.holding_torque(q) - model.holding_torque(q)
     np.testing.assert_allclose(np.asarray(gains.kp) * (0 - q), missing, atol=1e-6)
     assert np.abs(q).max() > 1e-3

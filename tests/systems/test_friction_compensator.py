@@ -245,7 +245,7 @@ def test_a_push_dies_away_on_an_arm_with_a_third_less_friction_than_identified_a
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     generator = np.random.default_rng(seed)
-    station.set_positions(context, ARM.sample_poses(1, generator, margin=0.2)[0])
+    station.SetPositions(context, ARM.sample_poses(1, generator, margin=0.2)[0])
     push = 2 * holding_friction(Friction.of_arm(ARM)) * generator.choice([-1.0, 1.0], 7)
     station.GetInputPort("mtml.effort_disturbance").FixValue(context, push)
     simulator.AdvanceTo(0.3)
@@ -268,7 +268,7 @@ def released(ratio, error, holding_error, seconds=1.5):
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     start = [0.1, 0.3, -0.1, 0.5, 0.4, 0.1, 0.3]
-    station.set_positions(context, start)
+    station.SetPositions(context, start)
     station.GetInputPort("mtml.effort_disturbance").FixValue(context, error)
     simulator.AdvanceTo(seconds)
     return np.abs(station.GetOutputPort("mtml.state_true").Eval(context)[:7] - start)

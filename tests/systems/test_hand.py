@@ -44,7 +44,7 @@ def held_arm(grip, X_offset, duration):
     simulator = Simulator(diagram)
     root = simulator.get_mutable_context()
     context = station.GetMyMutableContextFromRoot(root)
-    station.set_positions(context, Q)
+    station.SetPositions(context, Q)
     frame = ArmFrame(arm, "dh_7")
     wanted = moved(frame.pose(Q), *X_offset)
     diagram.GetInputPort("wanted").FixValue(root, AbstractValue.Make(wanted))

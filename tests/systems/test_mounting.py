@@ -24,9 +24,9 @@ def drift(arm, mounted, model):
     q = (arm.position_lower + 2 * arm.position_upper) / 3
     q[2] -= 0.4 if name == "mtml" else 0.0  # inside the parallelogram's stops
     assert not arm.limit_violations(q)
-    station.set_positions(context, q)
+    station.SetPositions(context, q)
     simulator.AdvanceTo(0.5)
-    return np.abs(station.get_positions(context) - q)
+    return np.abs(station.GetPositions(context) - q)
 
 
 @pytest.mark.parametrize(

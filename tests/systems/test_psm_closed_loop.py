@@ -103,7 +103,7 @@ def test_same_torques_move_both_alike(q):
         station = ArmStation(ARM, closure=closure)
         simulator = Simulator(station)
         context = simulator.get_mutable_context()
-        station.set_positions(context, q)
+        station.SetPositions(context, q)
         balance = IdentifiedModel.from_arm(ARM).holding_torque(q)
         states = []
         for t in np.arange(0.0, 0.5, 0.01):
@@ -138,13 +138,13 @@ def test_closure_and_remote_centre_while_the_arm_moves_through_the_whole_box():
     builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort("psm.effort_commanded"))
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    station.set_positions(context, knots[0])
+    station.SetPositions(context, knots[0])
     plant, select = station.plant, tree_selector(station.plant, ARM)
     plant_context = station.GetSubsystemContext(plant, context)
     worst, tracking, linkage, q_seen = np.zeros(2), np.zeros(N), 0.0, []
     for t in np.arange(0.005, times[-1], 0.005):
         simulator.AdvanceTo(t)
-        q = station.get_positions(context)
+        q = station.GetPositions(context)
         worst = np.maximum(worst, gaps(plant, plant_context))
         tracking = np.maximum(tracking, np.abs(q - trajectory.value(t)[:, 0]))
         linkage = max(linkage, np.abs(plant.GetPositions(plant_context)[select] - ARM.linkage.position(q)).max())
@@ -169,12 +169,12 @@ def test_held_poses_all_over_the_box_keep_the_remote_centre(closure):
     context = station.GetMyMutableContextFromRoot(root)
     for q in box_poses(20):
         root.SetTime(0.0)
-        station.set_positions(context, q)
+        station.SetPositions(context, q)
         simulator.Initialize()
         simulator.AdvanceTo(0.5)
         worst = gaps(station.plant, station.GetSubsystemContext(station.plant, context))
         assert np.all(worst < 1e-7)
-        assert np.abs(station.get_positions(context) - q).max() < 5e-6
+        assert np.abs(station.GetPositions(context) - q).max() < 5e-6
 
 
 @pytest.mark.parametrize("closure", ["mimic", "ball"])
@@ -186,13 +186,13 @@ def test_full_effort_against_every_stop_moves_neither_linkage_nor_remote_centre(
     context = simulator.get_mutable_context()
     inset = 0.02 * (ARM.position_upper - ARM.position_lower)
     stop = ARM.position_upper if sign > 0 else ARM.position_lower
-    station.set_positions(context, stop - sign * inset)
+    station.SetPositions(context, stop - sign * inset)
     station.GetInputPort("psm.effort_commanded").FixValue(context, sign * ARM.effort_limits)
     plant, select = station.plant, tree_selector(station.plant, ARM)
     plant_context = station.GetSubsystemContext(plant, context)
     for t in np.arange(0.002, 0.5, 0.002):
         simulator.AdvanceTo(t)
-        q = station.get_positions(context)
+        q = station.GetPositions(context)
         assert np.all(gaps(plant, plant_context) < 2e-7)  # measured 8e-8
         follows = np.abs(plant.GetPositions(plant_context)[select] - ARM.linkage.position(q))
         assert follows.max() < 2e-5  # measured 7e-6 rad on the light finger as it stops, 4e-7 elsewhere

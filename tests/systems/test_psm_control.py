@@ -49,7 +49,7 @@ class Bench:
             name: SpatialInertia(inertia_factor * M.get_mass(), M.get_com(), M.get_unit_inertia())
             for name, M in inertias.items()
         }
-        self.station.set_link_inertias(self.context, heavier)
+        self.station.SetLinkInertias(self.context, heavier)
 
     def run(self, q0, q_desired, duration):
         """Times (m,), positions (m, n) and efforts (m, n), every millisecond."""
@@ -57,7 +57,7 @@ class Bench:
         for log in logs:
             log.Clear()
         self.root.SetTime(0.0)
-        self.station.set_positions(self.context, q0)
+        self.station.SetPositions(self.context, q0)
         settings = self.controller.GetMyMutableContextFromRoot(self.root)
         self.controller.GetInputPort("desired_state").FixValue(settings, np.concatenate([q_desired, np.zeros(N)]))
         self.simulator.Initialize()

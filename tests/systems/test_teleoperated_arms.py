@@ -26,8 +26,8 @@ def run(arms, duration=2.5):
     """The handle is pulled and turned by a person, then held; the state of all at the end, and the poses."""
     simulator = Simulator(arms)
     context = simulator.get_mutable_context()
-    arms.set_positions(context, START_MASTER, START_FOLLOWER)
-    X_MG0, X_FT0 = arms.X_MG(context), arms.X_FT(context)
+    arms.SetPositions(context, START_MASTER, START_FOLLOWER)
+    X_MG0, X_FT0 = arms.CalcX_MG(context), arms.CalcX_FT(context)
     arms.GetInputPort("engaged").FixValue(context, [1.0])
     for t in np.arange(0, duration, 0.01):
         s = np.clip((t - 0.1) / 1.0, 0, 1)
@@ -38,7 +38,7 @@ def run(arms, duration=2.5):
         arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(target))
         simulator.AdvanceTo(t + 0.01)
     state = [arms.GetOutputPort(f"{name}.state_estimated").Eval(context) for name in ("mtml", "psm")]
-    return np.concatenate(state), (X_MG0, arms.X_MG(context)), (X_FT0, arms.X_FT(context)), target
+    return np.concatenate(state), (X_MG0, arms.CalcX_MG(context)), (X_FT0, arms.CalcX_FT(context)), target
 
 
 def test_simulated_follower_arrives_where_a_hand_leads_it(arms):
@@ -60,7 +60,7 @@ def test_simulation_is_repeatable(arms):
 def test_master_that_nobody_touches_stays_and_so_does_the_follower(arms):
     simulator = Simulator(arms)
     context = simulator.get_mutable_context()
-    arms.set_positions(context, START_MASTER, START_FOLLOWER)
+    arms.SetPositions(context, START_MASTER, START_FOLLOWER)
     arms.GetInputPort("engaged").FixValue(context, [1.0])
     simulator.AdvanceTo(1.0)
     q_M = arms.GetOutputPort("mtml.state_estimated").Eval(context)[:7]

@@ -108,6 +108,21 @@ class RecordingReport:
         """The findings with which nothing should be identified."""
         return tuple(finding for finding in self.findings if finding.severity == "refusal")
 
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
+        """The findings that make results worse."""
+        return tuple(finding for finding in self.findings if finding.severity == "warning")
+
+    @property
+    def refusal(self) -> str:
+        """The first refusal in one line, with the number of all; "" without any."""
+        if not self.refusals:
+            return ""
+        first, *others = self.refusals
+        reasons = f"refused for {len(others) + 1} reasons, the first: " if others else "refused: "
+        where = "" if first.where == self.source else f"{first.where}: "
+        return f"{self.source}: {reasons}{where}{first.what}; {first.advice}"
+
     def as_dict(self) -> dict[str, Any]:
         """For JSON: what does not apply is null."""
         return _without_nan(asdict(self))

@@ -17,6 +17,7 @@ from dvrk_drake.analysis.static.doubts import check_effort_unit
 from dvrk_drake.analysis.static.static_identification import usable_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import LEAST_ROWS, REST_SPEED, Recording
 
 #: A joint that moves less has never moved [rad], [m].
@@ -220,20 +221,73 @@ def _without_source(message: str, source: str) -> str:
     return message.removeprefix(source).lstrip(": ")
 
 
-def check_for_identification(recording: Recording, arm: Arm) -> RecordingReport:
-    """As `check_recording`, with a refusal where `identify` refuses what may still be compared with a model.
+def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -> RecordingReport:
+    """Looks for faults of a recording before anything is identified from it: what `dvrk-drake check` does.
+
+    Faults are, among others: units, signs, exchanged channels, efforts at their limit, times that go back, late or
+    repeated signals, joints that never move. Nothing is raised for a fault; it becomes a finding of the report.
 
     Args:
-        recording: as read.
+        recording: poses or a motion with efforts (m, n), in joint or actuator coordinates, as read.
         arm: which was recorded.
+        progress: called with the step, "checking the recording", and its finished share 0..1.
+
+    Returns:
+        `findings` with severity, place, advice and size, of which `refusals` and `warnings`; numbers of each joint as
+        `joints`; `as_dict` for JSON. `identify` refuses a recording that has refusals.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> arm = dvrk.load_arm("mtml")
+        >>> q = arm.sample_poses(20, np.random.default_rng(0))
+        >>> efforts_in_n_mm = 1e3 * dvrk.IdentifiedModel.from_arm(arm).holding_torque(q)
+        >>> report = dvrk.check(dvrk.Recording(q=q, tau=efforts_in_n_mm), arm)
+        >>> [finding.kind for finding in report.refusals]
+        ['unusable']
     """
     report = check_with_channels(recording, arm)
+    step_progress(progress, "checking the recording")(1.0)
     if report.refusals:
         return report
     refusals = _refusals_of_identify(recording, arm)
     # What a refusal says again, and with what is needed.
     others = [finding for finding in report.findings if not (refusals and finding.kind == "few poses")]
     return replace(report, findings=(*refusals, *others))
+
+
+def require_usable(
+    recording: Recording,
+    arm: Arm,
+    progress: Progress | None = None,
+    *,
+    channels: bool = False,
+    apart_from: str = "",
+) -> RecordingReport:
+    """Checks a recording before it is used.
+
+    Args:
+        recording, arm: as of `check_recording`.
+        progress: called with the step, "checking the recording", and its finished share 0..1.
+        channels: check them too, see `check_with_channels`.
+        apart_from: kind of findings that do not matter.
+
+    Returns:
+        The report, without refusals.
+
+    Raises:
+        RecordingError: the first refusal; refusals and warnings are its `findings`.
+    """
+    report_share = step_progress(progress, "checking the recording")
+    report_share(0.0)
+    report = (check_with_channels if channels else check_recording)(recording, arm)
+    report_share(1.0)
+    kept = tuple(finding for finding in report.findings if finding.kind != apart_from)
+    report = replace(report, findings=kept)
+    if report.refusals:
+        error = RecordingError(report.refusal)
+        error.findings = (*report.refusals, *report.warnings)
+        raise error
+    return report
 
 
 def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:

@@ -13,6 +13,7 @@ from dvrk_drake.analysis.dynamic.columns import drive_effects, dynamic_columns, 
 from dvrk_drake.analysis.dynamic.effect_choice import choose_effects, left_out_errors
 from dvrk_drake.analysis.dynamic.estimates import DynamicEstimates, base_parameter_estimates, parameter_covariance
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
+from dvrk_drake.analysis.results import Identification
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of, phase_folds, repeatability_floor
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
@@ -32,12 +33,11 @@ from dvrk_drake.recordings.recording import REST_SPEED, Recording
 LEAST_EFFECT = 1e-4
 
 
-@dataclass(frozen=True, eq=False)
-class DynamicIdentification:
-    """A model with what a report of it needs.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DynamicIdentification(Identification):
+    """A model identified from a motion; it has `dynamics`, and its base parameters are those of the links there.
 
     Attributes:
-        model: with `dynamics`; its base parameters are those of the links there.
         grid: the motion.
         period: after which the motion repeats [s], or None.
         measured, predicted: (r, n) efforts of the actuators behind the filter, ends left out [N m, N].
@@ -45,7 +45,6 @@ class DynamicIdentification:
         nominal_mass: of all links as the SDF has them [kg].
     """
 
-    model: IdentifiedModel
     grid: MotionGrid
     period: float | None
     measured: NDArray[np.float64]
@@ -98,7 +97,17 @@ def identify_dynamic(
     progress(1.0)
     predicted = problem.columns.tau - left
     nominal = float(sum(link.parameters[0] for link in problem.regressor.links))
-    return DynamicIdentification(model, grid, period, problem.columns.tau, predicted, estimates.dry_friction(), nominal)
+    return DynamicIdentification(
+        model=model,
+        recording=recording,
+        num_rows=len(recording),
+        grid=grid,
+        period=period,
+        measured=problem.columns.tau,
+        predicted=predicted,
+        dry_friction=estimates.dry_friction(),
+        nominal_mass=nominal,
+    )
 
 
 def _refuse_worse_than_zero(recording: Recording, grid: MotionGrid, errors: NDArray[np.float64]) -> None:

@@ -7,10 +7,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.results import Validation
 from dvrk_drake.analysis.signals.low_pass import low_pass
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of, repeatability_floor
-from dvrk_drake.analysis.verdict import judge, rule_text, worst
+from dvrk_drake.analysis.verdict import judge, rule_text
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.recordings.recording import Recording
 
@@ -43,8 +44,8 @@ class ActuatorError:
     verdict: Verdict
 
 
-@dataclass(frozen=True, eq=False)
-class DynamicValidation:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DynamicValidation(Validation):
     """Errors of a model on one motion.
 
     Attributes:
@@ -74,10 +75,15 @@ class DynamicValidation:
         """Verdict on each actuator."""
         return {actuator.name: actuator.verdict for actuator in self.actuators}
 
+    @property
+    def relative_errors(self) -> dict[str, float | None]:
+        """RMS error / RMS effort of each actuator behind the low-pass [1]; None where nothing was measured."""
+        return {actuator.name: actuator.relative_error for actuator in self.actuators}
+
     def as_dict(self) -> dict:
-        """What `validate --json` writes."""
+        """Returns what `validate --json` writes."""
         return {
-            "verdict": worst(self.verdicts)[0],
+            "verdict": self.verdict,
             "rule": rule_text(in_motion=True),
             "coordinates": "actuator",
             "cut_off_hz": self.cut_off,
@@ -125,7 +131,17 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
         for i, name in enumerate(arm.joint_names)
     ]
     t = grid.row_times[grid.inner]
-    return DynamicValidation(actuators, grid.settings.effort_cut_off, t, a, v, measured, predicted)
+    return DynamicValidation(
+        model=model,
+        recording=recording,
+        actuators=actuators,
+        cut_off=grid.settings.effort_cut_off,
+        t=t,
+        q=a,
+        v=v,
+        measured=measured,
+        predicted=predicted,
+    )
 
 
 def _efforts(model: IdentifiedModel, grid: MotionGrid) -> NDArray[np.float64]:

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
+from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.check.recording_check import require_usable
+from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
 from dvrk_drake.analysis.payload.motion_difference import MotionDifference, Whitening, motion_difference
 from dvrk_drake.analysis.payload.point_mass import PointMass, PointMassProblem
 from dvrk_drake.analysis.signals.repetition import phase_folds
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
 
 #: Of the intervals that are reported.
@@ -166,6 +171,87 @@ def estimate_payload(
     return sorted(estimates, key=lambda payload: payload.left_out)
 
 
+@dataclass(frozen=True, eq=False)
+class PayloadIdentification:
+    """Result of `payload`.
+
+    Attributes:
+        payload: on the named link, or on the one that explains the change best.
+        estimates: on each moving link, best first.
+        model: of the arm without the payload.
+        warnings: another link explains the change better, and what was found in the recordings.
+        link: the named one, or None.
+    """
+
+    payload: Payload
+    estimates: list[Payload]
+    model: IdentifiedModel
+    warnings: tuple[Finding, ...] = ()
+    link: str | None = None
+
+    def as_dicts(self) -> list[dict]:
+        """Returns what `payload --json` writes: the payload on the named link, or on every link."""
+        chosen = self.estimates if self.link is None else [self.payload]
+        return [payload.as_dict(self.estimates) for payload in chosen]
+
+
+def payload(
+    reference: Recording,
+    loaded: Recording,
+    model: IdentifiedModel | Arm,
+    link: str | None = None,
+    *,
+    progress: Progress | None = None,
+) -> PayloadIdentification:
+    """Checks two recordings of one motion and estimates what was added to the arm: what `dvrk-drake payload` does.
+
+    Args:
+        reference, loaded: motions with efforts (m, n), without and with the payload.
+        model: identified from a motion of the arm without the payload; or the arm: its model is then identified from
+            `reference`.
+        link: of the SDF that carries the payload; None for the one that explains the change best.
+        progress: called with the step, "checking the recording", "identifying" or "estimating", and its finished share
+            0..1.
+
+    Returns:
+        Mass [kg] and place [m] with standard errors as `payload`, the same on each link as `estimates`, and `warnings`.
+
+    Raises:
+        RecordingError: `check` refuses a recording, or the two are not of one motion: see `findings` of the error.
+        ModelError: the model has no dynamics, or there is no such link.
+        IdentificationError: `reference` does not determine the arm's model.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> arm = dvrk.load_arm("psm")
+        >>> t, w = np.arange(0, 11, 0.02)[:, None], 1 + 0.25 * np.arange(7)
+        >>> middle = (arm.position_upper + arm.position_lower) / 2
+        >>> reach = 0.3 * (arm.position_upper - arm.position_lower)
+        >>> q, v, vd = middle + reach * np.sin(w * t), reach * w * np.cos(w * t), -reach * w**2 * np.sin(w * t)
+        >>> def recorded(model):
+        ...     tau = arm.transmission.pull_back_effort(model.dynamic_model.effort(q, v, vd))
+        ...     return dvrk.Recording(q=q, qd=v, tau=tau, t=t[:, 0])
+        >>> model, heavier = (dvrk.IdentifiedModel.from_arm(arm, dynamics=True) for _ in range(2))
+        >>> links = {link.link: link for link in heavier.dynamics.links}
+        >>> links["end_link"].parameters[0] += 0.1  # [kg] at the origin of the link
+        >>> result = dvrk.payload(recorded(model), recorded(heavier), model, "end_link")
+        >>> round(result.payload.body.mass, 3), result.payload.found  # [kg]
+        (0.1, True)
+    """
+    arm = model if isinstance(model, Arm) else model.load_arm()
+    check_links(DynamicRegressor(arm), [] if link is None else [link])
+    found: tuple[Finding, ...] = ()
+    for recording in (reference, loaded):
+        report = require_usable(recording, arm, progress)
+        found += tuple(replace(warning, where=f"{report.source}: {warning.where}") for warning in report.warnings)
+    if isinstance(model, Arm):
+        model = identify_dynamic(reference, arm, step_progress(progress, "identifying")).model
+    estimates = estimate_payload(reference, loaded, model.dynamic_model, progress=step_progress(progress, "estimating"))
+    chosen = estimates[0] if link is None else next(p for p in estimates if p.link == link)
+    found = (*better_link_warnings(chosen, estimates), *found)
+    return PayloadIdentification(chosen, estimates, model, found, link)
+
+
 def check_links(regressor: DynamicRegressor, links: Sequence[str]) -> None:
     """Raises ModelError unless links of these names move; before a model is identified for nothing."""
     names = [link.link for link in regressor.links]
@@ -181,6 +267,22 @@ def as_good(estimates: Sequence[Payload]) -> list[Payload]:
 def better_links(payload: Payload, estimates: Sequence[Payload]) -> list[Payload]:
     """Returns the links that explain the change clearly better than `payload` does, best first."""
     return [other for other in estimates if SAME_ERROR * other.left_out < payload.left_out]
+
+
+def better_link_warnings(payload: Payload, estimates: Sequence[Payload]) -> tuple[Finding, ...]:
+    """Returns a warning that names the links that explain the change better than that of `payload`, if any do."""
+    better = better_links(payload, estimates)
+    if not better:
+        return ()
+    first = better[0]
+    same = [other.link for other in as_good(estimates)]
+    mass = f", {first.body.mass:.3g} +- {first.mass_error:.2g} kg" if first.found else ""
+    what = (
+        f"does not explain the change best: left-out error {payload.left_out:.1%}, but {first.left_out:.1%} with a "
+        f"payload on {' or '.join(same)}{mass}"
+    )
+    advice = f"use this result only if the payload is certainly on {payload.link}; else repeat with --link {first.link}"
+    return (Finding("warning", "other link", payload.link, what, advice),)
 
 
 def shown_elsewhere(payload: Payload, estimates: Sequence[Payload]) -> list[Payload]:

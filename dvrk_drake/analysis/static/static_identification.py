@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.results import Identification
 from dvrk_drake.analysis.static.doubts import Doubt, check_effort_unit, find_doubts, outlier_doubts, usable_measurements
 from dvrk_drake.analysis.static.effect_selection import StaticProblem, select_effects
 from dvrk_drake.analysis.static.linear_fit import LinearFit, rms, weighted_fit
@@ -42,15 +43,17 @@ LEAST_GAIN_RATIO = 0.98
 FOLDS = 10
 
 
-@dataclass(frozen=True)
-class StaticIdentification:
-    """A model with what a report of it needs: the poses used, in joint coordinates, doubts, and (m, n) residuals.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StaticIdentification(Identification):
+    """A model identified from poses.
 
-    `measured` (m, n) is False where an effort is no holding torque.
+    Attributes:
+        doubts: measurements that were left out, and why.
+        residuals: (m, n) measured minus fitted efforts [N m; N].
+        left_out_residuals: (m, n) the same for poses predicted from all others.
+        measured: (m, n) False where an effort is no holding torque.
     """
 
-    model: IdentifiedModel
-    recording: Recording
     doubts: list[Doubt]
     residuals: NDArray[np.float64]
     left_out_residuals: NDArray[np.float64]
@@ -61,7 +64,7 @@ def identify_static(
     recording: Recording,
     arm: Arm,
     method: Method = "robust",
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], object] = lambda share: None,
     measured: NDArray[np.bool_] | None = None,
 ) -> StaticIdentification:
     """Identifies the static model of `arm` from a recording of poses at rest.
@@ -142,7 +145,14 @@ def identify_static(
             version=version("dvrk-drake"),
         ),
     )
-    return StaticIdentification(model, recording, doubts, fit.residuals, fit.left_out_residuals, measured)
+    return StaticIdentification(
+        model=model,
+        recording=recording,
+        doubts=doubts,
+        residuals=fit.residuals,
+        left_out_residuals=fit.left_out_residuals,
+        measured=measured,
+    )
 
 
 def usable_poses(recording: Recording, arm: Arm, averaged: bool = True) -> Recording:
@@ -238,7 +248,7 @@ def _segments_support(
     return supported
 
 
-def _cross_validate(problem: StaticProblem, progress: Callable[[float], None]) -> NDArray[np.float64]:
+def _cross_validate(problem: StaticProblem, progress: Callable[[float], object]) -> NDArray[np.float64]:
     """(m, n) residuals of ten-fold cross-validation, effects and trust chosen anew in every fold."""
     poses = len(problem.q)
     folds = np.random.default_rng(0).permutation(poses) % min(FOLDS, poses)

@@ -7,9 +7,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.results import Validation
 from dvrk_drake.analysis.static.doubts import Doubt, check_effort_unit, find_doubts, usable_measurements
 from dvrk_drake.analysis.static.linear_fit import rms
-from dvrk_drake.analysis.verdict import judge, rule_text, worst
+from dvrk_drake.analysis.verdict import judge, rule_text
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
@@ -36,11 +37,16 @@ class JointError:
     verdict: Verdict
 
 
-@dataclass(frozen=True)
-class Validation:
-    """Errors of `model` on one recording; residuals are measured minus predicted, (m, n).
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StaticValidation(Validation):
+    """Errors of a model on poses.
 
-    `measured` (m, n) is False where an effort is no holding torque.
+    Attributes:
+        joints: in the arm's order.
+        poses: their number.
+        residuals: (m, n) measured minus predicted efforts, in the recording's coordinates [N m; N].
+        doubts: measurements that the verdicts leave out, and why.
+        measured: (m, n) False where an effort is no holding torque.
     """
 
     joints: list[JointError]
@@ -54,10 +60,15 @@ class Validation:
         """Verdict on each joint."""
         return {joint.name: joint.verdict for joint in self.joints}
 
+    @property
+    def relative_errors(self) -> dict[str, float | None]:
+        """RMS error / RMS effort of each joint, without outliers [1]; None where nothing was measured."""
+        return {joint.name: joint.relative_error_undoubted for joint in self.joints}
+
     def as_dict(self) -> dict:
-        """What `validate --json` writes."""
+        """Returns what `validate --json` writes."""
         return {
-            "verdict": worst(self.verdicts)[0],
+            "verdict": self.verdict,
             "rule": rule_text(in_motion=False),
             "joints": [asdict(joint) for joint in self.joints],
             "poses": self.poses,
@@ -65,7 +76,7 @@ class Validation:
         }
 
 
-def predict(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
+def predict_static(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
     """Holding torques (m, n) at the recording's poses, in the recording's own coordinates.
 
     Raises:
@@ -80,9 +91,9 @@ def predict(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]
     return tau
 
 
-def validate(
+def validate_static(
     model: IdentifiedModel, recording: Recording, measured_joints: NDArray[np.bool_] | None = None
-) -> Validation:
+) -> StaticValidation:
     """Compares a model with a recording.
 
     Args:
@@ -95,7 +106,7 @@ def validate(
     """
     arm = model.load_arm()
     measured = recording.measured_effort()
-    predicted = predict(model, recording)
+    predicted = predict_static(model, recording)
     residuals = measured - predicted
     in_joints = recording.in_joint_coordinates(arm)
     if measured_joints is None:
@@ -108,7 +119,15 @@ def validate(
         usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
     commanded = np.any(predicted != 0, axis=0)
     errors = _joint_errors(arm, measured, residuals, measured_joints, usable, commanded)
-    return Validation(errors, len(recording), residuals, doubts, measured_joints)
+    return StaticValidation(
+        model=model,
+        recording=recording,
+        joints=errors,
+        poses=len(recording),
+        residuals=residuals,
+        doubts=doubts,
+        measured=measured_joints,
+    )
 
 
 def _joint_errors(

@@ -15,7 +15,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, VectorLogSink
 
 from dvrk_drake.analysis.static.static_identification import StaticIdentification, identify_static
-from dvrk_drake.analysis.static.validation import Validation, validate
+from dvrk_drake.analysis.static.validation import StaticValidation, validate_static
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError
 from dvrk_drake.experiments.ground_truth import collect_static_poses, damped_station, perturbed_links, with_links
@@ -26,7 +26,7 @@ from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.arm_view import framing, start_meshcat
+from dvrk_drake.systems.arm_view import start_meshcat
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
@@ -118,8 +118,8 @@ class DemoResult:
 
     arm: Arm
     identification: StaticIdentification
-    fresh: Validation
-    fresh_paper: Validation
+    fresh: StaticValidation
+    fresh_paper: StaticValidation
     release_time: NDArray[np.float64]
     released: NDArray[np.float64]
     released_as_drawn: NDArray[np.float64]
@@ -185,14 +185,14 @@ def _run_demo(
     model.save(output / "model.yaml")
     fresh_poses = collect(FRESH_POSES, "collecting fresh poses")
     write_recording(fresh_poses, output / "fresh_poses.csv")
-    fresh = validate(model, fresh_poses)
+    fresh = validate_static(model, fresh_poses)
     paper_model = identify_static(poses, arm, "paper").model
-    fresh_paper = validate(paper_model, fresh_poses)
+    fresh_paper = validate_static(paper_model, fresh_poses)
 
     def third(index: int) -> Callable[[float], None]:
         return lambda share: progress("releasing and holding", (index + share) / 3)
 
-    meshcat = start_meshcat(*framing(arm))
+    meshcat = start_meshcat(arm)
     t, released = _release(station(meshcat), model, plan, meshcat, third(0))
     with atomic_write(output / "arm.html") as stream:
         stream.write(meshcat.StaticHtml())
@@ -230,7 +230,7 @@ def _closed_loop(
     log = LogVectorOutput(station.GetOutputPort(f"{station.arm.name.lower()}.state_true"), builder, SAMPLE_PERIOD)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    station.set_positions(context, q_start)
+    station.SetPositions(context, q_start)
     return simulator, log, controller, desired
 
 

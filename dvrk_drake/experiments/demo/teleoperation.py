@@ -81,8 +81,8 @@ def play_teleoperation(
     builder = DiagramBuilder()
     arms = builder.AddSystem(_make_arms(meshcat))
     start = arms.CreateDefaultContext()
-    arms.set_positions(start, START_MASTER, START_FOLLOWER)
-    hand = builder.AddSystem(PoseTrajectorySource(_hand_motion(arms.X_MG(start))))
+    arms.SetPositions(start, START_MASTER, START_FOLLOWER)
+    hand = builder.AddSystem(PoseTrajectorySource(_hand_motion(arms.CalcX_MG(start))))
     switches = [0.0, *np.ravel(ENGAGED)]
     clutch = builder.AddSystem(
         TrajectorySource(PiecewisePolynomial.ZeroOrderHold(switches, np.arange(len(switches))[None] % 2))
@@ -92,15 +92,15 @@ def play_teleoperation(
         builder.Connect(source.get_output_port(), arms.GetInputPort(port))
     simulator = Simulator(builder.Build())
     context = arms.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    arms.set_positions(context, START_MASTER, START_FOLLOWER)
+    arms.SetPositions(context, START_MASTER, START_FOLLOWER)
 
     samples = _Samples([], [], [])
     with recorded_in(meshcat, frames_per_second=32):
         for t in np.arange(round(duration / PERIOD) + 1) * PERIOD:
             simulator.AdvanceTo(t)
             samples.following.append(bool(arms.GetOutputPort("following").Eval(context)[0]))
-            samples.X_MG.append(arms.X_MG(context))
-            samples.X_FT.append(arms.X_FT(context))
+            samples.X_MG.append(arms.CalcX_MG(context))
+            samples.X_FT.append(arms.CalcX_FT(context))
             progress(t / duration)
     if meshcat is not None:
         _draw_paths(meshcat, samples)
@@ -115,8 +115,8 @@ def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
     arms = _make_arms(meshcat)
     simulator = Simulator(arms)
     context = simulator.get_mutable_context()
-    arms.set_positions(context, START_MASTER, START_FOLLOWER)
-    X_MG0 = arms.X_MG(context)
+    arms.SetPositions(context, START_MASTER, START_FOLLOWER)
+    X_MG0 = arms.CalcX_MG(context)
     reach = np.array([0.8, 0.8, 0.8, 0.12, 0.12, 0.12])
     sliders = MeshcatPoseSliders(
         meshcat, lower_limit=-reach, upper_limit=reach, step=np.repeat([0.01, 0.002], 3), prefix="hand"

@@ -79,7 +79,7 @@ def release(case: Release) -> NDArray[np.float64]:
     log = LogVectorOutput(station.GetOutputPort(f"{name}.state_true"), builder, SAMPLE_PERIOD)
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
-    station.set_positions(station.GetMyMutableContextFromRoot(context), way.value(0.0).ravel())
+    station.SetPositions(station.GetMyMutableContextFromRoot(context), way.value(0.0).ravel())
     before = 0.0
     if case.led:
         before = LEADING + RESTING

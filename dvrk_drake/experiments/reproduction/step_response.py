@@ -97,7 +97,7 @@ def simulate_ours(true_arm: Arm, model: IdentifiedModel, duration: float) -> NDA
     log = LogVectorOutput(station.GetOutputPort(f"{PAPER_ARM}.state_true"), builder, PERIOD)
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
-    station.set_positions(station.GetMyMutableContextFromRoot(context), published.FIGURE_7_START)
+    station.SetPositions(station.GetMyMutableContextFromRoot(context), published.FIGURE_7_START)
     simulator.AdvanceTo(duration)
     return samples(log, simulator)[:, : arm.num_joints]
 

@@ -20,7 +20,7 @@ from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, per_actuator
-from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
@@ -167,7 +167,7 @@ class Bench:
         believed = condition.inertia / condition.gravity
         self._station = ArmStation(
             arm,
-            time_step=PERIOD,
+            plant_config=arm_plant_config(PERIOD),
             effects=_later(arm.effects, condition.ticks),
             modify_plant=lambda plant: _scale_rotors(plant, condition.inertia),
         )
@@ -188,8 +188,8 @@ class Bench:
         root = self._diagram.CreateDefaultContext()
         station = self._station.GetMyMutableContextFromRoot(root)
         controller = self._controller.GetMyMutableContextFromRoot(root)
-        self._station.set_link_inertias(station, self._inertias)
-        self._station.set_positions(station, q)
+        self._station.SetLinkInertias(station, self._inertias)
+        self._station.SetPositions(station, q)
         self._controller.SetGains(controller, gains)
         desired = np.concatenate([q_desired, np.zeros(self.arm.num_joints)])
         self._controller.GetInputPort("desired_state").FixValue(controller, desired)

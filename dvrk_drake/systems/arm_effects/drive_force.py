@@ -9,13 +9,13 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_fault
+from dvrk_drake.dynamics.codegen import entry_point
 from dvrk_drake.dynamics.static_model import compile_effect_torque
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import POSITION_KINDS, ArmEffects
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 from dvrk_drake.systems.arm_effects.motors import Motors, motor_effort_into
-from dvrk_drake.systems.gravity_pid_step import entry_point
 
 
 class DriveForce(LeafSystem):

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
 
 from dvrk_drake.dynamics.actuator_effects import effect_step
+from dvrk_drake.dynamics.codegen import entry_point
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 from dvrk_drake.systems.arm_effects.motors import in_steps
-from dvrk_drake.systems.gravity_pid_step import entry_point
 
 
 class DriveStep(LeafSystem):
@@ -44,7 +44,7 @@ class DriveStep(LeafSystem):
     **Encoders.** A position of an actuator is a whole number of counts; joints follow by the transmission. The velocity
     is the difference of two readings over the time step h, low-passed to first order: with a = exp(-2 pi f h),
     y[k] = a y[k-1] + (1 - a) (x[k] - x[k-1]) / h. Without an encoder, position and velocity are exact. The arm is taken
-    to have rested before it starts: where `set_at_rest` says, or where it is at initialization. With a delay, what is
+    to have rested before it starts: where `SetAtRest` says, or where it is at initialization. With a delay, what is
     out during initialization itself is the former.
     """
 
@@ -102,7 +102,7 @@ class DriveStep(LeafSystem):
         state = self.EvalVectorInput(context, 0).get_value()
         self._measure_into(state, *self._maps, self._constants, memory, output.get_mutable_value())
 
-    def set_at_rest(self, context: Context, q: NDArray[np.float64]) -> None:
+    def SetAtRest(self, context: Context, q: NDArray[np.float64]) -> None:
         """What has been measured of an arm that rested at q (n,) until now; in this system's context."""
         for group, value in zip((_OUT, _MEMORY), self._at_rest(q), strict=True):
             context.SetDiscreteState(group, value)

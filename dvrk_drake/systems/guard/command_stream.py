@@ -7,10 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.systems.guard.limits import Vector
-
-#: No joint is there, that fast or that strong [rad, m, rad/s, m/s, N m, N].
-ABSURD = 1e6
 
 #: Refusals of messages that do not belong to the session or to the sender in command. They are counted separately.
 FOREIGN = frozenset(
@@ -43,7 +41,7 @@ def is_finite(numbers: list[float]) -> bool:
 
     A list, since numpy takes longer for a few numbers and warns of an overflow.
     """
-    return sum(map(abs, numbers)) < ABSURD
+    return sum(map(abs, numbers)) < IMPLAUSIBLE
 
 
 def foreign_refusal(command: lcmt_dvrk_command | None, arm_name: str, num_joints: int, session_id: int) -> int:

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.check.recording_check import check_for_identification, check_recording
+from dvrk_drake.analysis.check.recording_check import check, check_recording
 from dvrk_drake.cli import main
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import holding_torques
@@ -66,7 +66,7 @@ def test_what_identify_takes_passes(tmp_path, capsys):
     for recording in (poses(8), motion(6, 100)):
         write_recording(recording, path)
         assert main(["check", path, "--arm", "mtmr"]) == 0, capsys.readouterr().out
-        assert not check_for_identification(read_recording(path, ARM), ARM).refusals
+        assert not check(read_recording(path, ARM), ARM).refusals
 
 
 def test_few_poses_may_still_validate_a_model():
@@ -83,8 +83,8 @@ def test_rests_of_a_motion_are_judged_as_poses():
     recording = with_efforts(q, t=np.arange(len(q)) / 100)
     friction = 0.05 * ARM.effort_limits * np.tanh(np.gradient(q, 0.01, axis=0) / 0.05)
     recording = replace(recording, tau=recording.measured_effort() + friction)
-    assert not check_for_identification(recording, ARM).refusals
-    (refusal,) = check_for_identification(with_sign(recording, 2), ARM).refusals
+    assert not check(recording, ARM).refusals
+    (refusal,) = check(with_sign(recording, 2), ARM).refusals
     assert (refusal.kind, refusal.joints) == ("effort sign", (2,))
 
 
@@ -98,8 +98,8 @@ def test_one_wrong_sign_is_refused_and_its_joint_named(name, joint, coordinates)
     recording = replace(recording, tau=recording.measured_effort() + friction)
     if coordinates == "actuator":
         recording = recording.in_actuator_coordinates(arm)
-    assert not check_for_identification(recording, arm).refusals
-    (refusal,) = check_for_identification(with_sign(recording, joint), arm).refusals
+    assert not check(recording, arm).refusals
+    (refusal,) = check(with_sign(recording, joint), arm).refusals
     assert (refusal.kind, refusal.where, refusal.joints) == ("effort sign", arm.joint_names[joint], (joint,))
 
 
@@ -109,14 +109,14 @@ def test_a_spring_or_a_small_gravity_is_no_wrong_sign():
     tau = recording.measured_effort().copy()
     tau[:, 1] -= 3 * np.mean(tau[:, 1])
     tau[:, 5] *= -1
-    assert not check_for_identification(replace(recording, tau=tau), ARM).refusals
+    assert not check(replace(recording, tau=tau), ARM).refusals
 
 
 @pytest.mark.parametrize("name", ["mtm_2015_good72", "mtm_2015_apr18_all80", "mtmr_2017_sweep40"])
 def test_a_wrong_sign_in_real_poses_is_refused(name, shared_data):
     recording = read_recording(shared_data / "mtm_static" / f"{name}.csv", ARM)
     for joint in (1, 2):
-        (refusal,) = check_for_identification(with_sign(recording, joint), ARM).refusals
+        (refusal,) = check(with_sign(recording, joint), ARM).refusals
         assert refusal.joints == (joint,)
 
 
@@ -126,6 +126,6 @@ def test_real_recordings_pass(shared_data):
         arm = load_arm("psm" if path.name.startswith("psm") else "mtmr")
         recording = read_recording(path, arm, "actuator" if path.parent.name == "trajectories" else "joint")
         if recording.tau is not None:
-            assert not check_for_identification(recording, arm).refusals, path.name
+            assert not check(recording, arm).refusals, path.name
             checked += 1
     assert checked == 9

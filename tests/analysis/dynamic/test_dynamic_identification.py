@@ -18,7 +18,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.recording import Recording, write_recording
-from dvrk_drake.reports.dynamic_identification import print_dynamics
+from dvrk_drake.reports.identification import print_dynamics
 from dvrk_drake.reports.terminal_tables import TABLE_WIDTH
 
 NOISE = 0.05

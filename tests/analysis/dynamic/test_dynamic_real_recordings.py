@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.dynamic.validation import validate_motion
-from dvrk_drake.analysis.recalibration import recalibrate
+from dvrk_drake.analysis.recalibration import refit_friction
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import load_arm
@@ -151,7 +151,7 @@ def test_a_third_of_another_day_recalibrates_the_rest_of_it(another_day):
             whole, q=whole.q[rows], qd=whole.qd[rows], tau=whole.tau[rows], t=whole.t[rows], lines=None
         )
 
-    result = recalibrate(model, part(slice(None, third)))
+    result = refit_friction(model, part(slice(None, third)))
     before, after = errors(model, part(slice(third, None))), errors(result.model, part(slice(third, None)))
     assert np.all(before[3:] > 0.2) and np.all(after[3:] < 0.2)
     assert np.all(after < before + 0.005)

@@ -9,7 +9,7 @@ from loaded_arm import two_days
 from pydrake.multibody.tree import MultibodyForces
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.payload.payload import as_good, estimate_payload
+from dvrk_drake.analysis.payload.payload import as_good, better_link_warnings, estimate_payload
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -19,7 +19,7 @@ from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.recordings.recording import Recording, read_recording, write_recording
-from dvrk_drake.reports.payload import describe_better_links, print_payload
+from dvrk_drake.reports.payload import print_payload
 from dvrk_drake.reports.terminal_tables import make_console
 
 pytestmark = pytest.mark.slow
@@ -130,8 +130,8 @@ def assert_end_link_explains(estimates, capsys):
     by_link = {payload.link: payload for payload in estimates}
     wrong = [by_link["insertion_link"], by_link["bottom_bar_link"]]
     for payload in wrong:
-        warning = describe_better_links(payload, estimates)
-        assert warning.startswith(f"{payload.link} does not explain the change best") and "on end_link" in warning
+        (warning,) = map(str, better_link_warnings(payload, estimates))
+        assert f"{payload.link}: does not explain the change best" in warning and "on end_link" in warning
         assert "\n" not in warning and "--link end_link" in warning
         assert payload.as_dict(estimates)["better_links"][0] == "end_link"
         print_payload(make_console(), payload, estimates)
@@ -140,7 +140,7 @@ def assert_end_link_explains(estimates, capsys):
         assert payload.found or "A payload on end_link explains the change" in printed
     assert not wrong[0].found and wrong[0].as_dict(estimates)["largest_at_com"] is None
     end = by_link["end_link"]
-    assert describe_better_links(end, estimates) is None and end.as_dict(estimates)["better_links"] == []
+    assert not better_link_warnings(end, estimates) and end.as_dict(estimates)["better_links"] == []
 
 
 LINKS = ["insertion_link", "bottom_bar_link", "end_link"]
@@ -156,7 +156,7 @@ def test_without_payload_no_link_is_better():
     model, reference, other = two_days("psm", "end_link", 0.0, [0.0, 0.0, 0.0], 0)
     estimates = estimate_payload(reference, other, model, LINKS)
     for payload in estimates:
-        assert describe_better_links(payload, estimates) is None
+        assert not better_link_warnings(payload, estimates)
         assert payload.as_dict(estimates)["largest_at_com"] > 0
 
 
@@ -212,7 +212,7 @@ def test_a_named_link_is_compared_with_all_others(tmp_path, capsys):
     command = ["payload", *paths, "--model", str(tmp_path / "model.yaml"), "--link"]
     assert main([*command, "insertion_link"]) == 0
     said = capsys.readouterr()
-    assert said.err.startswith("dvrk-drake: warning: insertion_link does not explain the change best")
+    assert said.err.startswith("dvrk-drake: warning: insertion_link: does not explain the change best")
     assert said.err.count("\n") == 1 and "end_link" in said.err
     assert "Where the payload may be" in said.out and "below" not in said.out
     assert main([*command, link]) == 0

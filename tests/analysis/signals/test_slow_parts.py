@@ -8,7 +8,7 @@ from rests import RATE, motion_with_rests
 
 from dvrk_drake.analysis.signals.static_segments import SAME_REST, find_poses, rest_poses, slow_parts
 from dvrk_drake.analysis.static.static_identification import LEAST_POSES, identify_static
-from dvrk_drake.analysis.static.validation import validate
+from dvrk_drake.analysis.static.validation import validate_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError, RecordingError
@@ -149,7 +149,7 @@ def test_a_real_excitation_motion_is_no_recording_of_poses(arm, real_parts):
         assert measured[:, 0].sum() == 0
         assert model.joints[0].trust == model.joints[2].trust == 0.0
         assert np.all(model.holding_torque(np.array([0.5, 0.4, 0.1, 0, 0, 0, 0]))[[0, 2]] == 0.0)
-        for joint in validate(model, real_parts[other][1].recording, real_parts[other][1].measured).joints:
+        for joint in validate_static(model, real_parts[other][1].recording, real_parts[other][1].measured).joints:
             assert joint.rms_error_undoubted <= joint.rms_torque_undoubted + 1e-12, (name, joint.name)
 
 

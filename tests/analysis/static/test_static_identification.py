@@ -9,7 +9,7 @@ import pytest
 from dvrk_drake.analysis.static.doubts import find_doubts
 from dvrk_drake.analysis.static.linear_fit import robust_fit, weighted_fit
 from dvrk_drake.analysis.static.static_identification import identify_static
-from dvrk_drake.analysis.static.validation import predict, validate
+from dvrk_drake.analysis.static.validation import predict_static, validate_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.static_model import compile_static_model
@@ -55,7 +55,7 @@ def test_robust_method_recovers_parameters_and_finds_the_effects(arm):
     assert found[effects[0]] == pytest.approx(0.05, abs=0.004)
     assert found[effects[1]] == pytest.approx(-0.05, abs=0.002)
     fresh, _ = simulated(arm, poses=200, seed=9, effects=effects, coefficients=(0.05, -0.05))
-    errors = validate(model, fresh).joints
+    errors = validate_static(model, fresh).joints
     for error, limit in zip(errors[1:6], arm.effort_limits[1:6], strict=True):
         assert error.rms_error < 0.005 * limit, error
     assert all(error.rms_error <= error.rms_torque for error in errors)
@@ -138,7 +138,7 @@ def test_pure_friction_hardly_makes_a_joint_worse_than_zero_torque(arm):
             return dataclasses.replace(recording, tau=tau)
 
         model = identify_static(with_friction(simulated(arm, seed=seed)[0]), arm).model
-        errors = validate(model, with_friction(simulated(arm, poses=200, seed=100 + seed)[0])).joints
+        errors = validate_static(model, with_friction(simulated(arm, poses=200, seed=100 + seed)[0])).joints
         ratios.append([e.rms_error / e.rms_torque for e in errors[3:]])
     assert np.mean(ratios) < 1.03
     assert np.max(ratios) < 1.2
@@ -155,7 +155,9 @@ def test_actuator_coordinates_give_the_same_model(arm):
     model = identify_static(recording, arm, "paper").model
     np.testing.assert_allclose(identify_static(actuator, arm, "paper").model.theta, model.theta, atol=1e-12)
     np.testing.assert_allclose(
-        arm.transmission.pull_back_effort(predict(model, actuator)), model.holding_torque(recording.q), atol=1e-12
+        arm.transmission.pull_back_effort(predict_static(model, actuator)),
+        model.holding_torque(recording.q),
+        atol=1e-12,
     )
 
 
@@ -198,7 +200,7 @@ def test_a_joint_that_did_not_move_gets_no_torque(arm):
     result = identify_static(Recording(q=q, tau=tau, source="fixed wrist"), arm).model
     assert np.all(result.trust[3:] == 0.0)
     fresh, _ = simulated(arm, poses=100, seed=3)
-    for error in validate(result, fresh).joints:
+    for error in validate_static(result, fresh).joints:
         assert error.rms_error <= error.rms_torque, error
 
 
@@ -297,7 +299,7 @@ def test_default_method_beats_the_paper_on_left_out_poses(arm, shared_data):
 
 def test_another_day_of_the_same_arm_is_predicted_better_than_by_zero_torque(arm, shared_data):
     model = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_good72.csv"), arm).model
-    other = validate(model, read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"))
+    other = validate_static(model, read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"))
     for joint in other.joints:
         assert joint.rms_error_undoubted <= joint.rms_torque_undoubted, joint
 

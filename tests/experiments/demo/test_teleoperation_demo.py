@@ -56,7 +56,7 @@ def test_live_scene_obeys_its_sliders_and_buttons(monkeypatch):
             arms = self.get_system()
             self.set_target_realtime_rate(0.0)
             for due in [due for due in plan if due <= time]:
-                tips[due] = arms.X_FT(self.get_context()).translation()
+                tips[due] = arms.CalcX_FT(self.get_context()).translation()
                 plan.pop(due)()
             super().AdvanceTo(time)
 

@@ -133,14 +133,14 @@ def test_a_controller_sees_the_arm_before_the_step_of_its_command(effects):
     add_closed_loop(builder, station, controller)
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    station.set_positions(context, np.full(7, 0.3))
+    station.SetPositions(context, np.full(7, 0.3))
     station.GetInputPort("mtml.effort_disturbance").FixValue(context, 0.2 * arm.effort_limits)
     simulator.Initialize()
     port, own = controller.GetOutputPort("effort"), controller.GetMyContextFromRoot(simulator.get_context())
     for k in range(1, 30):
-        before = station.get_positions(context)
+        before = station.GetPositions(context)
         simulator.AdvanceTo(k * STEP)
-        now = station.get_positions(context)
+        now = station.GetPositions(context)
         limited = [np.clip(model.holding_torque(q), -arm.effort_limits, arm.effort_limits) for q in (before, now)]
         np.testing.assert_allclose(port.Eval(own), limited[0], atol=1e-12)
     assert np.abs(limited[1] - limited[0]).max() > 1e-6

@@ -89,8 +89,6 @@ def test_a_coordinate_that_is_none_is_refused():
     nowhere = ArmEffects(friction=[FrictionEffect("actuator.elbow", "presliding", 0.01, 0.1)])
     with pytest.raises(StationError, match=r'coordinate is "actuator\.elbow"; allowed: actuator\.outer_yaw'):
         ArmStation(arm, effects=nowhere)
-    with pytest.raises(StationError, match="effects are of a simulation"):
-        ArmStation(arm, hardware=True, effects=arm.effects)
 
 
 def test_no_sdf_has_friction_tags():

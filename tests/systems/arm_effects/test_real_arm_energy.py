@@ -41,7 +41,7 @@ class HeldArm:
         self.simulator = Simulator(diagram)
         root = self.simulator.get_mutable_context()
         self.context = self.station.GetMyMutableContextFromRoot(root)
-        self.station.set_positions(self.context, middle(self.arm))
+        self.station.SetPositions(self.context, middle(self.arm))
         self.frame = ArmFrame(self.arm, HANDLES[name])
         self.start = self.wanted = self.X_BG
         self.port = diagram.GetInputPort("wanted").FixValue(root, AbstractValue.Make(self.wanted))
@@ -51,7 +51,7 @@ class HeldArm:
 
     @property
     def q(self):
-        return self.station.get_positions(self.context)
+        return self.station.GetPositions(self.context)
 
     @property
     def X_BG(self):

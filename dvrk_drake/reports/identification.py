@@ -1,4 +1,4 @@
-"""Tables and figures of dynamic identifications and recalibrations."""
+"""Identified models, recalibrations and their errors on recordings: tables in a terminal, and figures of efforts."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from rich.markup import escape
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification
 from dvrk_drake.analysis.dynamic.estimates import DRY_KINDS, LEAST_TOLD
-from dvrk_drake.analysis.dynamic.validation import DynamicValidation
+from dvrk_drake.analysis.dynamic.validation import DynamicValidation, validate_motion
 from dvrk_drake.analysis.recalibration import FOLDS, Recalibration
+from dvrk_drake.analysis.results import Identification, Validation
+from dvrk_drake.analysis.static.static_identification import StaticIdentification
+from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS
 from dvrk_drake.dynamics.dynamic_section import (
     ActuatorEffectEstimate,
@@ -23,11 +26,74 @@ from dvrk_drake.dynamics.dynamic_section import (
 )
 from dvrk_drake.dynamics.physical_consistency import total_mass_reached
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.reports.figures import MEASURED_COLOUR, MODEL_COLOUR, ZERO_COLOUR, save_figure
-from dvrk_drake.reports.terminal_tables import VERDICT_STYLES, make_table, print_rule, print_verdict
+from dvrk_drake.reports.figures import (
+    MEASURED_COLOUR,
+    MODEL_COLOUR,
+    ZERO_COLOUR,
+    plot_static_identification,
+    plot_static_validation,
+    save_figure,
+)
+from dvrk_drake.reports.terminal_tables import (
+    VERDICT_STYLES,
+    make_table,
+    print_doubts,
+    print_model,
+    print_rule,
+    print_static_validation,
+    print_verdict,
+)
 
 #: On a screen: base parameters of more than so many standard errors, so many pairs, so many effects beside friction.
 SHOWN_BEYOND, SHOWN_PAIRS, SHOWN_EFFECTS = 10.0, 5, 10
+
+
+def print_identification(console: Console, result: Identification, full: bool = False) -> None:
+    """Prints parameters, effects and errors.
+
+    Args:
+        console: to print to.
+        result: of poses or of a motion.
+        full: print every parameter, and nothing but the model.
+    """
+    if isinstance(result, DynamicIdentification):
+        print_dynamics(console, result, full)
+    elif isinstance(result, StaticIdentification):
+        if not full:
+            print_doubts(console, result.doubts)
+        print_model(console, result.model)
+        if not full and len(result.recording) < result.num_rows:
+            console.print(
+                f"{result.num_rows} rows are {len(result.recording)} distinct poses; samples of a pose are averaged"
+            )
+
+
+def print_validation(console: Console, validation: Validation) -> None:
+    """Prints verdicts and errors on poses or on a motion."""
+    if isinstance(validation, DynamicValidation):
+        print_dynamic_validation(console, validation)
+    elif isinstance(validation, StaticValidation):
+        print_static_validation(console, validation)
+        print_doubts(console, validation.doubts)
+
+
+def plot_identification(folder: Path, result: Identification) -> None:
+    """Writes PNGs of fitted and predicted efforts; a motion's as `plot_motion`."""
+    if isinstance(result, DynamicIdentification):
+        fit = validate_motion(result.model, result.recording)
+        arm = result.model.load_arm()
+        plot_motion(folder, arm, fit, f"{arm.name}, fitted to {Path(result.recording.source).name}")
+    elif isinstance(result, StaticIdentification):
+        plot_static_identification(folder, result)
+
+
+def plot_validation(folder: Path, validation: Validation) -> None:
+    """Writes PNGs of errors; a motion's as `plot_motion`."""
+    if isinstance(validation, DynamicValidation):
+        arm = validation.model.load_arm()
+        plot_motion(folder, arm, validation, f"{arm.name}, {Path(validation.recording.source).name}")
+    elif isinstance(validation, StaticValidation):
+        plot_static_validation(folder, validation)
 
 
 def print_dynamics(console: Console, result: DynamicIdentification, full: bool = False) -> None:

@@ -1,0 +1,94 @@
+"""Identification of an arm's model from a recording, whether it is one of poses or of a motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.check.recording_check import require_usable
+from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, identify_dynamic
+from dvrk_drake.analysis.signals.static_segments import find_poses
+from dvrk_drake.analysis.static.static_identification import Method, StaticIdentification, identify_static
+from dvrk_drake.analysis.verdict import unexplained_effort
+from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.progress import Progress, step_progress
+from dvrk_drake.recordings.recording import Recording
+
+
+def identify(
+    recording: Recording,
+    arm: Arm,
+    *,
+    method: Method = "robust",
+    slow_parts: bool = False,
+    progress: Progress | None = None,
+) -> StaticIdentification | DynamicIdentification:
+    """Checks a recording and identifies the arm's model from it: what `dvrk-drake identify` does.
+
+    A recording of poses gives a static model: gravity, cables and springs, which hold the arm at rest. So does a motion
+    in which the arm rests often enough. A motion without rests gives the full dynamics: inertial parameters that are
+    physically consistent, rotors and friction.
+
+    Args:
+        recording: poses with efforts (m, n), or a motion with times and efforts, in joint or actuator coordinates.
+        arm: which was recorded, mounted as it was: see `Arm.with_gravity`.
+        method: for poses: "robust", or "paper" for the least squares of Rutfield et al. (2015).
+        slow_parts: take the low-speed segments of a motion without rests as poses.
+        progress: called with the step, "checking the recording" or "identifying", and its finished share 0..1.
+
+    Returns:
+        The model as `model`, the prepared recording as `recording`, warnings as `warnings`, and what tables and figures
+        show; `save` writes the model file.
+
+    Raises:
+        RecordingError: the recording does not fit the arm, or `check` refuses it: see `findings` of the error.
+        IdentificationError: the recording does not determine a model.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> arm = dvrk.load_arm("mtmr")
+        >>> generator = np.random.default_rng(0)
+        >>> q = arm.sample_poses(40, generator)
+        >>> tau = dvrk.IdentifiedModel.from_arm(arm).holding_torque(q)
+        >>> tau += 0.003 * arm.effort_limits * generator.normal(size=q.shape)
+        >>> result = dvrk.identify(dvrk.Recording(q=q, tau=tau), arm)
+        >>> len(result.model.base_parameters), len(result.model.joints)
+        (12, 7)
+        >>> for warning in result.warnings:
+        ...     print(warning)
+        >>> result.save("model.yaml")
+    """
+    poses = find_poses(recording, arm, slow_parts)
+    report = require_usable(poses.recording, arm, progress, channels=True)
+    share = step_progress(progress, "identifying")
+    try:
+        if poses.moves:
+            motion = identify_dynamic(poses.recording, arm, share)
+            return replace(motion, warnings=(*report.warnings, *_unexplained(motion)))
+        static = identify_static(poses.recording, arm, method, share, poses.measured)
+    except DvrkDrakeError as error:
+        error.findings = report.warnings
+        raise
+    warnings = (*report.warnings, *_friction_in_segments(static, poses.measured))
+    return replace(static, warnings=warnings, note=poses.note, num_rows=len(poses.recording))
+
+
+def _unexplained(result: DynamicIdentification) -> tuple[Finding, ...]:
+    actuators = result.model.dynamic_model.section.actuators
+    return unexplained_effort({a.name: a.rms_cross_validation / a.rms_effort for a in actuators if a.rms_effort > 0})
+
+
+def _friction_in_segments(result: StaticIdentification, measured: NDArray[np.bool_] | None) -> tuple[Finding, ...]:
+    commanded = [joint.name for joint in result.model.joints if joint.trust > 0]
+    if measured is None or not commanded:
+        return ()
+    what = (
+        "friction in low-speed segments can look like gravity, also in the ten-fold error; the torque on "
+        f"{', '.join(commanded)} may be worse than zero torque elsewhere"
+    )
+    advice = "validate the model on static poses before it commands an arm"
+    return (Finding("warning", "low-speed segments", result.recording.source or "recording", what, advice),)

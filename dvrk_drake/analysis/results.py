@@ -1,0 +1,126 @@
+"""What the results of identification, validation and prediction have in common, for poses and for motions."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.verdict import Requirement, unfit, worst
+from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary, Verdict
+from dvrk_drake.errors import ModelError
+from dvrk_drake.models.files import refuse_existing
+from dvrk_drake.recordings.recording import Recording
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Identification:
+    """Result of `identify`: a `StaticIdentification` or a `DynamicIdentification`.
+
+    Attributes:
+        model: the identified model.
+        recording: the prepared recording: distinct poses in joint coordinates, or the motion as recorded.
+        warnings: what makes the model less reliable, found in the recording or in the fit; `str` of each is one line.
+        note: which rows were taken as poses, or "".
+        num_rows: of the recording, or of the poses that were found in it; repeated poses are averaged.
+    """
+
+    model: IdentifiedModel
+    recording: Recording
+    warnings: tuple[Finding, ...] = ()
+    note: str = ""
+    num_rows: int = 0
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Writes the model file, at once or not at all.
+
+        Args:
+            path: the YAML file to write.
+            overwrite: replace an existing file.
+
+        Raises:
+            DvrkDrakeError: the file exists, or cannot be written.
+        """
+        refuse_existing(path, overwrite)
+        self.model.save(path)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Validation(ABC):
+    """Result of `validate`: a `StaticValidation` or a `DynamicValidation`.
+
+    Attributes:
+        model: which was compared.
+        recording: which it was compared with, as prepared: poses, or the motion as recorded.
+        warnings: what the errors do not show, found in the recording or in the comparison; `str` of each is one line.
+        note: which rows were taken as poses, or "".
+    """
+
+    model: IdentifiedModel
+    recording: Recording
+    warnings: tuple[Finding, ...] = ()
+    note: str = ""
+
+    @property
+    @abstractmethod
+    def verdicts(self) -> dict[str, Verdict]:
+        """Verdict on each joint, see `dvrk_drake.analysis.verdict`."""
+
+    @property
+    @abstractmethod
+    def relative_errors(self) -> dict[str, float | None]:
+        """RMS error / RMS effort of each joint, without outliers [1]; None where nothing was measured."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """The least favourable of the verdicts."""
+        return worst(self.verdicts)[0]
+
+    @abstractmethod
+    def as_dict(self) -> dict:
+        """Returns what `validate --json` writes."""
+
+    def unfit(self, required: Requirement) -> list[str]:
+        """Returns the joints whose verdict is worse than "good" or "usable", each with its verdict."""
+        return unfit(self.verdicts, required)
+
+    @property
+    def of_same_recording(self) -> bool:
+        """Whether the model was identified from this recording, so that the errors are those of the fit."""
+        return bool(self.recording.sha256) and self.recording.sha256 == self.model.provenance.sha256
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Writes the model with these verdicts; `dvrk-drake run` warns of a model without them.
+
+        Args:
+            path: the model file; an existing one is replaced.
+            overwrite: replace verdicts that the model has from another recording.
+
+        Raises:
+            ModelError: the model was identified from this recording, or has verdicts already.
+        """
+        source = self.recording.source or "recording"
+        if self.of_same_recording:
+            raise ModelError(f"{source}: verdicts need a recording that the model was not identified from")
+        if self.model.validation is not None and not overwrite:
+            saved = self.model.validation.recording
+            raise ModelError(f"{path}: has verdicts from {saved} already; replace them with overwrite=True")
+        summary = ValidationSummary(self.recording.source, self.recording.sha256, dict(self.verdicts))
+        replace(self.model, validation=summary).save(path)
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Result of `predict`.
+
+    Attributes:
+        tau: (m, n) efforts at the rows of the recording, in its coordinates [N m; N].
+        warnings: what `check` found in the recording; `str` of each is one line.
+    """
+
+    tau: NDArray[np.float64]
+    warnings: tuple[Finding, ...] = ()

@@ -1,0 +1,110 @@
+"""Comparison of a model with a recording that it was not identified from, and efforts that a model predicts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.check.recording_check import require_usable
+from dvrk_drake.analysis.dynamic.validation import DynamicValidation, predict_motion, validate_motion
+from dvrk_drake.analysis.results import Prediction
+from dvrk_drake.analysis.signals.static_segments import find_poses
+from dvrk_drake.analysis.static.validation import StaticValidation, predict_static, validate_static
+from dvrk_drake.analysis.verdict import unexplained_effort
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.progress import Progress, step_progress
+from dvrk_drake.recordings.recording import Recording
+
+
+def validate(
+    model: IdentifiedModel, recording: Recording, *, slow_parts: bool = False, progress: Progress | None = None
+) -> StaticValidation | DynamicValidation:
+    """Compares a model's efforts with those of a recording: what `dvrk-drake validate` does.
+
+    A motion is compared behind the low-pass of the model's identification if the model has dynamics; otherwise, and for
+    poses, holding torques are compared.
+
+    Args:
+        model: from `identify`, or `IdentifiedModel.load`.
+        recording: poses or a motion with efforts (m, n), which the model was not identified from.
+        slow_parts: take the low-speed segments of a motion without rests as poses.
+        progress: called with the step, "checking the recording" or "validating", and its finished share 0..1.
+
+    Returns:
+        `verdict`, `verdicts` and `relative_errors` of the joints, `warnings`, and the errors in detail.
+
+    Raises:
+        RecordingError: the recording does not fit the model's arm, or `check` refuses it: see `findings` of the error.
+        IdentificationError: `slow_parts` finds none.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> arm = dvrk.load_arm("psm")
+        >>> model = dvrk.IdentifiedModel.from_arm(arm)
+        >>> q = arm.sample_poses(20, np.random.default_rng(0))
+        >>> errors = dvrk.validate(model, dvrk.Recording(q=q, tau=1.1 * model.holding_torque(q)))
+        >>> errors.verdict, round(errors.relative_errors["pitch"], 3)
+        ('good', 0.091)
+    """
+    arm = model.load_arm()
+    poses = find_poses(recording, arm, slow_parts)
+    report = require_usable(poses.recording, arm, progress)
+    validation: StaticValidation | DynamicValidation
+    if poses.moves and model.dynamics is not None:
+        validation = validate_motion(model, poses.recording)
+        errors = validation.relative_errors
+        found = unexplained_effort({name: errors[name] for name, v in validation.verdicts.items() if v == "do not use"})
+    else:
+        validation = validate_static(model, poses.recording, poses.measured)
+        found = _motion(poses.recording.motion(arm), report.source)
+    step_progress(progress, "validating")(1.0)
+    if validation.of_same_recording:
+        what = "the model was identified from this recording, so these are errors of the fit"
+        found += (Finding("warning", "same recording", report.source, what, "validate with another one"),)
+    return replace(validation, warnings=(*report.warnings, *found), note=poses.note)
+
+
+def _motion(motion: str, source: str) -> tuple[Finding, ...]:
+    if not motion:
+        return ()
+    what = f"the arm moves in this recording ({motion})"
+    advice = "the model holds poses, and knows nothing of inertia and of moving friction"
+    return (Finding("warning", "motion", source, what, advice),)
+
+
+def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress | None = None) -> Prediction:
+    """Predicts the efforts at the rows of a recording: what `dvrk-drake predict` does.
+
+    Args:
+        model: from `identify`, or `IdentifiedModel.load`.
+        recording: poses or a motion; it needs no efforts.
+        progress: called with the step, "checking the recording" or "predicting", and its finished share 0..1.
+
+    Returns:
+        `tau` (m, n) [N m; N] in the recording's coordinates, and `warnings`. For a motion, if the model has dynamics,
+        all efforts of the motors, behind the low-pass of the model's identification; otherwise what holds each pose.
+
+    Raises:
+        RecordingError: the recording does not fit the model's arm, or `check` refuses it: see `findings` of the error.
+
+    Example:
+        >>> import dvrk_drake as dvrk, numpy as np
+        >>> arm = dvrk.load_arm("mtml")
+        >>> model = dvrk.IdentifiedModel.from_arm(arm)
+        >>> q = arm.sample_poses(3, np.random.default_rng(0))
+        >>> dvrk.predict(model, dvrk.Recording(q=q)).tau.shape
+        (3, 7)
+    """
+    arm = model.load_arm()
+    # What finds and checks a motion needs efforts.
+    measured = recording if recording.tau is not None else replace(recording, tau=np.zeros_like(recording.q))
+    if model.dynamics is None or not find_poses(measured, arm).moves:
+        return Prediction(predict_static(model, recording))
+    report = require_usable(measured, arm, progress, apart_from="no effort" if recording.tau is None else "")
+    tau = predict_motion(model, recording)
+    if recording.coordinates == "joint":
+        tau = arm.transmission.pull_back_effort(tau)
+    step_progress(progress, "predicting")(1.0)
+    return Prediction(tau, report.warnings)

@@ -1,0 +1,152 @@
+"""Export of a model into the file format of another program."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.model_links import ModelBodies, model_bodies
+from dvrk_drake.errors import ModelError
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model, dry_friction
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.export.dvrk_psm_gravity_compensation import KinematicCompensation, kinematic_compensation
+from dvrk_drake.export.sdf import write_sdf
+from dvrk_drake.export.urdf import write_urdf
+from dvrk_drake.models.files import refuse_existing
+
+Format = Literal["sdf", "urdf", "dvrk-gc", "dvrk-kinematic-gc"]
+
+
+@dataclass(frozen=True, eq=False)
+class ModelExport:
+    """A model in the terms of a file format.
+
+    Attributes:
+        model: which is exported.
+        format: of the file.
+        origin: where the model is from, for the file.
+        bodies: links and rotors of an SDF or URDF, and what these cannot state; else None.
+        compensation: content of a file of the dVRK's controller; else None.
+    """
+
+    model: IdentifiedModel
+    format: Format
+    origin: str
+    bodies: ModelBodies | None = None
+    compensation: GravityCompensationFile | KinematicCompensation | None = None
+
+    def write(self, path: str | Path) -> None:
+        """Writes the file at once or not at all; an existing one is replaced.
+
+        Args:
+            path: the file. Meshes of an SDF or URDF are copied into a folder <name>_meshes beside it.
+
+        Raises:
+            DvrkDrakeError: the file cannot be written.
+            ModelError: something in the arm's SDF that URDF cannot state.
+        """
+        arm = self.model.load_arm()
+        if self.bodies is not None:
+            write = write_sdf if self.format == "sdf" else write_urdf
+            write(arm, self.bodies.links, path, self.origin, self.bodies.rotors)
+        elif isinstance(self.compensation, GravityCompensationFile):
+            self.compensation.save(path, arm.name, f"dvrk-drake export of {self.origin}")
+        elif self.compensation is not None:
+            self.compensation.save(path)
+
+
+def prepare_export(
+    model: IdentifiedModel,
+    format: Format,
+    *,
+    origin: str = "",
+    tolerance: float | None = None,
+    friction: bool | Sequence[float] = False,
+    friction_ratio: Sequence[float] | None = None,
+    dead_band: Sequence[float] | None = None,
+    saturation: Sequence[float] | None = None,
+) -> ModelExport:
+    """Computes what `export_model` writes; arguments and errors as there."""
+    origin = origin or f"a model of {model.load_arm().name}"
+    if format in ("sdf", "urdf"):
+        return ModelExport(model, format, origin, bodies=model_bodies(model))
+    if format == "dvrk-kinematic-gc":
+        file = kinematic_compensation(model, **({} if tolerance is None else {"tolerance": tolerance}))
+        return ModelExport(model, format, origin, compensation=file)
+    if format != "dvrk-gc":
+        raise ModelError(f'unknown format "{format}"; known formats: {", ".join(get_args(Format))}')
+    coulomb = None if friction is False else dry_friction(model) if friction is True else friction
+    given = {
+        "tolerance": tolerance,
+        "coulomb": coulomb,
+        "friction_ratio": friction_ratio,
+        "dead_band": dead_band,
+        "saturation": saturation,
+    }
+    options = CompensationOptions(**{k: v for k, v in given.items() if v is not None})  # type: ignore[arg-type]
+    return ModelExport(model, format, origin, compensation=compensation_from_model(model, options))
+
+
+def export_model(
+    model: IdentifiedModel,
+    path: str | Path,
+    format: Format | None = None,
+    *,
+    origin: str = "",
+    tolerance: float | None = None,
+    friction: bool | Sequence[float] = False,
+    friction_ratio: Sequence[float] | None = None,
+    dead_band: Sequence[float] | None = None,
+    saturation: Sequence[float] | None = None,
+    overwrite: bool = False,
+) -> ModelExport:
+    """Writes a model for other programs: what `dvrk-drake export` does.
+
+    Args:
+        model: from `identify`, `IdentifiedModel.load`, or `IdentifiedModel.from_arm`.
+        path: the file to write. Meshes of an SDF or URDF are copied into a folder <name>_meshes beside it.
+        format: "sdf", "urdf", or a file of the dVRK's controller: "dvrk-gc", the gravity compensation of an MTM, or
+            "dvrk-kinematic-gc", that of a PSM. By default what the path ends in: .sdf or .urdf.
+        origin: where the model is from, for the file.
+        tolerance: error [N m; N] that is accepted where a file of the dVRK cannot state what the model states. Default:
+            1e-6.
+        friction: for "dvrk-gc": compensate the dry friction of the model's dynamics, or these (7,) values [N m].
+        friction_ratio, dead_band, saturation: for "dvrk-gc": (7,) shares of it to compensate [1], and speeds between
+            which the compensation rises [rad/s]. Default: as in files in use.
+        overwrite: replace an existing file.
+
+    Returns:
+        What was written: `bodies` with what an SDF or URDF cannot state as `bodies.left_out`, or `compensation`.
+
+    Raises:
+        ModelError: an unknown format, or a model that the format cannot state.
+        DvrkDrakeError: the file exists, or cannot be written.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("psm"))
+        >>> exported = dvrk.export_model(model, "psm.json", "dvrk-kinematic-gc", tolerance=0.5)
+        >>> exported.compensation.mass.shape  # [kg] of the links of the controller's chain
+        (7,)
+    """
+    if format is None:
+        suffix = Path(path).suffix
+        if suffix not in (".sdf", ".urdf"):
+            raise ModelError(f"{path}: its format is not clear; state one of {', '.join(get_args(Format))}")
+        format = "sdf" if suffix == ".sdf" else "urdf"
+    refuse_existing(path, overwrite)
+    export = prepare_export(
+        model,
+        format,
+        origin=origin,
+        tolerance=tolerance,
+        friction=friction,
+        friction_ratio=friction_ratio,
+        dead_band=dead_band,
+        saturation=saturation,
+    )
+    export.write(path)
+    return export

@@ -1,0 +1,117 @@
+"""The model files with Drake's own parser, without this package's code: the same arms as `load_arm` composes."""
+
+import re
+import runpy
+
+import numpy as np
+import pytest
+from pydrake.multibody.parsing import LoadModelDirectives, Parser, ProcessModelDirectives
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation, MultibodyPlant
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from repository import ROOT
+
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.plant import holding_torque, make_arm_plant, package_map, set_arm_positions
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
+
+PSM = "package://dvrk_drake/directives/psm.dmd.yaml"
+
+
+def add_models(parser: Parser, name: str) -> None:
+    """Adds an arm to the parser's plant as docs/models_in_drake.md says."""
+    parser.package_map().AddMap(package_map())
+    if name == "psm":
+        parser.AddModels(url=PSM)
+    else:
+        parser.AddModels(url=f"package://dvrk_drake/sdf/{name}.sdf")
+        plant = parser.plant()
+        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link"))
+
+
+def plain_plant(name: str) -> MultibodyPlant:
+    plant = MultibodyPlant(1e-3)
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
+    parser = Parser(plant)
+    parser.SetStrictParsing()
+    add_models(parser, name)
+    plant.Finalize()
+    return plant
+
+
+def positions(plant: MultibodyPlant, arm: Arm, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions of the plant at the arm's pose, and the index of each of the arm's tree joints."""
+    index = np.array([plant.GetJointByName(joint).position_start() for joint in arm.tree_joint_names])
+    q_plant = np.zeros(plant.num_positions())
+    q_plant[index] = arm.linkage.position(q)
+    return q_plant, index
+
+
+@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+def test_drakes_parser_gives_the_arm_that_load_arm_composes(name):
+    arm = load_arm(name)
+    ours, plain = make_arm_plant(arm), plain_plant(name)
+    assert plain.num_positions() == ours.num_positions() == len(arm.tree_joint_names)
+    ours_context, context = ours.CreateDefaultContext(), plain.CreateDefaultContext()
+    for q in arm.sample_poses(10, np.random.default_rng(0)):
+        set_arm_positions(ours, ours_context, arm, q)
+        q_plant, index = positions(plain, arm, q)
+        plain.SetPositions(context, q_plant)
+        gravity = -arm.linkage.pull_back_effort(plain.CalcGravityGeneralizedForces(context)[index])
+        np.testing.assert_allclose(gravity, holding_torque(ours, ours_context, arm), atol=1e-12)
+        order = positions(ours, arm, q)[1]
+        mass = plain.CalcMassMatrix(context)[np.ix_(index, index)]
+        np.testing.assert_allclose(mass, ours.CalcMassMatrix(ours_context)[np.ix_(order, order)], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+def test_limits_are_those_of_the_arm(name):
+    arm, plant = load_arm(name), plain_plant(name)
+    for i, joint_name in enumerate(arm.joint_names):
+        joint = plant.GetJointByName(joint_name)
+        assert joint.position_lower_limits() == pytest.approx([arm.position_lower[i]], abs=1e-9)
+        assert joint.position_upper_limits() == pytest.approx([arm.position_upper[i]], abs=1e-9)
+        assert plant.GetJointActuatorByName(joint_name).effort_limit() == arm.effort_limits[i]
+    assert plant.num_actuators() == arm.num_joints
+
+
+@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+def test_links_do_not_touch_each_other_and_the_linkage_follows_in_a_simulation(name):
+    arm = load_arm(name)
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
+    add_models(Parser(plant), name)
+    plant.Finalize()
+    assert not scene_graph.model_inspector().GetCollisionCandidates()
+    simulator = Simulator(builder.Build())
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    start, index = positions(plant, arm, arm.sample_poses(1, np.random.default_rng(1))[0])
+    plant.SetPositions(context, start)
+    simulator.AdvanceTo(0.1)
+    tree = plant.GetPositions(context)[index]
+    assert np.abs(tree - start[index]).max() > 1e-3, "the arm falls"
+    independent = [arm.tree_joint_names.index(joint) for joint in arm.joint_names]
+    np.testing.assert_allclose(tree, arm.linkage.position(tree[independent]), atol=1e-4)
+
+
+def test_model_directives_can_be_processed():
+    plant = MultibodyPlant(1e-3)
+    parser = Parser(plant)
+    parser.package_map().AddMap(package_map())
+    directives = LoadModelDirectives(str(MODELS_FOLDER / "directives" / "psm.dmd.yaml"))
+    models = ProcessModelDirectives(directives, parser)
+    assert [model.model_name for model in models] == ["psm", "large_needle_driver"]
+
+
+@pytest.mark.parametrize("name", ["mtml", "mtmr"])
+def test_files_of_the_masters_are_those_that_the_tool_makes(name):
+    tool = runpy.run_path(str(ROOT / "tools/make_master_sdfs.py"))
+    assert (MODELS_FOLDER / "sdf" / f"{name}.sdf").read_text() == tool["master_sdf"](load_arm(name))
+
+
+def test_the_page_about_drake_runs(capsys):
+    page = (ROOT / "docs/models_in_drake.md").read_text()
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(code, {})
+    assert "13 positions" in capsys.readouterr().out

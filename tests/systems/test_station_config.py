@@ -1,0 +1,122 @@
+"""Stations from files: Drake's own loader and schemas, the same ports in simulation and on hardware."""
+
+import re
+
+import numpy as np
+import pytest
+from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+from pydrake.lcm import DrakeLcm
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from repository import ROOT
+
+from dvrk_drake.errors import ArmError, StationError
+from dvrk_drake.experiments.scenario import Scenario
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, station_ports
+from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
+from dvrk_drake.systems.station_config import ArmConfig, StationConfig, load_station_config, make_arm_station
+
+FILE = """
+arm: psm
+closure: ball
+gravity: [0, 9.81, 0]
+real_arm: [friction]
+seed: 3
+plant: {time_step: 0.002, contact_model: point}
+simulator: {target_realtime_rate: 0.0, start_time: 1.0}
+driver: {status_period: 0.002, model: model.yaml}
+"""
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "station.yaml"
+    path.write_text(FILE)
+    return path
+
+
+def test_a_file_is_read_with_drakes_loader_and_keeps_what_it_leaves_out(path):
+    config = load_station_config(path)
+    assert (config.arm, config.closure, config.seed, config.real_arm) == ("psm", "ball", 3, ["friction"])
+    assert (config.plant.time_step, config.plant.contact_model) == (0.002, "point")
+    assert config.plant.discrete_contact_approximation == "sap" and not config.plant.use_sampled_output_ports
+    assert config.driver.status_period == 0.002
+    assert config.driver.model == str(path.parent / "model.yaml")
+
+
+def test_a_configuration_survives_its_file():
+    config = StationConfig(arm="mtmr", plant=arm_plant_config(2e-3))
+    again = yaml_load_typed(schema=StationConfig, data=yaml_dump_typed(config, schema=StationConfig))
+    assert repr(again) == repr(config), "Drake's own schemas do not define equality"
+
+
+def test_the_station_is_the_one_of_the_file(path):
+    config = load_station_config(path)
+    station = make_arm_station(config)
+    assert isinstance(station, ArmStation) and station.plant.time_step() == 0.002
+    np.testing.assert_allclose(station.plant.gravity_field().gravity_vector(), [0.0, 9.81, 0.0], atol=0)
+    assert station.plant.get_contact_model().name == "kPoint"
+    assert station.plant.num_constraints() > 0, "pinned loops"
+    simulator = Simulator(station)
+    ApplySimulatorConfig(config.simulator, simulator)
+    simulator.Initialize()
+    simulator.AdvanceTo(1.004)
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_hardware_and_simulation_have_the_same_ports(name):
+    config = StationConfig(arm=name)
+    hardware, simulation = make_arm_station(config, hardware=True, lcm=DrakeLcm("memq://")), make_arm_station(config)
+    assert isinstance(hardware, HardwareArmStation)
+    for ports in (hardware, simulation):
+        for port, size in station_ports(load_arm(name)).inputs.items():
+            assert ports.GetInputPort(port).size() == size
+        for port, size in station_ports(load_arm(name)).outputs.items():
+            assert ports.GetOutputPort(port).size() == size
+
+
+def test_a_scenario_states_its_arm_with_the_same_fields():
+    assert issubclass(Scenario, ArmConfig) and issubclass(StationConfig, ArmConfig)
+    # "closure" has another default in a scenario, but the same meaning.
+    own = [set(schema.__annotations__) & set(ArmConfig.__annotations__) for schema in (Scenario, StationConfig)]
+    assert own == [{"closure"}, set()]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("arm: psm", "", "arm is missing; give an arm's name"),
+        ("closure: ball", "closure: weld", 'closure is "weld"; allowed: mimic, ball'),
+        (
+            "[0, 9.81, 0]",
+            "[0, 981, 0]",
+            r"station\.yaml: gravity \(0, 981, 0\) must be three numbers of a size up to 30 m/s",
+        ),
+        ("seed: 3", "seed: -1", r"seed is -1; allowed: 0\.\."),
+        ("[friction]", "[fraction]", "simulated arm: .*fraction"),
+        ("time_step: 0.002,", "time_step: 0.02,", r"plant\.time_step must be above 0 and at most 0\.01 s"),
+        ("status_period: 0.002", "status_period: 0.2", r"status_period is 0\.2; allowed"),
+        ("seed: 3", "sead: 3", r"station\.yaml: .*sead"),
+        ("point", "[", r"station\.yaml: "),
+    ],
+)
+def test_what_is_not_allowed_is_named(path, old, new, message):
+    assert FILE.count(old) == 1
+    path.write_text(FILE.replace(old, new))
+    with pytest.raises((StationError, ArmError), match=message) as error:
+        load_station_config(path)
+    assert "\n" not in str(error.value)
+
+
+def test_the_example_of_the_documentation_runs(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/lcm.md").read_text(), re.DOTALL)
+    (code,) = (block for block in blocks if "load_station_config" in block)
+    names: dict = {}
+    exec(code, names)
+    assert names["simulator"].get_context().get_time() == 0.5
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(StationError, match=r"nowhere\.yaml: "):
+        load_station_config(tmp_path / "nowhere.yaml")

@@ -1,0 +1,203 @@
+"""The public API: one import that loads nothing, documented names whose examples run, and README's example."""
+
+import ast
+import dataclasses
+import doctest
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import LeafSystem
+from repository import ROOT
+
+import dvrk_drake as dvrk
+
+#: Packages that take long to import.
+SLOW = {"pydrake", "numba", "numpy", "scipy", "sympy", "matplotlib", "rich", "yaml"}
+
+
+def loaded_by(code: str) -> set[str]:
+    """Names of all modules that a process of its own has loaded after `code`."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}; import sys; print(*sys.modules)"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return set(done.stdout.split())
+
+
+def test_the_import_loads_nothing_else():
+    loaded = loaded_by("import dvrk_drake; assert 'identify' in dir(dvrk_drake)")
+    assert "dvrk_drake" in loaded and not loaded & SLOW
+    assert not {name for name in loaded if name.startswith("dvrk_drake.")}
+
+
+def test_a_name_loads_only_what_it_needs():
+    loaded = loaded_by("import dvrk_drake; dvrk_drake.Recording")
+    assert "numba" not in loaded and "matplotlib" not in loaded
+
+
+def test_names_are_the_same_for_type_checkers_and_at_run_time():
+    tree = ast.parse((ROOT / "dvrk_drake/__init__.py").read_text())
+    typed = next(node for node in tree.body if isinstance(node, ast.If))
+    modules = {alias.name: node.module for node in typed.body for alias in node.names}
+    assert {name: f"dvrk_drake.{module}" for name, module in dvrk._MODULES.items()} == modules
+    assert dvrk.__all__ == sorted(modules)
+    packages = {path.stem for path in (ROOT / "dvrk_drake").iterdir()}
+    assert not packages & set(modules), "a module would hide the function"
+
+
+def test_an_unknown_name_is_named():
+    with pytest.raises(AttributeError, match="'dvrk_drake' has no attribute 'identifi'"):
+        dvrk.identifi  # noqa: B018
+
+
+@pytest.mark.parametrize("name", dvrk.__all__)
+def test_the_example_of_a_name_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    value = getattr(dvrk, name)
+    tests = doctest.DocTestFinder(recurse=False).find(value, name, module=False)
+    examples = [example for test in tests for example in test.examples]
+    assert examples and examples[0].source.startswith("import dvrk_drake as dvrk")
+    said = []
+    for test in tests:
+        doctest.DocTestRunner().run(test, out=said.append)
+    assert not said, "".join(said)
+
+
+@pytest.fixture(scope="module")
+def poses():
+    """An arm, the model that its SDF states, and a recording of 40 poses that the model holds."""
+    arm, generator = dvrk.load_arm("mtmr"), np.random.default_rng(0)
+    model = dvrk.IdentifiedModel.from_arm(arm)
+    q = arm.sample_poses(40, generator, margin=0.05)
+    tau = model.holding_torque(q) + 0.003 * arm.effort_limits * generator.normal(size=q.shape)
+    return arm, model, dvrk.Recording(q=q, tau=tau, source="poses.csv", sha256="1" * 64)
+
+
+def test_a_refusal_has_its_findings(poses):
+    arm, _, recording = poses
+    opposite = dataclasses.replace(recording, tau=-recording.tau)
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"poses\.csv: refused") as refused:
+        dvrk.identify(opposite, arm)
+    assert refused.value.findings and refused.value.findings[0].severity == "refusal"
+    assert str(refused.value.findings[0].what) in str(refused.value)
+
+
+def test_warnings_are_of_the_recording_and_of_the_result(poses):
+    arm, _, recording = poses
+    tau = recording.tau.copy()
+    tau[:, 6] = 0.0
+    result = dvrk.identify(dataclasses.replace(recording, tau=tau), arm)
+    assert ("no effort", "wrist_roll") in {(warning.kind, warning.where) for warning in result.warnings}
+    errors = dvrk.validate(result.model, recording)
+    assert [warning.kind for warning in errors.warnings] == ["same recording"]
+    with pytest.raises(dvrk.DvrkDrakeError, match="not identified from"):
+        errors.save("model.yaml")
+
+
+def test_progress_names_the_steps_in_order(poses):
+    arm, _, recording = poses
+    steps = []
+    dvrk.identify(recording, arm, progress=lambda step, share: steps.append((step, share)))
+    assert list(dict(steps)) == ["checking the recording", "identifying"]
+    for name in dict(steps):
+        shares = [share for step, share in steps if step == name]
+        assert shares == sorted(shares) and shares[0] == 0.0 and 0.9 < shares[-1] <= 1.0
+
+
+def test_a_result_replaces_a_file_only_on_request(poses, tmp_path):
+    arm, model, recording = poses
+    result = dvrk.identify(recording, arm, method="paper")
+    result.save(tmp_path / "model.yaml")
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"model.yaml: exists already; .* overwrite=True"):
+        result.save(tmp_path / "model.yaml")
+    result.save(tmp_path / "model.yaml", overwrite=True)
+    dvrk.export_model(model, tmp_path / "arm.urdf")
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.urdf: exists already"):
+        dvrk.export_model(model, tmp_path / "arm.urdf")
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.xml: its format is not clear; state one of sdf, urdf"):
+        dvrk.export_model(model, tmp_path / "arm.xml")
+
+
+def test_verdicts_are_stored_and_not_replaced_unasked(poses, tmp_path):
+    _, model, recording = poses
+    dvrk.validate(model, recording).save(tmp_path / "model.yaml")
+    stored = dvrk.IdentifiedModel.load(tmp_path / "model.yaml")
+    assert stored.validation.verdicts == dvrk.validate(model, recording).verdicts
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"has verdicts from poses\.csv already"):
+        dvrk.validate(stored, recording).save(tmp_path / "model.yaml")
+
+
+def test_the_model_of_an_arms_files_has_its_dynamics(tmp_path):
+    """At rest it holds what the static model holds; a motion under it has the efforts of the simulated arm."""
+    arm = dvrk.load_arm("psm")
+    model = dvrk.IdentifiedModel.from_arm(arm, dynamics=True)
+    model.save(tmp_path / "psm.yaml")
+    assert dvrk.IdentifiedModel.load(tmp_path / "psm.yaml") == model
+    springs = dvrk.IdentifiedModel.from_arm(arm, arm.effects.cables + arm.effects.springs)
+    q = arm.sample_poses(5, np.random.default_rng(0))
+    np.testing.assert_allclose(model.holding_torque(q), springs.holding_torque(q), atol=1e-12)
+    with pytest.raises(dvrk.DvrkDrakeError, match="either effects or dynamics"):
+        dvrk.IdentifiedModel.from_arm(arm, arm.effects.springs, dynamics=True)
+    reached = arm.sample_poses(6, np.random.default_rng(1), margin=0.2)
+    targets = [(k + 1.0, pose) for k, pose in enumerate(reached)]
+    run = dvrk.simulate(arm, effects=["friction"], duration=6.5, targets=targets, sample_period=0.005)
+    assert np.abs(run.recording.q[600] - reached[2]).max() < 0.05
+    heavy = dvrk.validate(model, run.recording).relative_errors
+    assert max(heavy[name] for name in ("yaw", "pitch", "insertion")) < 0.15
+    without = dataclasses.replace(run.recording, tau=None)
+    predicted = dvrk.predict(model, without).tau
+    assert np.corrcoef(predicted[200:-200, 1], run.recording.tau[200:-200, 1])[0, 1] > 0.99
+
+
+def test_a_simulation_takes_a_system_or_a_scenario(poses):
+    arm, model, _ = poses
+    limp = LimpController(arm.num_joints)
+    falls = dvrk.simulate(arm, controller=limp, effects=False, duration=0.3)
+    assert falls.desired is None and np.all(falls.recording.tau == 0) and np.abs(falls.recording.q[-1]).max() > 0.05
+    controller = dvrk.GravityPidController(model)
+    start = [0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5]
+    held = dvrk.simulate(arm, controller=controller, effects=False, duration=0.3, start=start)
+    np.testing.assert_allclose(held.recording.q[-1], start, atol=1e-3)
+    with pytest.raises(dvrk.DvrkDrakeError, match="a scenario states duration itself"):
+        dvrk.simulate(dvrk.load_scenario("mtmr"), duration=1.0)
+
+
+class LimpController(LeafSystem):
+    """Commands no effort."""
+
+    def __init__(self, n):
+        super().__init__()
+        self.DeclareVectorInputPort("state_estimated", 2 * n)
+        self.DeclareVectorOutputPort("effort", n, lambda context, output: output.SetZero())
+
+
+def readme_example() -> str:
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    return example
+
+
+def test_the_readme_example_is_short_and_has_one_import():
+    statements = ast.parse(readme_example()).body
+    assert len([node for node in ast.walk(ast.Module(statements, [])) if isinstance(node, ast.stmt)]) <= 12
+    assert [ast.unparse(n) for n in statements if isinstance(n, ast.Import | ast.ImportFrom)] == [
+        "import dvrk_drake as dvrk"
+    ]
+
+
+def test_the_readme_example_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arm, generator = dvrk.load_arm("mtmr"), np.random.default_rng(0)
+    model = dvrk.IdentifiedModel.from_arm(arm)
+    for name, count in (("poses.csv", 40), ("other_day.csv", 12)):
+        q = arm.sample_poses(count, generator, margin=0.05)
+        tau = model.holding_torque(q) + 0.003 * arm.effort_limits * generator.normal(size=q.shape)
+        dvrk.write_recording(dvrk.Recording(q=q, tau=tau), name)
+    exec(compile(readme_example(), "README.md", "exec"), {})
+    assert (tmp_path / "model.yaml").is_file()
+    assert "verdict" in capsys.readouterr().out
