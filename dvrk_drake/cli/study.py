@@ -3,23 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from rich.text import Text
-
-from dvrk_drake.cli.support import check_output, made_folder, quiet_drake
+from dvrk_drake.cli.support import ProgressBar, check_output, made_folder, quiet_drake
 from dvrk_drake.errors import StudyError
 
 
@@ -52,12 +37,16 @@ def _study(options: argparse.Namespace) -> None:
         raise StudyError(f"{options.output}: must end in .csv or .parquet")
     check_output(options.output, overwrite=True)
     plots = None if options.plots is None else made_folder(options.plots)
-    if options.scheduler is None:
-        with _progress() as progress:
-            rows = run_study_locally(study, options.output, options.workers, progress)
-    else:
-        with dask_executor(options.scheduler) as executor, _progress() as progress:
-            rows = run_study(study, executor, options.output, progress)
+    with ProgressBar("runs") as bar:
+
+        def show(done: int, all_cases: int) -> None:
+            bar(f"{done}/{all_cases} runs", done / all_cases)
+
+        if options.scheduler is None:
+            rows = run_study_locally(study, options.output, options.workers, show)
+        else:
+            with dask_executor(options.scheduler) as executor:
+                rows = run_study(study, executor, options.output, show)
     print_study(make_console(), study, rows)
     print(f"results: {options.output}, {len(rows)} runs")
     if plots is not None:
@@ -69,37 +58,3 @@ def _workers(text: str) -> int:
     if not (text.isdigit() and 1 <= int(text) <= 1024):
         raise argparse.ArgumentTypeError(f'"{text}" is not a number of processes, 1..1024')
     return int(text)
-
-
-class _RateColumn(ProgressColumn):
-    def render(self, task: Task) -> Text:
-        return Text("" if not task.speed else f"{60 * task.speed:.1f} runs/min")
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[int, int], None]]:
-    """A bar on stderr with rate and remaining time, gone when the work is done; silent where stderr is no terminal."""
-    console = Console(stderr=True)
-    bar = Progress(
-        BarColumn(),
-        MofNCompleteColumn(),
-        _RateColumn(),
-        TimeElapsedColumn(),
-        TextColumn("elapsed,"),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-        speed_estimate_period=600,  # a run may take a minute
-    )
-    task = None
-
-    def show(done: int, all_cases: int) -> None:
-        nonlocal task
-        if task is None:  # what was there before is no speed
-            task = bar.add_task("", total=all_cases, completed=done)
-        bar.update(task, completed=done)
-
-    with bar:
-        yield show
