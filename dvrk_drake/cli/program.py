@@ -23,12 +23,8 @@ from dvrk_drake.cli import (
     model,
     payload,
     recalibrate,
-    record,
     reproduce,
     simulate,
-    study,
-    transparency,
-    tune,
 )
 from dvrk_drake.cli.support import folders_only_for_results, import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
@@ -38,7 +34,7 @@ from dvrk_drake.errors import DvrkDrakeError
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _OF_RECORDINGS = (check, identify, recalibrate, payload, export)
-_SIMULATED = (simulate, study, tune, transparency, reproduce, demo)
+_SIMULATED = (simulate, reproduce, demo)
 
 
 def run(arguments: Sequence[str] | None) -> int:
@@ -87,6 +83,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("dvrk-drake"))
     verbs = parser.add_subparsers(required=True, metavar="VERB")
-    for module in (model, *_OF_RECORDINGS, *_SIMULATED, lcm, record, collect):
+    for module in (model, *_OF_RECORDINGS, *_SIMULATED, lcm, collect):
         module.add_verbs(verbs)
     return parser
