@@ -299,15 +299,6 @@ def test_an_interrupt_is_not_lost_where_numba_compiles(verb, tmp_path):
     assert process.returncode == 130
 
 
-def test_an_interrupt_of_the_restart_is_not_lost():
-    block = "import signal; signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})\n"
-    kill = "import os; os.kill(os.getpid(), signal.SIGINT)\n"
-    code = f"{block}{kill}from dvrk_drake.cli import main\nmain()\n"
-    process = subprocess.run([sys.executable, "-c", code, "model", "mtml"], capture_output=True, text=True, check=False)
-    assert process.stderr == "dvrk-drake: interrupted\n"
-    assert process.returncode == 130
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
