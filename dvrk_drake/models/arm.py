@@ -270,7 +270,7 @@ def _load_arm(name: str) -> Arm:
     path = Path(name)
     if not path.is_absolute():
         if name not in known_arms():
-            raise ArmError(f'unknown arm "{name}"; known arms: {", ".join(known_arms())}')
+            raise ArmError(f'unknown arm "{name}"; known arms: {", ".join(known_arms())}; or name a YAML file')
         path = MODELS_FOLDER / "arms" / f"{name}.yaml"
     description = load_typed_yaml(ArmDescription, path, ArmError, "an arm's file")
     mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)

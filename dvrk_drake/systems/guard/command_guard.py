@@ -73,8 +73,8 @@ class CommandGuard:
     it came; who answers one measurement again and again gains no time. Then the arm holds. See `CommandExpiry`.
 
     **Measurements** are checked: numbers, age, and plausibility (`Plausibility`). One that is not finite or too old
-    ends commands; while the arm holds, some in a row are tolerated, and more are a fault. The first one must have a
-    pose that is not far beyond a position limit, else it is a fault as well.
+    ends commands; while the arm holds, some in a row are tolerated, and more are a fault. One that is
+    not compared with an earlier one (the first one, and after a gap, OFF or a reset) must not be far beyond a limit.
 
     **Period**: a guard that is not stepped for `longest_period`, or with a median period above `slow_period`, accepts
     no POSITION and EFFORT: what it limits would come too late.
@@ -164,7 +164,9 @@ class CommandGuard:
         self._plausibility = Plausibility(arm, model, self.settings.plausibility, self.limits.speed)
         self._period, self._oscillation = PeriodMonitor(self.settings), OscillationMonitor(self.settings, arm)
         self._follower = Follower(self.limits)
+        self._acted = False
         self.output = self._output(0.0)
+        self._commanded = self.output.effort
 
     def __deepcopy__(self, memo: object) -> CommandGuard:
         # A Drake context copies its state before every update, so this must be quick. No array is changed in place.
@@ -205,7 +207,7 @@ class CommandGuard:
 
     @property
     def last_sender_id(self) -> int:
-        """Whose commands came last and were not ignored; 0: nobody's."""
+        """Whose commands were accepted last; 0: nobody's."""
         return self._stream.sender_id
 
     @property
@@ -295,6 +297,7 @@ class CommandGuard:
                 text = f"{self.limits.names[joint]}: the commanded effort oscillates"
                 self.report_fault(text, lcmt_dvrk_status.FAULT_OSCILLATION)
                 self.output = self._output(0.0)
+        self._commanded = self.output.effort.copy()
         return self.output
 
     def report_fault(self, text: str, code: int = lcmt_dvrk_status.FAULT_DRIVER, *, has_power: bool = True) -> None:
@@ -317,10 +320,9 @@ class CommandGuard:
         """Takes a measurement and checks it; what is wrong with it ends in HOLD or FAULT."""
         measured, plausibility = self._measured, self._plausibility
         first = measured.q is None
-        problem = measured.take(measured_utime, q, v, effort)
-        if first and not problem and (problem := self.limits.implausible_pose(self._q())):
-            measured.q = None  # the next measurement is the first one again
-        if problem:
+        begins = plausibility.begins or measured.time_since(measured_utime) >= _LONGEST_GAP
+        implausible_pose = self.limits.implausible_pose if begins else None
+        if problem := measured.take(measured_utime, q, v, effort, implausible_pose):
             if first or measured.bad > self.settings.plausibility.bad_samples:
                 # An arm that was never measured has no pose that it could be held at.
                 self.report_fault(problem, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=not first)
@@ -332,12 +334,14 @@ class CommandGuard:
             self._follower.latch(self._q(), np.zeros(self.num_joints))  # it stands so far
         elif measured.dt == 0:
             return  # the same measurement again
-        if not self._powered or not 0 < measured.dt < _LONGEST_GAP:
+        if begins:
             plausibility.forget()
-        commanded = self.output.effort if self.state == lcmt_dvrk_status.STATE_EFFORT else None
+        commanded = self._commanded if self.state == lcmt_dvrk_status.STATE_EFFORT else None
         fault = plausibility.check(measured.dt, self._q(), measured.v, measured.effort, commanded)
         if fault:
             self.report_fault(fault, lcmt_dvrk_status.FAULT_IMPLAUSIBLE)
+        if not self._powered:
+            plausibility.forget()  # somebody may move the arm, in any way
 
     def _watch_period(self, dt: float) -> None:
         if self._expiry.wall is not None:
@@ -368,7 +372,7 @@ class CommandGuard:
         """
         if self.state in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_FAULT):
             return
-        acted = self.state != lcmt_dvrk_status.STATE_STARTING
+        acted, self._acted = self._acted, False
         self._hold()
         if acted and not self.settings.resume_automatically:
             self.hold_reason = self.hold_reason or reason
@@ -377,14 +381,15 @@ class CommandGuard:
         """REFUSAL_* of a command of this session, given who sent what before and what the arm is doing."""
         if self._stream.is_other_sender(command, utime):
             return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
-        if (code := content_refusal(command)) != lcmt_dvrk_status.REFUSAL_NONE:
-            return code
         if self._measured.utime is None or not 0 <= utime - command.status_utime <= self._expiry.expiry:
             return lcmt_dvrk_status.REFUSAL_STALE
-        if command.control_mode == lcmt_dvrk_command.OFF and lcmt_dvrk_command.OFF not in self._modes:
-            return lcmt_dvrk_status.REFUSAL_BAD_MODE
+        # The stream first: what does not continue it interrupts nothing.
         if (code := self._stream.refusal(command, utime)) != lcmt_dvrk_status.REFUSAL_NONE:
             return code
+        if (code := content_refusal(command)) != lcmt_dvrk_status.REFUSAL_NONE:
+            return code
+        if command.control_mode == lcmt_dvrk_command.OFF and lcmt_dvrk_command.OFF not in self._modes:
+            return lcmt_dvrk_status.REFUSAL_BAD_MODE
         if self.state == lcmt_dvrk_status.STATE_FAULT and command.control_mode != lcmt_dvrk_command.HOLD:
             return lcmt_dvrk_status.REFUSAL_FAULT
         if self.hold_reason and command.control_mode in _ACTIVE:
@@ -405,10 +410,11 @@ class CommandGuard:
         goes_on = self.state == lcmt_dvrk_status.STATE_STARTING and mode == force.command.control_mode
         force.take(command)
         force.wall_utime = self._expiry.wall_time(command.status_utime, utime - command.status_utime)
+        self._acted &= mode in _ACTIVE
         if mode == lcmt_dvrk_command.OFF:
             self.state, self._powered = lcmt_dvrk_status.STATE_OFF, False
         elif mode == lcmt_dvrk_command.HOLD:
-            if resets:
+            if resets and not self.limits.implausible_pose(self._q()):
                 self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
                 self.hold_reason = ""
                 if self._plausibility.invalid.any() or not self._follower.is_near(self._q()):
@@ -425,7 +431,7 @@ class CommandGuard:
             self._act(mode)
 
     def _act(self, mode: int) -> None:
-        self.state = _ACTIVE[mode]
+        self.state, self._acted = _ACTIVE[mode], True
         if mode == lcmt_dvrk_command.POSITION:
             self._follower.begin_position()
         else:

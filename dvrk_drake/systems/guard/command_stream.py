@@ -121,8 +121,9 @@ class CommandInForce:
 class CommandStream:
     """The commands of one sender. All times in us, arrivals on the arm's clock.
 
-    A sender keeps its place while its commands arrive, accepted or refused. A second sender is refused until the first
-    one has been silent for `expiry`.
+    A sender keeps its place while its commands are accepted. A second sender is refused until no command of the first
+    one has been accepted for `expiry`. A refused command keeps no place, or whoever repeats one would keep an operator
+    from resuming.
 
     Sequence and time of a command are compared with those of the last accepted command, unless that is older than
     `expiry`. A refused command changes neither, so a spoofed sequence or time does not end the control of the true
@@ -142,27 +143,21 @@ class CommandStream:
     sequence_jump: int
     sender_id: int = 0
     lost: int = 0
-    _heard: int = 0
     _last: lcmt_dvrk_command | None = None
     _arrival: int = 0
     _can_reset: bool = False
     _can_turn_off: bool = False
 
     def is_other_sender(self, command: lcmt_dvrk_command, utime: int) -> bool:
-        """Returns whether the command is of another sender than the one that still has its place."""
-        return command.sender_id != self.sender_id != 0 and utime - self._heard <= self.expiry
+        """Returns whether the command is of another sender than the one that has its place."""
+        return command.sender_id != self.sender_id != 0 and utime - self._arrival <= self.expiry
 
     def refusal(self, command: lcmt_dvrk_command, utime: int) -> int:
-        """Returns REFUSAL_* of a command that is good by itself, or REFUSAL_NONE; it keeps or takes the place."""
+        """Returns REFUSAL_* of a command that does not continue its sender's stream, or REFUSAL_NONE."""
         if self.is_other_sender(command, utime):
             return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
-        if command.sender_id != self.sender_id:
-            self.forget()
-            self.sender_id = command.sender_id
-        self._heard = utime
-        if self._last is not None and utime - self._arrival > self.expiry:
-            self._last = None
-        if self._last is not None:
+        same_sender = command.sender_id == self.sender_id
+        if same_sender and self._last is not None and utime - self._arrival <= self.expiry:
             step = command.sequence - self._last.sequence
             if step <= 0:
                 return lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER
@@ -170,13 +165,16 @@ class CommandStream:
                 return lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP
             if self._jumped(command.utime - self._last.utime, utime - self._arrival):
                 return lcmt_dvrk_status.REFUSAL_CLOCK_JUMP
-        if command.control_mode == lcmt_dvrk_command.OFF and not self._can_turn_off:
+        if command.control_mode == lcmt_dvrk_command.OFF and not (same_sender and self._can_turn_off):
             return lcmt_dvrk_status.REFUSAL_SUDDEN_OFF
         return lcmt_dvrk_status.REFUSAL_NONE
 
     def accept(self, command: lcmt_dvrk_command, utime: int) -> bool:
         """Goes on to this command; True if it asks for a reset: reset_fault changed from false to true."""
-        if self._last is not None:
+        if command.sender_id != self.sender_id:
+            self.forget()
+            self.sender_id = command.sender_id
+        if self._last is not None and utime - self._arrival <= self.expiry:
             self.lost += command.sequence - self._last.sequence - 1
         self._last, self._arrival = command, utime
         resets = command.reset_fault and self._can_reset

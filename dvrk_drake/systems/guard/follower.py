@@ -53,7 +53,8 @@ class Follower:
     def latch(self, q: Vector, v: Vector) -> None:
         """Makes the measured q the target; an arm that moves at v may go on until it has been braked."""
         self.target = q.copy()
-        self._laggard = q + self._limits.following_time * v
+        speed = self._limits.speed
+        self._laggard = q + self._limits.following_time * clip(v, -speed, speed)
 
     def hold(self, dt: float) -> GuardOutput:
         """At the target, `dt` seconds on."""

@@ -118,8 +118,8 @@ class GuardLimits:
         k = int(far[0])
         unit = "mm" if k < len(self._prismatic) and self._prismatic[k] else "degrees"
         return (
-            f"{self.names[k]} = {c[k]:.4g} is far beyond {self.lower[k]:.4g}..{self.upper[k]:.4g} in the first "
-            f"measurement; {unit} or wrong zero?"
+            f"{self.names[k]} = {c[k]:.4g} is far beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}; "
+            f"{unit} or wrong zero?"
         )
 
     def refusal_to_start(self, command: lcmt_dvrk_command, q: Vector, effort: Vector, gravity: Vector) -> int:
@@ -130,7 +130,7 @@ class GuardLimits:
         if command.control_mode == lcmt_dvrk_command.EFFORT:
             if self.beyond(q):
                 return lcmt_dvrk_status.REFUSAL_START_OUTSIDE
-            if np.any(np.abs(effort - gravity) > self.start_gravity):
+            if not np.all(np.abs(effort - gravity) <= self.start_gravity):
                 return lcmt_dvrk_status.REFUSAL_START_GRAVITY
             far = np.abs(np.asarray(command.effort) - effort) > self.start_effort
             far |= np.abs(effort) > self.command_limits + self.start_effort

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,7 +27,7 @@ class Measurement:
         q: last good positions (n,) [rad, m]; None: there were none yet.
         v: velocities (n,) [rad/s, m/s].
         effort: what the motors apply (n,) [N m, N].
-        dt: from the good measurement before to the last one [s].
+        dt: from the good measurement before to the last one [s]; 0 if it is the same one, inf if there was none.
         bad: number of measurements since the last good one.
     """
 
@@ -35,9 +37,9 @@ class Measurement:
     q: Vector | None = None
     v: Vector = field(init=False)
     effort: Vector = field(init=False)
-    dt: float = 0.0
+    dt: float = math.inf
     bad: int = 0
-    _measured_utime: int = 0
+    _measured_utime: int | None = None
     _steps_at_one_time: int = 0
 
     def __post_init__(self) -> None:
@@ -49,22 +51,45 @@ class Measurement:
         self._steps_at_one_time = 0 if dt else self._steps_at_one_time + 1
         self.utime = utime
         if dt < 0:
+            self._measured_utime = None
             return dt, f"the arm's clock went back by {-dt:.6f} s"
         return dt, "the arm's clock stands still" if self._steps_at_one_time > _MOST_STEPS_AT_ONE_TIME else ""
 
-    def take(self, measured_utime: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> str:
-        """Takes what was measured at `measured_utime` [us]; why it is none, in words, or ""."""
+    def time_since(self, measured_utime: int) -> float:
+        """Returns the time from the last good measurement to `measured_utime` [us] in s; inf if there was none."""
+        return math.inf if self._measured_utime is None else 1e-6 * (measured_utime - self._measured_utime)
+
+    def take(
+        self,
+        measured_utime: int,
+        q: ArrayLike,
+        v: ArrayLike,
+        effort: ArrayLike,
+        implausible_pose: Callable[[Vector], str] | None = None,
+    ) -> str:
+        """Takes what was measured at `measured_utime` [us]; why it is none, in words, or "".
+
+        `implausible_pose` says what is wrong with positions that are not compared with earlier ones.
+        """
         assert self.utime is not None
-        age = self.utime - measured_utime
+        age, dt = self.utime - measured_utime, self.time_since(measured_utime)
+        if not 0 <= age <= self.oldest:
+            self.bad += 1
+            return f"the measurement is {1e-6 * age:.3f} s old; allowed is 0 to {1e-6 * self.oldest:g} s"
+        if dt == 0:
+            self.dt = 0.0
+            return ""
+        if dt < 0:
+            self.bad += 1
+            return f"the measurement is {-dt:.6f} s older than the one before"
         q, v, effort = (np.array(numbers, float) for numbers in (q, v, effort))
         self.bad += 1
-        if not 0 <= age <= self.oldest:
-            return f"the measurement is {1e-6 * age:.3f} s old; allowed is 0 to {1e-6 * self.oldest:g} s"
         if not (
             q.shape == v.shape == effort.shape == (self.num_joints,)
             and is_finite([*q.tolist(), *v.tolist(), *effort.tolist()])
         ):
             return f"the measured positions, velocities or efforts are not {self.num_joints} finite numbers each"
-        self.dt = 0.0 if self.q is None else 1e-6 * (measured_utime - self._measured_utime)
-        self.q, self.v, self.effort, self._measured_utime, self.bad = q, v, effort, measured_utime, 0
+        if implausible_pose is not None and (problem := implausible_pose(q)):
+            return problem
+        self.dt, self.q, self.v, self.effort, self._measured_utime, self.bad = dt, q, v, effort, measured_utime, 0
         return ""

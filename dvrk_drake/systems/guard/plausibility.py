@@ -184,7 +184,8 @@ class Response:
         velocity = velocity + gain * (sample.v - velocity)
         unexplained = effort - M.dot(sample.v - velocity) - lasting
         lasting = lasting + min(sample.dt / self._memory, 1.0) * unexplained
-        return (effort, velocity, lasting, M, age), np.abs(unexplained) > self._allowed
+        # Inverted, since an effort that is not a number is not explained either.
+        return (effort, velocity, lasting, M, age), ~(np.abs(unexplained) <= self._allowed)
 
 
 class SilentEffort:
@@ -261,6 +262,11 @@ class Plausibility:
         """Takes all positions as valid, and begins anew with the next sample."""
         self.invalid, self.fault = self._none, ""
         self.forget()
+
+    @property
+    def begins(self) -> bool:
+        """Whether the next sample is compared with none before."""
+        return self._before is None
 
     def forget(self) -> None:
         """Does not compare the next sample with the ones before."""

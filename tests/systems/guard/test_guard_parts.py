@@ -18,11 +18,12 @@ MS, NOW = 1000, 10**9
 
 
 def measurement():
-    """A good one of three joints, now."""
+    """A good one of three joints, 25 ms ago."""
     measured = Measurement(3, 20_000)
+    measured.advance(NOW - 25 * MS)
+    assert measured.take(NOW - 25 * MS, GOOD, GOOD, GOOD) == ""
+    assert measured.dt == np.inf
     measured.advance(NOW)
-    assert measured.take(NOW, GOOD, GOOD, GOOD) == ""
-    assert measured.dt == 0.0
     return measured
 
 
@@ -76,7 +77,26 @@ def test_the_time_between_measurements_is_that_of_the_good_ones():
     measured.advance(NOW + 7 * MS)
     measured.take(NOW + 2 * MS, GOOD * np.nan, GOOD, GOOD)
     measured.take(NOW + 5 * MS, GOOD, GOOD, GOOD)
-    assert measured.dt == pytest.approx(5e-3, abs=1e-12)
+    assert measured.dt == pytest.approx(30e-3, abs=1e-12)
+
+
+def test_a_measurement_with_the_same_time_is_the_same_and_an_older_one_is_bad():
+    measured = measurement()
+    assert measured.take(NOW, GOOD + 1, GOOD, GOOD) == ""
+    assert measured.take(NOW, GOOD + 2, GOOD, GOOD) == "" and measured.dt == 0.0
+    problem = measured.take(NOW - 2 * MS, GOOD + 3, GOOD, GOOD)
+    assert problem == "the measurement is 0.002000 s older than the one before" and measured.bad == 1
+    np.testing.assert_array_equal(measured.q, GOOD + 1)
+    # After the arm's clock went back, times begin anew.
+    measured.advance(NOW - 1000 * MS)
+    assert measured.take(NOW - 1000 * MS, GOOD, GOOD, GOOD) == "" and measured.dt == np.inf
+
+
+def test_a_pose_that_nothing_is_compared_with_can_be_implausible():
+    measured = measurement()
+    assert measured.take(NOW, GOOD + 100, GOOD, GOOD, lambda q: f"{q[0]:g} is far away") == "100 is far away"
+    np.testing.assert_array_equal(measured.q, GOOD)
+    assert measured.bad == 1
 
 
 def test_a_measurement_is_a_copy():
@@ -117,11 +137,11 @@ def test_another_sender_must_wait_for_silence(silence, code):
     assert stream.send(0) is False
     assert stream.send(silence, sender=6) == code
     assert stream.stream.sender_id == (5 if code else 6)
-    # A sender that is refused is heard all the same.
+    # A refused command keeps no place: whoever repeats one must not keep others away.
     stream = Stream()
     stream.send(0)
     assert stream.send(40 * MS, step=0) == Status.REFUSAL_OUT_OF_ORDER
-    assert stream.send(80 * MS, sender=6) == Status.REFUSAL_OTHER_SENDER
+    assert stream.send(80 * MS, sender=6) is False
 
 
 @pytest.mark.parametrize(

@@ -110,6 +110,40 @@ def test_an_orderly_end_and_a_start_that_ends_need_no_resume(mode):
     assert (bench.guard.state, bench.guard.hold_reason) == (Status.STATE_HOLD, "")
 
 
+def test_a_sender_that_stops_while_it_changes_the_mode_waits_for_an_operator():
+    bench = Bench(checks=False).started(Command.EFFORT)
+    bench.run(Command.POSITION, 100)
+    assert bench.guard.state == Status.STATE_STARTING
+    bench.tick(60)
+    assert bench.guard.hold_reason
+    assert bench.send(Command.EFFORT) == Status.REFUSAL_RESUME
+
+
+def test_refused_commands_of_one_sender_do_not_keep_an_operator_from_a_reset():
+    bench = Bench().started()
+    expire(bench)
+    for k in range(200):
+        if k % 40 == 0:
+            assert bench.send(Command.EFFORT) in (Status.REFUSAL_RESUME, Status.REFUSAL_OTHER_SENDER)
+        if k > 100:
+            assert bench.send(Command.HOLD, sender=6, reset_fault=k > 150) == Status.REFUSAL_NONE
+        bench.tick()
+    assert bench.guard.hold_reason == ""
+
+
+@pytest.mark.parametrize("copied", [{"effort": [np.nan] * N}, {"reset_fault": True}, {"mode": Command.OFF}])
+def test_a_copy_that_does_not_continue_the_stream_does_not_interrupt_a_start(copied):
+    bench = Bench()
+    for k in range(300):
+        bench.run(Command.EFFORT, 1)
+        if k % 100 == 50:
+            copy_of = {"mode": Command.EFFORT, **copied}
+            command = bench.command(copy_of.pop("mode"), **copy_of)
+            command.sequence = 2**62
+            assert bench.guard.receive(command, bench.utime) == Status.REFUSAL_SEQUENCE_JUMP
+    assert bench.guard.state == Status.STATE_EFFORT
+
+
 def test_the_first_reason_stays():
     bench = Bench().started()
     expire(bench)

@@ -302,7 +302,7 @@ def test_an_arm_without_power_is_not_checked():
     bench.run(Command.HOLD, 1)
     bench.run(Command.OFF, 1)
     for _ in range(10):
-        bench.q = bench.q - 0.1  # it falls, and is caught
+        bench.q = bench.q - unit(4, 0.1)  # it falls, and is caught
         assert bench.tick().control_mode == Command.OFF
     assert bench.guard.fault_code == Status.FAULT_NONE
     bench.run(Command.HOLD, 100)
