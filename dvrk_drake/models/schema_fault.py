@@ -105,6 +105,8 @@ def _number_faults(value: Any, key: str, allowed: Range | None) -> Iterator[str]
             yield from filter(None, [allowed.fault(key, number)])
         elif not math.isfinite(number):
             yield f"{key} is {number:g}; allowed: a finite number"
+    elif allowed is not None and isinstance(value, bool | str):
+        yield f"{key} is {_quoted(value)}; allowed: a number"
 
 
 def schema_fault(schema: type, content: Any, what: str) -> str:

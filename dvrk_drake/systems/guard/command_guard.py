@@ -138,8 +138,10 @@ class CommandGuard:
                 only, as for an arm in a simulated Diagram. Copies of the guard share it.
 
         Raises:
-            StationError: no session, or settings or an arm's gains that guard nothing.
+            StationError: no session, unknown modes, or settings or an arm's gains that guard nothing.
         """
+        if unknown := set(modes or ()) - {*_ACTIVE, lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD}:
+            raise StationError(f"modes must be of POSITION, EFFORT and OFF; got {sorted(unknown)}")
         if session_id == 0:
             raise StationError("session_id must not be 0, which a command has that was never filled in")
         self.settings = settings or GuardSettings()
