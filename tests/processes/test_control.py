@@ -126,7 +126,12 @@ def test_a_controller_that_was_stopped_while_it_acted_ends_and_an_operator_resum
 
 def test_an_arm_that_does_not_resume_is_an_error():
     link = GuardedArm()
-    link.before_step = lambda: link.guard._take_over("its period is 20 ms")
+
+    def take_over():
+        link.guard._acted = True
+        link.guard._take_over("its period is 20 ms")
+
+    link.before_step = take_over
     with pytest.raises(ControllerError, match="MTML does not resume: its period is 20 ms"):
         reset_fault(link, lambda text: None)
 
