@@ -49,8 +49,8 @@ def add_arm(
     """
     if closure not in get_args(Closure):
         raise ArmError(f'unknown closure "{closure}"; known: {", ".join(get_args(Closure))}')
-    tamsi = DiscreteContactApproximation.kTamsi
-    if plant.time_step() > 0 and plant.get_discrete_contact_approximation() == tamsi:
+    # By its name, since newer versions of drake have no tamsi.
+    if plant.time_step() > 0 and plant.get_discrete_contact_approximation().name == "kTamsi":
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
     parser = Parser(plant)
     parser.package_map().AddMap(package_map())
