@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import require_usable
+from dvrk_drake.analysis.results import ModelResult
 from dvrk_drake.analysis.signals.drive_efforts import (
     FRICTION_PARTS,
     FrictionPart,
@@ -24,7 +23,6 @@ from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.files import refuse_existing
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
@@ -64,36 +62,19 @@ class RecalibratedActuator:
     offset: float
 
 
-@dataclass(frozen=True, eq=False)
-class Recalibration:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recalibration(ModelResult):
     """A model with new friction.
 
     Attributes:
-        model: to be saved.
         actuators: in the arm's order.
         shared: scales of friction at places that several actuators move, e.g. "finger_1 dry".
         seconds: of the motion that were used, a second at each end left out.
-        warnings: what `check` found in the recording; `str` of each is one line.
     """
 
-    model: IdentifiedModel
     actuators: list[RecalibratedActuator]
     shared: dict[str, float]
     seconds: float
-    warnings: tuple[Finding, ...] = ()
-
-    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Writes the model file, at once or not at all.
-
-        Args:
-            path: the YAML file to write.
-            overwrite: replace an existing file.
-
-        Raises:
-            DvrkDrakeError: the file exists, or cannot be written.
-        """
-        refuse_existing(path, overwrite)
-        self.model.save(path)
 
 
 def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progress | None = None) -> Recalibration:
@@ -187,7 +168,12 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
         if not coordinate.startswith("actuator.")
     }
     section = _section(model.dynamic_model.section, fit, x)
-    return Recalibration(_with_section(model, section, recording), actuators, shared, float(len(fit.tau) / fit.rate))
+    return Recalibration(
+        model=_with_section(model, section, recording),
+        actuators=actuators,
+        shared=shared,
+        seconds=float(len(fit.tau) / fit.rate),
+    )
 
 
 def predict_other_phases(

@@ -1,4 +1,4 @@
-"""What the results of identification, validation and prediction have in common, for poses and for motions."""
+"""Common parts of the results of identification, recalibration, validation and prediction."""
 
 from __future__ import annotations
 
@@ -18,22 +18,16 @@ from dvrk_drake.recordings.recording import Recording
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Identification:
-    """Result of `identify`: a `StaticIdentification` or a `DynamicIdentification`.
+class ModelResult:
+    """A model and the warnings about it.
 
     Attributes:
-        model: the identified model.
-        recording: the prepared recording: distinct poses in joint coordinates, or the motion as recorded.
+        model: the new model.
         warnings: what makes the model less reliable, found in the recording or in the fit; `str` of each is one line.
-        note: which rows were taken as poses, or "".
-        num_rows: of the recording, or of the poses that were found in it; repeated poses are averaged.
     """
 
     model: IdentifiedModel
-    recording: Recording
     warnings: tuple[Finding, ...] = ()
-    note: str = ""
-    num_rows: int = 0
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Writes the model file, at once or not at all.
@@ -47,6 +41,21 @@ class Identification:
         """
         refuse_existing(path, overwrite)
         self.model.save(path)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Identification(ModelResult):
+    """Result of `identify`: a `StaticIdentification` or a `DynamicIdentification`.
+
+    Attributes:
+        recording: the prepared recording: distinct poses in joint coordinates, or the motion as recorded.
+        note: which rows were taken as poses, or "".
+        num_rows: of the recording, or of the poses that were found in it; repeated poses are averaged.
+    """
+
+    recording: Recording
+    note: str = ""
+    num_rows: int = 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
