@@ -1,7 +1,7 @@
 """Mutation testing: changes one operator, constant or statement at a time and lists the changes that no test detects.
 
-Each mutant is tested in a fork of a process that has imported Drake and numpy. Tests that detected a mutant last run
-first, then the fastest. Modules that numba compiles are refused: numba would take the unchanged ones from its cache.
+Each mutant is tested in a fork of a process that has imported Drake and numpy, without the tests marked slow. Tests
+that detected a mutant last run first, then the fastest. Modules that numba compiles are refused: numba would take the unchanged ones from its cache.
 """
 
 import ast
@@ -130,7 +130,7 @@ class _Tests:
         sys.meta_path.insert(0, self)
         signal.setitimer(signal.ITIMER_PROF, self.limit)
         with open(os.devnull, "w") as null, redirect_stdout(null), redirect_stderr(null):
-            code = pytest.main(["-x", "-p", "no:cacheprovider", *self.tests], plugins=[self])
+            code = pytest.main(["-x", "-m", "not slow", "-p", "no:cacheprovider", *self.tests], plugins=[self])
         self.shared.setdefault("", (time.process_time(), list(sys.modules)))
         os._exit(code)
 
