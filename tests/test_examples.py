@@ -92,7 +92,7 @@ def test_the_model_is_written_where_the_user_says(tmp_path):
     assert list(tmp_path.iterdir()) == [poses]
     assert run(tmp_path, "real_recording.py", "poses.csv", "own.yaml").returncode == 0
     before = (tmp_path / "own.yaml").read_bytes()
-    assert IdentifiedModel.load(tmp_path / "own.yaml").load_arm().name == arm.name
+    assert IdentifiedModel.load(tmp_path / "own.yaml").arm.name == arm.name
     again = run(tmp_path, "real_recording.py", "poses.csv", "own.yaml")
     assert again.returncode == 1 and "exists already" in again.stderr
     assert (tmp_path / "own.yaml").read_bytes() == before

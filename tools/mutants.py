@@ -1,7 +1,8 @@
 """Mutation testing: changes one operator, constant or statement at a time and lists the changes that no test detects.
 
-Each mutant is tested in a fork of a process that has imported Drake and numpy, without the tests marked slow. Tests
-that detected a mutant last run first, then the fastest. Modules that numba compiles are refused: numba would take the unchanged ones from its cache.
+Each mutant is tested in a fork of a process that has imported Drake and numpy. Tests that detected a mutant last run
+first, then the fastest; those marked slow do not run. Modules that numba compiles are refused: numba would take the
+unchanged ones from its cache.
 """
 
 import ast

@@ -48,7 +48,7 @@ def validate(
         >>> errors.verdict, round(errors.relative_errors["pitch"], 3)
         ('good', 0.091)
     """
-    arm = model.load_arm()
+    arm = model.arm
     poses = find_poses(recording, arm, slow_parts)
     report = require_usable(poses.recording, arm, progress)
     validation: StaticValidation | DynamicValidation
@@ -97,7 +97,7 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
         >>> dvrk.predict(model, dvrk.Recording(q=q)).tau.shape
         (3, 7)
     """
-    arm = model.load_arm()
+    arm = model.arm
     # What finds and checks a motion needs efforts.
     measured = recording if recording.tau is not None else replace(recording, tau=np.zeros_like(recording.q))
     if model.dynamics is None or not find_poses(measured, arm).moves:

@@ -88,7 +88,7 @@ def cross_validated_verdicts(model: IdentifiedModel) -> dict[str, Verdict]:
 
     The held-out data are of the same recording. Another recording is the stronger test.
     """
-    limits = model.load_arm().effort_limits
+    limits = model.arm.effort_limits
     if model.dynamics is not None:
         return {
             a.name: judge(a.rms_effort, a.rms_cross_validation, float(limit), in_motion=True, commanded=joint.trust > 0)

@@ -86,7 +86,7 @@ def _export(options: argparse.Namespace) -> None:
         print_export(make_console(), path, export)
     if options.diff:
         bodies = model_bodies(model)
-        sys.stdout.write(sdf_difference(model.load_arm(), bodies.links, bodies.rotors))
+        sys.stdout.write(sdf_difference(model.arm, bodies.links, bodies.rotors))
 
 
 def _compare(options: argparse.Namespace) -> None:
@@ -109,7 +109,7 @@ def _compare(options: argparse.Namespace) -> None:
     if comparison.other_side:
         print(
             f"dvrk-drake: warning: {options.file}: the mirror image of the model fits better: the file is probably one "
-            f"of the other side's arm, not of {model.load_arm().name}. Check ARM_NAME and the serial number",
+            f"of the other side's arm, not of {model.arm.name}. Check ARM_NAME and the serial number",
             file=sys.stderr,
             flush=True,
         )

@@ -126,7 +126,7 @@ def _validate(options: argparse.Namespace) -> None:
     if options.json is not None:
         check_output(options.json, options.recording, options.model, overwrite=options.overwrite)
     model = dvrk.IdentifiedModel.load(options.model)
-    recording = dvrk.read_recording(options.recording, model.load_arm(), options.coordinates)
+    recording = dvrk.read_recording(options.recording, model.arm, options.coordinates)
     print_notes(options.recording, recording.notes)
     plots = None if options.plots is None else made_folder(options.plots)
     if options.save:
@@ -166,7 +166,7 @@ def _predict(options: argparse.Namespace) -> None:
 
     check_output(options.output, options.recording, options.model, overwrite=options.overwrite)
     model = dvrk.IdentifiedModel.load(options.model)
-    recording = dvrk.read_recording(options.recording, model.load_arm(), options.coordinates)
+    recording = dvrk.read_recording(options.recording, model.arm, options.coordinates)
     print_notes(options.recording, recording.notes)
     with ProgressBar("predicting") as bar:
         prediction = dvrk.predict(model, recording, progress=bar)

@@ -192,7 +192,7 @@ def _friction_compensator(options: argparse.Namespace) -> FrictionCompensator | 
             f"--friction-ratio needs a --model from identify of poses at rest; {options.model} does not say how wrong "
             "its weight may be, so nothing would keep the arm from creeping"
         )
-    friction = Friction.of_model(arm, IdentifiedModel.load(options.friction or options.model))
+    friction = Friction.of_model(IdentifiedModel.load(options.friction or options.model, arm))
     compensator = FrictionCompensator(
         friction,
         ratio=options.friction_ratio,
@@ -238,7 +238,6 @@ def ready_controller(
         ControllerError: no arm there, or one that may not be controlled now.
     """
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.errors import ModelError
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.arm_controller import ArmController
     from dvrk_drake.processes.control import ArmLink, first_status, reset_fault
@@ -247,9 +246,7 @@ def ready_controller(
 
     quiet_drake()
     arm, key = load_arm(options.arm), load_key(options.key)
-    model = IdentifiedModel.from_arm(arm) if options.model is None else IdentifiedModel.load(options.model)
-    if model.load_arm().name != arm.name:
-        raise ModelError(f"{options.model}: is of {model.load_arm().name}, not of {arm.name}")
+    model = IdentifiedModel.from_arm(arm) if options.model is None else IdentifiedModel.load(options.model, arm)
     if options.model is not None and (warning := model_warning(options.model, model)):
         _warn(warning)
     url = open_lcm(options.lcm_url).get_lcm_url()

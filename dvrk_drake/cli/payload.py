@@ -45,7 +45,7 @@ def _payload(options: argparse.Namespace) -> None:
     model = None if options.model is None else dvrk.IdentifiedModel.load(options.model)
     if model is not None and options.gravity is not None:
         raise ModelError(f"{options.model}: states its gravity; --gravity is for --arm")
-    arm = mounted(dvrk.load_arm(options.arm), options.gravity) if model is None else model.load_arm()
+    arm = mounted(dvrk.load_arm(options.arm), options.gravity) if model is None else model.arm
     if options.json is not None:
         check_output(options.json, options.reference, options.loaded, overwrite=options.overwrite)
     reference, loaded = (dvrk.read_recording(p, arm, options.coordinates) for p in (options.reference, options.loaded))

@@ -29,7 +29,7 @@ def _recalibrate(options: argparse.Namespace) -> None:
 
     check_output(options.output, options.recording, options.model, overwrite=options.overwrite)
     model = dvrk.IdentifiedModel.load(options.model)
-    recording = dvrk.read_recording(options.recording, model.load_arm(), options.coordinates)
+    recording = dvrk.read_recording(options.recording, model.arm, options.coordinates)
     print_notes(options.recording, recording.notes)
     with ProgressBar("recalibrating") as bar:
         result = dvrk.recalibrate(model, recording, progress=bar)

@@ -245,9 +245,7 @@ def _compensations(options: argparse.Namespace, arm: Arm) -> list[Compensation]:
         name, equals, path = given.partition("=")
         if not equals or not name or name in models:
             raise ModelError(f"--model {given}: must be NAME=MODEL.yaml, each name once")
-        models[name] = IdentifiedModel.load(path)
-        if models[name].load_arm().name != arm.name:
-            raise ModelError(f"{path}: is of {models[name].arm}, not of {arm.name}")
+        models[name] = IdentifiedModel.load(path, arm)
     if not models:
         models["SDF"] = IdentifiedModel.from_arm(arm)
     listed = [Compensation("nothing")]

@@ -84,20 +84,18 @@ class Friction:
         )
 
     @classmethod
-    def of_model(cls, arm: Arm, model: IdentifiedModel) -> Friction:
+    def of_model(cls, model: IdentifiedModel) -> Friction:
         """What a model that was identified from a motion says.
 
         Raises:
-            ModelError: it was identified from poses, or of another arm.
+            ModelError: it was identified from poses.
         """
-        if (of := model.load_arm().name) != arm.name:
-            raise ModelError(f"friction: the model is of {of}, not of {arm.name}")
         if model.dynamics is None:
             raise ModelError(
                 "friction: the model was identified from poses, which tell nothing of friction; give a motion's"
             )
         effects = model.dynamics.effects
-        return cls.of(arm, [e.effect for e in effects], [e.value for e in effects])
+        return cls.of(model.arm, [e.effect for e in effects], [e.value for e in effects])
 
     @property
     def rows(self) -> NDArray[np.float64]:

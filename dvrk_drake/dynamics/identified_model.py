@@ -1,8 +1,9 @@
 """The identified model of an arm: its files, its torques, and its evaluation in a control loop."""
 
 import math
+import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, get_args
@@ -32,11 +33,15 @@ from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import missing_key, schema_fault, within
+from dvrk_drake.models.sdf_model import PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 
 # No postponed annotations here: yaml_load_typed reads the types at run time.
 
-
+#: Of the files that `IdentifiedModel.save` writes.
+FORMAT = "dvrk_drake identified model 3"
+#: Of older files that can be read: in 2, `arm` is a name or an absolute path.
+_READABLE_FORMATS = ("dvrk_drake identified model 2",)
 #: Measured positions, which may be beyond the limits of a joint.
 _POSITIONS = within(-50.0, 50.0, "rad or m")
 
@@ -106,14 +111,51 @@ class ValidationSummary:
     verdicts: dict[str, str] = field(default_factory=dict)
 
 
-@dataclass
-class IdentifiedModel:
-    """What holds an arm: tau = trust o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
+@dataclass(kw_only=True)
+class _Identified:
+    """What a model states of its arm, in its file and in Python."""
 
-    `gravity` [m/s^2] is the gravity vector in the base frame that the base parameters were identified with. `effects`
-    are those of a model identified from poses, of position alone. One identified from a motion has `dynamics`, with
-    effects of all kinds; its base parameters are those of the links there. `validation` is what `validate --save`
-    stored.
+    base_parameters: list[BaseParameterEstimate] = field(default_factory=list)
+    effects: list[ActuatorEffectEstimate] = field(default_factory=list)
+    joints: list[JointStatistics] = field(default_factory=list)
+    provenance: Provenance = field(default_factory=Provenance)
+    dynamics: DynamicSection | None = None
+    validation: ValidationSummary | None = None
+
+
+@dataclass(kw_only=True)
+class _Head:
+    """The first lines of a model file.
+
+    Attributes:
+        format: version of the file's keys.
+        arm: URL or name of an arm of this package, or the path of an arm's file, relative to the model file.
+        gravity: (3,) gravity vector in the arm's base frame [m/s^2].
+    """
+
+    format: str = ""
+    arm: str = ""
+    gravity: list[float] = field(default_factory=list, metadata=GRAVITIES)
+
+
+@dataclass(kw_only=True)
+class ModelFile(_Identified, _Head):
+    """Schema of a model file."""
+
+
+@dataclass(kw_only=True)
+class IdentifiedModel(_Identified):
+    """Parameters that hold an arm: tau = trust o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
+
+    Attributes:
+        arm: the arm, mounted as it was when its base parameters were identified.
+        base_parameters: in the order of `derive_gravity(arm).base.names`. Of a model identified from a motion, those of
+            the links in `dynamics`.
+        effects: of position alone, of a model identified from poses; a model with `dynamics` has all effects there.
+        joints: how each joint was fitted.
+        provenance: where the model came from.
+        dynamics: of a model identified from a motion.
+        validation: what `validate --save` stored.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -124,15 +166,7 @@ class IdentifiedModel:
         ((5, 7), 'pitch')
     """
 
-    format: str = "dvrk_drake identified model 2"
-    arm: str = ""
-    gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81], metadata=GRAVITIES)
-    base_parameters: list[BaseParameterEstimate] = field(default_factory=list)
-    effects: list[ActuatorEffectEstimate] = field(default_factory=list)
-    joints: list[JointStatistics] = field(default_factory=list)
-    provenance: Provenance = field(default_factory=Provenance)
-    dynamics: DynamicSection | None = None
-    validation: ValidationSummary | None = None
+    arm: Arm
 
     @classmethod
     def from_arm(cls, arm: Arm, effects: Sequence[DriveEffect] = (), *, dynamics: bool = False) -> "IdentifiedModel":
@@ -150,8 +184,7 @@ class IdentifiedModel:
             raise ModelError("a model with dynamics has all effects of the arm; give either effects or dynamics")
         gravity = derive_gravity(arm)
         return cls(
-            arm=arm.source,
-            gravity=[float(x) for x in arm.gravity],
+            arm=arm,
             base_parameters=[
                 BaseParameterEstimate(name, float(value), 0.0, True)
                 for name, value in zip(gravity.base.names, gravity.base_values, strict=True)
@@ -163,24 +196,30 @@ class IdentifiedModel:
         )
 
     @classmethod
-    def load(cls, path: str | Path) -> "IdentifiedModel":
+    def load(cls, path: str | Path, arm: Arm | None = None) -> "IdentifiedModel":
         """Reads a model file.
 
+        Args:
+            path: the model file.
+            arm: refuse a model of another arm.
+
         Raises:
-            ModelError: no such file, not a model, or one that does not fit its arm.
+            ModelError: no such file, not a model, or one that does not fit its arm or is not of `arm`.
         """
         content = load_yaml(path, ModelError)
         # Another version has other keys, which are not worth naming.
         version = content.get("format") if isinstance(content, dict) else None
-        if version and version != IdentifiedModel.format:
-            raise ModelError(
-                f'{path}: format is "{version}", this version reads "{IdentifiedModel.format}"; identify anew'
-            )
-        model = typed_content(cls, content, str(path), ModelError, "a model file")
+        if version and version not in (FORMAT, *_READABLE_FORMATS):
+            raise ModelError(f'{path}: format is "{version}", this version reads "{FORMAT}"; identify anew')
+        file = typed_content(ModelFile, content, str(path), ModelError, "a model file")
         # A number that is missing would be 0 without a word.
-        if key := missing_key(cls, content):
+        if key := missing_key(ModelFile, content):
             raise ModelError(f"{path}: {key} is missing")
         try:
+            own_arm = load_arm(_named_from(path, file.arm)).with_gravity(file.gravity)
+            if arm is not None and own_arm.name != arm.name:
+                raise ModelError(f"is of {own_arm.name}, not of {arm.name}")
+            model = cls(arm=own_arm, **{part.name: getattr(file, part.name) for part in fields(_Identified)})
             model.check()
         except (ModelError, ArmError) as error:
             raise ModelError(f"{path}: {error}") from error
@@ -194,36 +233,33 @@ class IdentifiedModel:
         """
         self.check()
         with atomic_write(path) as stream:
-            stream.write(yaml_dump_typed(self))
+            stream.write(yaml_dump_typed(self._file(_name_for(path, self.arm))))
+
+    def _file(self, arm: str) -> ModelFile:
+        parts = {part.name: getattr(self, part.name) for part in fields(_Identified)}
+        return ModelFile(format=FORMAT, arm=arm, gravity=self.arm.gravity.tolist(), **parts)
 
     def check(self) -> None:
-        """Raises ModelError unless the parameters fit the arm that the model names."""
-        if fault := schema_fault(IdentifiedModel, asdict(self), "a model"):
+        """Raises ModelError unless the parameters fit the arm."""
+        if fault := schema_fault(ModelFile, asdict(self._file(self.arm.source)), "a model"):
             raise ModelError(fault)
-        if self.format != IdentifiedModel.format:
-            raise ModelError(f'format is "{self.format}", this version reads "{IdentifiedModel.format}"')
-        arm = self.load_arm()
-        names = derive_gravity(arm).base.names
+        names = derive_gravity(self.arm).base.names
         if tuple(p.name for p in self.base_parameters) != names:
             raise ModelError(f"base parameters must be, in this order: {'; '.join(names)}")
-        if tuple(joint.name for joint in self.joints) != arm.joint_names:
-            raise ModelError(f"joints must be, in this order: {', '.join(arm.joint_names)}")
+        if tuple(joint.name for joint in self.joints) != self.arm.joint_names:
+            raise ModelError(f"joints must be, in this order: {', '.join(self.arm.joint_names)}")
         for i, effect in enumerate(self.effects):
-            if fault := effect_fault(arm, effect.effect, POSITION_KINDS):
+            if fault := effect_fault(self.arm, effect.effect, POSITION_KINDS):
                 raise ModelError(f"effects[{i}]: {fault}")
-        if self.validation is not None and set(self.validation.verdicts) != set(arm.joint_names):
-            raise ModelError(f"validation.verdicts must name these joints: {', '.join(arm.joint_names)}")
+        if self.validation is not None and set(self.validation.verdicts) != set(self.arm.joint_names):
+            raise ModelError(f"validation.verdicts must name these joints: {', '.join(self.arm.joint_names)}")
         for name, verdict in self.validation.verdicts.items() if self.validation else ():
             if verdict not in get_args(Verdict):
                 raise ModelError(f'validation.verdicts.{name} is "{verdict}"; allowed: {", ".join(get_args(Verdict))}')
         if self.dynamics is not None:
-            DynamicModel(arm, self.dynamics)
-            if self.effects or self.dynamics.gravity != self.gravity:
+            DynamicModel(self.arm, self.dynamics)
+            if self.effects or not np.allclose(self.dynamics.gravity, self.arm.gravity, rtol=0, atol=1e-9):
                 raise ModelError("a model with dynamics has effects only there, and the gravity that stands there")
-
-    def load_arm(self) -> Arm:
-        """The arm that this model is of, mounted as it was when identified."""
-        return load_arm(self.arm).with_gravity(self.gravity)
 
     @property
     def holding_effects(self) -> list[ActuatorEffectEstimate]:
@@ -245,7 +281,7 @@ class IdentifiedModel:
     @cached_property
     def static_model(self) -> StaticModel:
         """The compiled structure that `theta` belongs to."""
-        return compile_static_model(self.load_arm(), tuple(e.effect for e in self.holding_effects))
+        return compile_static_model(self.arm, tuple(e.effect for e in self.holding_effects))
 
     @cached_property
     def dynamic_model(self) -> DynamicModel:
@@ -256,7 +292,7 @@ class IdentifiedModel:
         """
         if self.dynamics is None:
             raise ModelError("the model has no dynamics: it was identified from poses; identify a motion")
-        return DynamicModel(self.load_arm(), self.dynamics)
+        return DynamicModel(self.arm, self.dynamics)
 
     def with_scaled_parameters(self, factors: ArrayLike) -> "IdentifiedModel":
         """What a wrong identification might have left: base parameters times `factors` (b,). Its `dynamics` stay."""
@@ -287,7 +323,7 @@ class ControlModel:
         self._theta = np.ascontiguousarray(model.theta)
         self._scale = model.trust * with_gravity
         if model.dynamics is None:
-            self._regressor = DynamicRegressor(model.load_arm())
+            self._regressor = DynamicRegressor(model.arm)
             self._parameters = self._regressor.values
         else:
             self._regressor, self._parameters = model.dynamic_model.regressor, model.dynamic_model.parameters
@@ -301,6 +337,20 @@ class ControlModel:
     def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the mass matrix (n, n) of the independent joints at q (n,) [rad, m], rotors included."""
         return self._regressor.mass_matrix(q[None], self._parameters)[0]
+
+
+def _name_for(path: str | Path, arm: Arm) -> str:
+    """Returns what the model file at `path` names its arm: a URL, or a path relative to the model file."""
+    if not os.path.isabs(arm.source):
+        return f"{PACKAGE_URL}arms/{arm.source}.yaml"
+    return os.path.relpath(arm.source, os.path.dirname(os.path.realpath(path)))
+
+
+def _named_from(path: str | Path, name: str) -> str:
+    """Returns what `load_arm` loads the arm by that the model file at `path` calls `name`."""
+    if not name.endswith((".yaml", ".yml")) or name.startswith(PACKAGE_URL):
+        return name
+    return os.path.join(os.path.dirname(os.path.realpath(path)), name)
 
 
 def _nominal_dynamics(arm: Arm) -> DynamicSection:

@@ -170,9 +170,9 @@ def model_bodies(model: IdentifiedModel) -> ModelBodies:
     Raises:
         ModelError: no bodies have these base parameters.
     """
-    arm = model.load_arm()
+    arm = model.arm
     left_out = _static_effects(model)
-    expected = load_arm(model.arm).gravity
+    expected = load_arm(arm.source).gravity
     if not np.allclose(arm.gravity, expected, atol=0.02):
         gravity = ", ".join(f"{x:.3f}" for x in arm.gravity)
         left_out.append(

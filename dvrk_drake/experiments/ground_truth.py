@@ -183,7 +183,7 @@ def unlike_its_drawing(name: str, folder: Path, seed: int) -> GroundTruth:
     if name == PAPER_ARM:
         true_arm = dataclasses.replace(true_arm, effects=arm.effects.without("springs"))
     laws = [*true_arm.effects.cables, *true_arm.effects.springs]
-    model = dataclasses.replace(IdentifiedModel.from_arm(true_arm, laws), arm=arm.source)
+    model = dataclasses.replace(IdentifiedModel.from_arm(true_arm, laws), arm=arm)
     origin = (
         f"The true arm is the SDF's with links that are each up to {100 * SPREAD:.0f} % heavier or lighter (drawn with "
         f"seed {seed}), and the effects of `mechanisms/`: friction, cables, encoders, motors, delays."

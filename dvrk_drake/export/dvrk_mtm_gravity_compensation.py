@@ -132,7 +132,7 @@ def compensation_from_model(
         ModelError: not the model of an MTM, options of the wrong length, or an error above `options.tolerance`.
     """
     options = options or CompensationOptions()
-    arm = model.load_arm()
+    arm = model.arm
     if arm.joint_names != MTM_JOINTS:
         raise ModelError(f"{arm.name}: the controller's gravity-compensation file is one of an MTM; joints differ")
     check_tolerance(options.tolerance)
@@ -169,7 +169,7 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
     """
     if model.dynamics is None:
         raise ModelError("the model has no dynamics, so it knows no friction; give it with --coulomb")
-    arm = model.load_arm()
+    arm = model.arm
     rows = effect_coordinates(arm)
     friction = np.zeros(arm.num_joints)
     for effect in model.dynamics.effects:
@@ -180,7 +180,7 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
 
 def largest_differences(file: GravityCompensationFile, model: IdentifiedModel) -> NDArray[np.float64]:
     """(7,) by how much [N m] the torque that the file commands at rest differs from the model's over the joint box."""
-    poses = model.load_arm().sample_poses(4000, np.random.default_rng(1))
+    poses = model.arm.sample_poses(4000, np.random.default_rng(1))
     return np.asarray(np.abs(controller_torque(file, poses) - model.holding_torque(poses)).max(axis=0))
 
 
@@ -253,7 +253,7 @@ def _refuse_errors(
         return
     least = min(tolerance, 1e-6)
     off = ", ".join(f"{name} {e:.2g}" for name, e in zip(MTM_JOINTS, error, strict=True) if e > least)
-    down = model.load_arm().gravity
+    down = model.arm.gravity
     lean = float(np.rad2deg(np.arccos(np.clip(-down[2] / np.linalg.norm(down), -1.0, 1.0))))
     limits = ["a last link balanced about its roll axis"]
     if lean > 0.05:

@@ -110,7 +110,7 @@ def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) 
     Raises:
         ModelError: the model is not of an MTM, or the file is named as one of another arm of this project.
     """
-    arm = model.load_arm()
+    arm = model.arm
     if arm.joint_names != MTM_JOINTS:
         raise ModelError(f"{arm.name}: a gravity-compensation file of the dVRK is one of an MTM; joints differ")
     known = [name.upper() for name in known_arms()]

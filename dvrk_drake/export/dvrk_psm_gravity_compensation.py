@@ -93,7 +93,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
         ModelError: not the model of a PSM, a counterweight that outweighs all that the insertion carries, or an error
             above `tolerance` [N m, N]: joint effects, trust below 1.
     """
-    arm = model.load_arm()
+    arm = model.arm
     plant = make_arm_plant(arm)
     if arm.joint_names[:3] != ARM_JOINTS or not plant.HasBodyNamed("back_crank_link"):
         raise ModelError(f"{arm.name}: the controller's kinematic compensation file is one of a PSM; joints differ")

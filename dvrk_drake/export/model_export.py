@@ -48,7 +48,7 @@ class ModelExport:
             DvrkDrakeError: the file cannot be written.
             ModelError: something in the arm's SDF that URDF cannot state.
         """
-        arm = self.model.load_arm()
+        arm = self.model.arm
         if self.bodies is not None:
             write = write_sdf if self.format == "sdf" else write_urdf
             write(arm, self.bodies.links, path, self.origin, self.bodies.rotors)
@@ -70,7 +70,7 @@ def prepare_export(
     saturation: Sequence[float] | None = None,
 ) -> ModelExport:
     """Computes what `export_model` writes; arguments and errors as there."""
-    origin = origin or f"a model of {model.load_arm().name}"
+    origin = origin or f"a model of {model.arm.name}"
     if format in ("sdf", "urdf"):
         return ModelExport(model, format, origin, bodies=model_bodies(model))
     if format == "dvrk-kinematic-gc":

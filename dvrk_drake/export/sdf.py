@@ -17,7 +17,7 @@ from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import LARGEST_BINARY, atomic_write, open_input, read_json_input
-from dvrk_drake.models.sdf_model import DRAKE, MODELS_FOLDER, PACKAGE_URL, compose_sdf
+from dvrk_drake.models.sdf_model import DRAKE, PACKAGE_URL, compose_sdf, local_path
 
 #: Relative change below which a link keeps its text: what converting an inertia back and forth rounds off.
 _UNCHANGED = 1e-12
@@ -226,11 +226,9 @@ def copy_meshes(copies: dict[Path, Path]) -> None:
 
 
 def _local_path(uri: str) -> Path | None:
-    if uri.startswith(PACKAGE_URL):
-        return MODELS_FOLDER / uri.removeprefix(PACKAGE_URL)
-    if uri.startswith(_FILE_URL) or "://" not in uri:
-        return Path(uri.removeprefix(_FILE_URL))
-    return None
+    if "://" in uri.removeprefix(PACKAGE_URL).removeprefix(_FILE_URL):
+        return None
+    return local_path(uri.removeprefix(_FILE_URL))
 
 
 def _parts_of(mesh: Path) -> list[str]:

@@ -31,9 +31,10 @@ from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_li
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, within
-from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, read_sdf_facts
+from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, local_path, read_sdf_facts
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
+_ARMS = MODELS_FOLDER / "arms"
 #: Length of the gravity vector, at most [m/s^2].
 LARGEST_GRAVITY = 30.0
 #: A gain is too large if this position error [rad, m] demands the whole effort limit of the joint: kp at once, kd if
@@ -244,11 +245,15 @@ def _count_fault(key: str, values: Mapping[str, Sequence[float] | NDArray], join
 
 def known_arms() -> list[str]:
     """Names that `load_arm` accepts."""
-    return sorted(path.stem for path in (MODELS_FOLDER / "arms").glob("*.yaml"))
+    return sorted(path.stem for path in _ARMS.glob("*.yaml"))
 
 
 def load_arm(name: str) -> Arm:
-    """Loads an arm by name (e.g. "mtml"; case does not matter) or by the path of an arm's YAML file.
+    """Loads an arm.
+
+    Args:
+        name: of an arm of this package, e.g. "mtml" (case does not matter), or the path or package URL of an arm's YAML
+            file.
 
     Raises:
         ArmError: no such arm, or its files contradict each other.
@@ -262,7 +267,11 @@ def load_arm(name: str) -> Arm:
     """
     if "\0" in name:
         raise ArmError(f"{name!r}: is not the name of a file")
-    return _load_arm(os.path.realpath(name) if name.endswith((".yaml", ".yml")) else name.lower())
+    if not name.endswith((".yaml", ".yml")):
+        return _load_arm(name.lower())
+    path = Path(os.path.realpath(local_path(name)))
+    # One Arm object an arm, whatever it is loaded by.
+    return _load_arm(path.stem if path.parent == _ARMS.resolve() else str(path))
 
 
 @cache
@@ -271,7 +280,7 @@ def _load_arm(name: str) -> Arm:
     if not path.is_absolute():
         if name not in known_arms():
             raise ArmError(f'unknown arm "{name}"; known arms: {", ".join(known_arms())}; or name a YAML file')
-        path = MODELS_FOLDER / "arms" / f"{name}.yaml"
+        path = _ARMS / f"{name}.yaml"
     description = load_typed_yaml(ArmDescription, path, ArmError, "an arm's file")
     mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)
     instrument = Instrument()

@@ -66,6 +66,11 @@ class SdfFacts:
     prismatic: frozenset[str]
 
 
+def local_path(url: str) -> Path:
+    """Returns the path of a package URL, or of what is a path already."""
+    return MODELS_FOLDER / url.removeprefix(PACKAGE_URL) if url.startswith(PACKAGE_URL) else Path(url)
+
+
 def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | None = None) -> ElementTree.Element:
     """The model of the first file with the links, joints and frames of the others added: an arm and its instrument.
 
@@ -82,7 +87,7 @@ def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | Non
         ArmError: a file is not an SDF with one model, gives a link that is already there more than shapes and a mass
             of 0, or lacks one that is to be mirrored.
     """
-    root, *others = (_read(Path(str(url).replace(PACKAGE_URL, f"{MODELS_FOLDER}/", 1))) for url in urls)
+    root, *others = (_read(local_path(url)) for url in urls)
     for url, part in zip(urls, (root, *others), strict=True):
         mirror_links(part, (mirrored or {}).get(url, ()), url)
     (model,) = root.findall("model")

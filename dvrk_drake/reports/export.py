@@ -26,7 +26,7 @@ from dvrk_drake.reports.figures import MODEL_COLOUR, save_figure
 
 def print_export(console: Console, path: str, export: ModelExport) -> None:
     """Prints what a file has of a model, what it cannot state, and its name."""
-    arm = export.model.load_arm()
+    arm = export.model.arm
     if export.format == "sdf" and export.bodies is not None:
         print_changed_links(console, changed_links(arm, export.bodies.links), export.bodies)
         console.print(f"SDF: {path}", soft_wrap=True)

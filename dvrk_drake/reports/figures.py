@@ -81,7 +81,7 @@ def plot_measured_against_predicted(
         doubts: what is doubted is drawn as a cross, and does not stretch the axes.
     """
     usable = usable_measurements(recording.q.shape, doubts) & measured_joints
-    arm = model.load_arm()
+    arm = model.arm
     names = arm.joint_names
     measured, predicted = recording.measured_effort(), model.holding_torque(recording.q)
     figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained")
@@ -115,7 +115,7 @@ def plot_measured_against_predicted(
     key = next((ax.get_legend_handles_labels() for ax in axes.flat if ax.has_data()), None)
     if key:
         figure.legend(*key, loc="lower right", fontsize=8)
-    figure.suptitle(f"{model.arm}: holding torque, {len(recording)} rows of {Path(recording.source).name}")
+    figure.suptitle(f"{model.arm.name}: holding torque, {len(recording)} rows of {Path(recording.source).name}")
     save_figure(figure, path)
 
 
@@ -125,13 +125,13 @@ def plot_static_identification(folder: Path, result: StaticIdentification) -> No
     joints = result.model.joints
     plot_torque_error(
         folder / "torque_error.png",
-        result.model.load_arm(),
+        result.model.arm,
         np.array([j.rms_zero_torque_undoubted for j in joints]),
         {
             "leave-one-out": np.array([j.rms_leave_one_out_undoubted for j in joints]),
             "ten-fold, effects chosen anew": np.array([j.rms_cross_validation_undoubted for j in joints]),
         },
-        f"{result.model.arm}: poses not used for fitting ({Path(recording.source).name}, without doubted ones)",
+        f"{result.model.arm.name}: poses not used for fitting ({Path(recording.source).name}, without doubted ones)",
     )
     plot_measured_against_predicted(folder / "predicted.png", result.model, recording, result.measured, result.doubts)
 
@@ -139,14 +139,14 @@ def plot_static_identification(folder: Path, result: StaticIdentification) -> No
 def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
     """Writes torque_error.png and predicted.png of a validation."""
     model = validation.model
-    arm = model.load_arm()
+    arm = model.arm
     recording = validation.recording.in_joint_coordinates(arm)
     plot_torque_error(
         folder / "torque_error.png",
         arm,
         np.array([j.rms_torque for j in validation.joints]),
         {"model": np.array([j.rms_error for j in validation.joints])},
-        f"{model.arm}: all {validation.poses} poses of {Path(recording.source).name}",
+        f"{model.arm.name}: all {validation.poses} poses of {Path(recording.source).name}",
     )
     plot_measured_against_predicted(folder / "predicted.png", model, recording, validation.measured, validation.doubts)
 

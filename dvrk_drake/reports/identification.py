@@ -81,7 +81,7 @@ def plot_identification(folder: Path, result: Identification) -> None:
     """Writes PNGs of fitted and predicted efforts; a motion's as `plot_motion`."""
     if isinstance(result, DynamicIdentification):
         fit = validate_motion(result.model, result.recording)
-        arm = result.model.load_arm()
+        arm = result.model.arm
         plot_motion(folder, arm, fit, f"{arm.name}, fitted to {Path(result.recording.source).name}")
     elif isinstance(result, StaticIdentification):
         plot_static_identification(folder, result)
@@ -90,7 +90,7 @@ def plot_identification(folder: Path, result: Identification) -> None:
 def plot_validation(folder: Path, validation: Validation) -> None:
     """Writes PNGs of errors; a motion's as `plot_motion`."""
     if isinstance(validation, DynamicValidation):
-        arm = validation.model.load_arm()
+        arm = validation.model.arm
         plot_motion(folder, arm, validation, f"{arm.name}, {Path(validation.recording.source).name}")
     elif isinstance(validation, StaticValidation):
         plot_static_validation(folder, validation)

@@ -23,7 +23,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.experiments.demo.demo import NO_DRY_FRICTION, DemoResult
 from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
 from dvrk_drake.experiments.simulation import Simulation
-from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.arm import Arm
 
 TABLE_WIDTH = 112
 RULE_WIDTH = 80
@@ -84,11 +84,11 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
     """Parameters with their standard errors, then how each joint was fitted."""
     provenance = model.provenance
     console.print(
-        f"{model.arm}, {provenance.poses} poses, method {provenance.method}, rank {provenance.rank} of "
+        f"{model.arm.name}, {provenance.poses} poses, method {provenance.method}, rank {provenance.rank} of "
         f"{len(model.base_parameters)}, condition number {provenance.condition_number:.3g}\n"
     )
     table = make_table("Base parameters", "", "value", "standard error", "unit", "|value| < 2 se")
-    units = derive_gravity(model.load_arm()).base.units
+    units = derive_gravity(model.arm).base.units
     for p, unit in zip(model.base_parameters, units, strict=True):
         zero = "" if p.distinguishable else "zero?"
         table.add_row(escape(p.name), f"{p.value:+.5f}", f"{p.standard_error:.5f}", unit, zero)
@@ -189,14 +189,16 @@ def print_demo(console: Console, result: DemoResult, folder: Path) -> None:
     console.print(NO_DRY_FRICTION, style="dim", soft_wrap=True)
     files = sorted(path.name for path in folder.iterdir() if path.is_file())
     console.print(f"written to {folder}: {', '.join(files)}", soft_wrap=True)
-    if load_arm(result.identification.model.arm).coupled_limits:
+    if result.identification.model.arm.coupled_limits:
         console.print(
             "The simulated arm has no stops in q2 + q3 yet: the step, and the release with the model as drawn, pass "
             "where a real arm would hit them.",
             style="dim",
             soft_wrap=True,
         )
-    console.print(NEXT_STEPS.format(folder=folder, arm=result.identification.model.arm), markup=False, soft_wrap=True)
+    console.print(
+        NEXT_STEPS.format(folder=folder, arm=result.identification.model.arm.source), markup=False, soft_wrap=True
+    )
 
 
 def print_symbolic_model(console: Console, gravity: SymbolicGravity) -> None:

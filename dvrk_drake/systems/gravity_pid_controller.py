@@ -103,7 +103,7 @@ class GravityPidController(LeafSystem):
         """
         super().__init__()
         model.check()
-        arm = model.load_arm()
+        arm = model.arm
         self._arm, self._joint_names = arm, arm.joint_names
         n = arm.num_joints
         limits = np.asarray(arm.effort_limits if effort_limits is None else effort_limits, float)

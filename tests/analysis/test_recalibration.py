@@ -66,7 +66,7 @@ def test_friction_and_offsets_of_the_second_day_are_found(name):
 def test_rigid_bodies_stay_and_offsets_count_in_motion_alone():
     model, truth, generator = days("psm")
     result = refit_friction(model, motion(truth, generator))
-    new, arm = result.model, model.load_arm()
+    new, arm = result.model, model.arm
     assert new.dynamics.links == model.dynamics.links and new.dynamics.rotors == model.dynamics.rotors
     assert new.base_parameters == model.base_parameters
     # An offset that a motion shows is no torque that holds an arm (`IdentifiedModel.holding_effects`).

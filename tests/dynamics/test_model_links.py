@@ -47,7 +47,7 @@ def parameters_of(model: IdentifiedModel, regressor: DynamicRegressor) -> np.nda
 
 
 def written(model: IdentifiedModel, path) -> DynamicRegressor:
-    arm, bodies = model.load_arm(), model_bodies(model)
+    arm, bodies = model.arm, model_bodies(model)
     write_sdf(arm, bodies.links, path, "a test", bodies.rotors)
     return DynamicRegressor(dataclasses.replace(arm, sdf=(str(path),)))
 

@@ -115,7 +115,7 @@ def test_the_controller_computes_the_models_torque_from_the_file(name, tmp_path)
         ActuatorEffectEstimate("actuator.wrist_platform", "offset", 0.0, -0.01),
         ActuatorEffectEstimate("joint.wrist_pitch", "spring", 4.0, 0.02),
     ]
-    arm = model.load_arm()
+    arm = model.arm
     path = tmp_path / "gc.json"
     compensation_from_model(model).save(path, arm.name, "test")
     q = arm.sample_poses(300, np.random.default_rng(11))
@@ -174,7 +174,7 @@ def test_friction_of_a_models_dynamics_is_what_a_joint_feels_that_moves_alone():
 
 def test_limits_hold_what_is_needed_and_what_the_motors_have():
     model = balanced()
-    arm = model.load_arm()
+    arm = model.arm
     file = compensation_from_model(model)
     tau = model.holding_torque(arm.sample_poses(100000, np.random.default_rng(12)))
     assert np.all((tau >= file.torque_lower) & (tau <= file.torque_upper))
@@ -207,8 +207,8 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
         if "trust" in change:
             model.joints[4].trust = change["trust"]
         else:
-            model.gravity = change["gravity"]
-            model.base_parameters = IdentifiedModel.from_arm(model.load_arm()).base_parameters
+            model.arm = model.arm.with_gravity(change["gravity"])
+            model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
         with pytest.raises(ModelError, match="cannot hold"):
             compensation_from_model(model)
     with pytest.raises(ModelError, match="one of an MTM"):
@@ -230,8 +230,8 @@ def test_a_tolerance_that_is_no_number_accepts_nothing(arm, option, tolerance, t
 
 def test_a_leaning_base_is_refused_by_default_and_held_as_well_as_the_file_can(tmp_path, capsys):
     model = balanced()
-    model.gravity = LEANING
-    model.base_parameters = IdentifiedModel.from_arm(model.load_arm()).base_parameters
+    model.arm = model.arm.with_gravity(LEANING)
+    model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
     given, out = tmp_path / "model.yaml", tmp_path / "gc.json"
     model.save(given)
     assert main(["export", str(given), "--dvrk-gc", str(out)]) == 2
@@ -241,7 +241,7 @@ def test_a_leaning_base_is_refused_by_default_and_held_as_well_as_the_file_can(t
     tolerance = error.split("--gc-tolerance ")[1].strip()
     assert main(["export", str(given), "--dvrk-gc", str(out), "--gc-tolerance", tolerance]) == 0
     printed = capsys.readouterr().out
-    q = model.load_arm().sample_poses(300, np.random.default_rng(5))
+    q = model.arm.sample_poses(300, np.random.default_rng(5))
     controller = np.array([dvrk_controller(out, pose, np.zeros(7)) for pose in q])
     off = np.abs(controller - model.holding_torque(q)).max(axis=0)
     stated = largest_differences(GravityCompensationFile.load(out), model)

@@ -61,12 +61,12 @@ def other_psm():
 def test_the_controller_computes_the_models_torque_from_the_file(gravity, tmp_path):
     model = other_psm()
     if gravity is not None:
-        model.gravity = gravity
-        model.base_parameters = IdentifiedModel.from_arm(model.load_arm()).base_parameters
+        model.arm = model.arm.with_gravity(gravity)
+        model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
     path = tmp_path / "psm.json"
     file = kinematic_compensation(model)
     file.save(path)
-    arm = model.load_arm()
+    arm = model.arm
     q = arm.sample_poses(200, np.random.default_rng(8))
     q[:, 3:] = 0.0
     expected = model.holding_torque(q)[:, :3]

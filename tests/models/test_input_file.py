@@ -179,7 +179,7 @@ def test_limits_in_degrees_are_refused(key, tmp_path):
         load_arm(str(path))
 
 
-@pytest.mark.parametrize("key", ["base_parameters[3].value", "joints[2].trust", "gravity[0]", "joints[0].rms_fit"])
+@pytest.mark.parametrize("key", ["base_parameters[3].value", "joints[2].trust", "joints[0].rms_fit"])
 @pytest.mark.parametrize("number", [math.nan, math.inf])
 def test_a_model_with_a_number_that_is_none_is_refused(key, number, tmp_path, capsys):
     model = IdentifiedModel.from_arm(ARM)
@@ -187,16 +187,13 @@ def test_a_model_with_a_number_that_is_none_is_refused(key, number, tmp_path, ca
     index, _, attribute = rest.partition("].")
     path = tmp_path / "model.yaml"
     model.save(path)
-    if attribute:
-        setattr(getattr(model, name)[int(index)], attribute, number)
-    else:
-        getattr(model, name)[int(index.strip("]"))] = number
+    setattr(getattr(model, name)[int(index)], attribute, number)
     with pytest.raises(ModelError) as refusal:
         model.save(tmp_path / "other.yaml")
     assert f"{key} is {number}; allowed: a finite number" in str(refusal.value)
-    from pydrake.common.yaml import yaml_dump_typed
-
-    path.write_text(yaml_dump_typed(model))
+    content = yaml.safe_load(path.read_text())
+    content[name][int(index)][attribute] = number
+    path.write_text(yaml.safe_dump(content))
     write_recording(random_recording(), tmp_path / "r.csv")
     assert main(["validate", str(path), str(tmp_path / "r.csv")]) == 2
     assert f"{path}: {key} is {number}; allowed: a finite number" in capsys.readouterr().err

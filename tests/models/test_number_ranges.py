@@ -14,7 +14,7 @@ import yaml
 from guard_bench import Weightless
 
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.identified_model import IdentifiedModel, ModelFile
 from dvrk_drake.errors import ArmError, ControllerError, ModelError, ScenarioError, StationError
 from dvrk_drake.experiments.scenario import Scenario, load_scenario
 from dvrk_drake.experiments.study.study_file import Study
@@ -43,7 +43,7 @@ from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.station_config import load_station_config
 
 #: Schemas of files.
-FILES = (ArmDescription, Mechanism, Instrument, Gains, DvrkDriver, Scenario, Study, PoseFile, IdentifiedModel)
+FILES = (ArmDescription, Mechanism, Instrument, Gains, DvrkDriver, Scenario, Study, PoseFile, ModelFile)
 #: Dataclasses that Python code makes, with arrays.
 OBJECTS = (Arm, GravityCompensationFile, CollectionSettings, Grip)
 
@@ -97,7 +97,7 @@ IN_OBJECTS = {f"{schema.__name__}.{key_of(p)}": (p, f) for schema in OBJECTS for
 def test_no_schema_is_passed_over():
     assert len(IN_FILES) > 120
     assert len(IN_OBJECTS) > 50
-    assert {"IdentifiedModel.joints[0].trust", "DvrkDriver.guard.expiry", "Mechanism.gains.kp[0]"} <= set(IN_FILES)
+    assert {"ModelFile.joints[0].trust", "DvrkDriver.guard.expiry", "Mechanism.gains.kp[0]"} <= set(IN_FILES)
     assert {"Arm.effort_limits", "Arm.gains.kp[0]", "Arm.linkage.matrix"} <= set(IN_OBJECTS)
 
 

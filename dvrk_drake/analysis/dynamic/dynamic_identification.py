@@ -191,14 +191,14 @@ def _section(
 
 def _model(recording: Recording, arm: Arm, section: DynamicSection, covariance: NDArray[np.float64]) -> IdentifiedModel:
     in_joints = recording.in_joint_coordinates(arm)
+    as_mounted = arm.with_gravity(section.gravity)
     joints = []
     for j, name in enumerate(arm.joint_names):
         lower, upper = float(in_joints.q[:, j].min()), float(in_joints.q[:, j].max())
         coverage = (upper - lower) / float(arm.position_upper[j] - arm.position_lower[j])
         joints.append(JointStatistics(name=name, position_lower=lower, position_upper=upper, coverage=coverage))
     model = IdentifiedModel(
-        arm=arm.source,
-        gravity=section.gravity,
+        arm=as_mounted,
         joints=joints,
         provenance=Provenance(
             recording=recording.source,
@@ -209,8 +209,6 @@ def _model(recording: Recording, arm: Arm, section: DynamicSection, covariance: 
         ),
         dynamics=section,
     )
-    # The model's own arm, whose gravity is derived once for all.
-    as_mounted = model.load_arm()
     regressor = DynamicRegressor(as_mounted)
     model.base_parameters = base_parameter_estimates(as_mounted, section, regressor, covariance)
     return model

@@ -100,7 +100,7 @@ def predict_motion(model: IdentifiedModel, recording: Recording) -> NDArray[np.f
         ModelError: the model has no dynamics.
     """
     dynamics = model.dynamic_model
-    grid = motion_grid(recording, model.load_arm(), dynamics.section.signals)
+    grid = motion_grid(recording, model.arm, dynamics.section.signals)
     return low_pass(_efforts(model, grid), grid.rate, grid.settings.effort_cut_off)
 
 
@@ -115,7 +115,7 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
         ModelError: the model has no dynamics.
     """
     dynamics = model.dynamic_model
-    arm = model.load_arm()
+    arm = model.arm
     tau = recording.in_actuator_coordinates(arm).measured_effort()
     grid = motion_grid(recording, arm, dynamics.section.signals)
     measured, predicted = grid.behind_filter(tau), grid.behind_filter(_efforts(model, grid))

@@ -238,7 +238,7 @@ def payload(
         >>> round(result.payload.body.mass, 3), result.payload.found  # [kg]
         (0.1, True)
     """
-    arm = model if isinstance(model, Arm) else model.load_arm()
+    arm = model if isinstance(model, Arm) else model.arm
     check_links(DynamicRegressor(arm), [] if link is None else [link])
     found: tuple[Finding, ...] = ()
     for recording in (reference, loaded):

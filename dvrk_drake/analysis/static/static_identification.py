@@ -124,8 +124,7 @@ def identify_static(
             trust = np.where(_segments_support(problem, validated, usable), trust, 0.0)
     fit = _scaled(fit, tau, trust)
     model = IdentifiedModel(
-        arm=arm.source,
-        gravity=[float(x) for x in arm.gravity],
+        arm=arm,
         base_parameters=[
             BaseParameterEstimate(name, *_estimate(value, error))
             for name, value, error in zip(gravity_model.gravity.base.names, fit.theta, sd, strict=False)

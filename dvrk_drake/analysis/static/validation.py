@@ -82,7 +82,7 @@ def predict_static(model: IdentifiedModel, recording: Recording) -> NDArray[np.f
     Raises:
         RecordingError: the recording does not fit the model's arm.
     """
-    arm = model.load_arm()
+    arm = model.arm
     recording.check_fits(arm)
     tau = model.holding_torque(recording.in_joint_coordinates(arm).q)
     if recording.coordinates == "actuator":
@@ -104,7 +104,7 @@ def validate_static(
     Raises:
         RecordingError: the recording does not fit the model's arm, or has no efforts.
     """
-    arm = model.load_arm()
+    arm = model.arm
     measured = recording.measured_effort()
     predicted = predict_static(model, recording)
     residuals = measured - predicted

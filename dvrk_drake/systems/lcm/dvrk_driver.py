@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import ModelError, StationError
+from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import MessageKey
@@ -75,12 +75,7 @@ class DvrkDriver:
         Raises:
             ModelError: it cannot be read, or is not of `arm`.
         """
-        if not self.model:
-            return None
-        model = IdentifiedModel.load(self.model)
-        if model.load_arm().name != arm.name:
-            raise ModelError(f"{self.model}: is of {model.load_arm().name}, not of {arm.name}")
-        return model
+        return IdentifiedModel.load(self.model, arm) if self.model else None
 
     def load_key(self) -> MessageKey | None:
         """Returns the key in `key_file`, or None without one.

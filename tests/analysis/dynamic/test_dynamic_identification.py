@@ -59,7 +59,7 @@ def test_cross_validation_promises_no_more_than_the_noise_allows(case):
 
 def test_true_base_parameters_and_rotors_lie_in_their_intervals(case):
     _, truth, _, result = case
-    mounted = result.model.load_arm()
+    mounted = result.model.arm
     B = base_parameter_map(derive_gravity(mounted), DynamicRegressor(mounted))
     beta = B @ truth.parameters[: B.shape[1]]
     z = [(p.value - b) / p.standard_error for p, b in zip(result.model.base_parameters, beta, strict=True)]

@@ -47,8 +47,7 @@ def model_of_all_effects(name, tilt):
     section = dataclasses.replace(dynamics.section, gravity_expected=dynamics.section.gravity)
     covariance = np.eye(10 * len(section.links)) * 1e-6
     model = IdentifiedModel(
-        arm=arm.source,
-        gravity=section.gravity,
+        arm=arm,
         base_parameters=base_parameter_estimates(arm, section, dynamics.regressor, covariance),
         joints=[JointStatistics(name=joint) for joint in arm.joint_names],
         dynamics=section,
@@ -94,7 +93,7 @@ def test_of_a_loaded_file_too_and_what_contradicts_itself_is_refused(case, tmp_p
     with pytest.raises(ModelError, match="has effects only there"):
         dataclasses.replace(model, effects=model.holding_effects[:1]).check()
     with pytest.raises(ModelError, match="the gravity that stands there"):
-        dynamics = dataclasses.replace(model.dynamics, gravity=[float(-g) for g in model.gravity])
+        dynamics = dataclasses.replace(model.dynamics, gravity=[float(-g) for g in model.arm.gravity])
         dataclasses.replace(model, dynamics=dynamics).check()
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import IdentificationError, ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.recordings.recording import Recording, read_recording
 
 pytestmark = pytest.mark.slow
@@ -231,25 +233,44 @@ def test_model_file_round_trip_and_refusals(arm, tmp_path):
     again = IdentifiedModel.load(tmp_path / "m.yaml")
     assert again == model
     np.testing.assert_allclose(again.holding_torque(recording.q), model.holding_torque(recording.q), atol=1e-12)
-    text = (tmp_path / "m.yaml").read_text()
+    text, url = (tmp_path / "m.yaml").read_text(), "package://dvrk_drake/arms/mtmr.yaml"
     for bad, message in (
-        (text.replace("arm: mtmr", "arm: psm9"), 'unknown arm "psm9"'),
+        (text.replace(url, "psm9"), 'unknown arm "psm9"'),
         (
             text.replace("kind: cable sine", "kind: viscous"),
             'kind is "viscous"; allowed: offset, spring, cable sine, cable cosine',
         ),
         (
-            text.replace("model 2", "model 1").replace("\neffects:", "\njoint_effects:"),
-            'model 1", this version reads "dvrk_drake identified model 2"; identify anew',
+            text.replace("model 3", "model 1").replace("\neffects:", "\njoint_effects:"),
+            'model 1", this version reads "dvrk_drake identified model 3"; identify anew',
         ),
         (text.replace("trust: 1.0", "trust: 2.0"), r"joints\[1\]\.trust is 2; allowed: 0\.\.1"),
-        (text.replace("arm: mtmr", "arms: mtmr"), 'key "arms" is unknown; did you mean "arm"'),
+        (text.replace("arm: ", "arms: ", 1), 'key "arms" is unknown; did you mean "arm"'),
         ("]", "not YAML: line 1"),
     ):
         assert bad != text
         (tmp_path / "bad.yaml").write_text(bad)
         with pytest.raises(ModelError, match=message):
             IdentifiedModel.load(tmp_path / "bad.yaml")
+
+
+def test_a_model_file_finds_its_arm_after_both_have_moved_and_one_of_version_2_is_read(tmp_path):
+    (tmp_path / "arms").mkdir()
+    shutil.copy(MODELS_FOLDER / "arms" / "mtmr.yaml", tmp_path / "arms" / "own.yaml")
+    IdentifiedModel.from_arm(load_arm(str(tmp_path / "arms" / "own.yaml"))).save(tmp_path / "model.yaml")
+    text = (tmp_path / "model.yaml").read_text()
+    assert "\narm: arms/own.yaml\n" in text
+    (tmp_path / "elsewhere").mkdir()
+    moved = shutil.move(tmp_path / "arms", tmp_path / "elsewhere")
+    shutil.move(tmp_path / "model.yaml", tmp_path / "elsewhere")
+    arm = IdentifiedModel.load(tmp_path / "elsewhere" / "model.yaml").arm
+    assert arm is load_arm(f"{moved}/own.yaml")
+    for name in ("mtmr", f"{moved}/own.yaml"):
+        old = text.replace("model 3", "model 2").replace("arm: arms/own.yaml", f"arm: {name}")
+        (tmp_path / "old.yaml").write_text(old)
+        assert IdentifiedModel.load(tmp_path / "old.yaml").arm is load_arm(name)
+    with pytest.raises(ModelError, match=r"old\.yaml: is of MTMR, not of PSM"):
+        IdentifiedModel.load(tmp_path / "old.yaml", load_arm("psm"))
 
 
 # The paper's own recording.
