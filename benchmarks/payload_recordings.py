@@ -70,7 +70,7 @@ def _with_payload(recording: Recording, model: DynamicModel, link: str, mass: fl
     grid = motion_grid(recording, arm, model.section.signals)
     k = [link.link for link in model.regressor.links].index(link)
     Y = model.regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
-    added = Y @ point_mass_parameters(mass, place) @ arm.transmission.inverse().matrix
+    added = Y @ point_mass_parameters(mass, place) @ arm.transmission.inverse.matrix
     return dataclasses.replace(recording, tau=recording.measured_effort() + grid.efforts_at_rows(added))
 
 

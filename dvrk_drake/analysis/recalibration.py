@@ -18,7 +18,6 @@ from dvrk_drake.analysis.signals.drive_efforts import (
 )
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of, phase_folds
-from dvrk_drake.dynamics.actuator_effects import effect_coordinates
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -204,7 +203,7 @@ class _Fit:
         self.other = expected.other
         self.keys = list(expected.friction)
         self.friction = np.stack([expected.friction[key] for key in self.keys], axis=2)
-        rows = effect_coordinates(model.arm)
+        rows = model.arm.effect_coordinates
         self._loads = np.array([rows[coordinate] != 0 for coordinate, _ in self.keys])
         self.expected = expected.total()
         self._folds = folds

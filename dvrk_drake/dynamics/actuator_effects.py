@@ -1,9 +1,10 @@
 """Torques of friction, cables and springs in the drive: each a named model, linear in one coefficient.
 
-An effect acts along a coordinate x of the drive (see `effect_coordinates`): an actuator, a joint that actuators share,
-or a place where parts rub. The effort that the motors must add is coefficient * shape(x, v, state), pulled back to the
-actuators. A shape is written once: one of position alone as an expression, which serves the torque that holds an arm
-as well as its motion; one of velocity or with memory as a step, which a batch runs over a motion, a simulation in time.
+An effect acts along a coordinate x of the drive (see `Arm.effect_coordinates`): an actuator, a joint that actuators
+share, or a place where parts rub. The effort that the motors must add is coefficient * shape(x, v, state), pulled
+back to the actuators. A shape is written once: one of position alone as an expression, which serves the torque that
+holds an arm as well as its motion; one of velocity or with memory as a step, which a batch runs over a motion, a
+simulation in time.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ class ActuatorEffect:
     """One effect along one coordinate of the drive.
 
     Attributes:
-        coordinate: a key of `effect_coordinates(arm)`.
+        coordinate: a key of `Arm.effect_coordinates`.
         kind: a key of `EFFECT_KINDS`.
         scale: see `EffectKind.scale`; 0 for kinds that have none.
     """
@@ -169,22 +170,9 @@ def _run(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale: float
     return out
 
 
-def effect_coordinates(arm: Arm) -> dict[str, NDArray[np.float64]]:
-    """The coordinates that effects can act along: name -> row h (n,) with x = h a of the actuators' positions a.
-
-    "actuator.<name>", "joint.<name>" and the arm's own `friction_coordinates`. The actuators' efforts for an effort f
-    along x are h' f.
-    """
-    J_inverse = arm.transmission.inverse().matrix
-    rows = {f"actuator.{name}": unit for name, unit in zip(arm.joint_names, np.eye(arm.num_joints), strict=True)}
-    rows.update({f"joint.{name}": row for name, row in zip(arm.joint_names, J_inverse, strict=True)})
-    rows.update({name: row @ J_inverse for name, row in arm.friction_coordinates.items()})
-    return rows
-
-
 def distinct_coordinates(arm: Arm) -> list[str]:
     """The coordinates that move each in its own way: the first of those that move alike, so all actuators."""
-    rows = effect_coordinates(arm)
+    rows = arm.effect_coordinates
     kept: list[str] = []
     for name in rows:
         h = rows[name] / np.linalg.norm(rows[name])
@@ -200,12 +188,12 @@ def slides(arm: Arm, coordinate: str) -> bool:
 
 def joint_row(arm: Arm, coordinate: str) -> NDArray[np.float64]:
     """(n,) what a coordinate of the drive moves by per joint; an effort f along it is row f on the joints."""
-    return np.asarray(effect_coordinates(arm)[coordinate] @ arm.transmission.matrix)
+    return np.asarray(arm.effect_coordinates[coordinate] @ arm.transmission.matrix)
 
 
 def position_along(arm: Arm, coordinate: str, q: NDArray[np.float64]) -> NDArray[np.float64]:
     """(m,) position x of a coordinate of the drive at poses q (m, n) of the joints [rad, m]."""
-    return np.asarray(arm.transmission.position(q) @ effect_coordinates(arm)[coordinate])
+    return np.asarray(arm.transmission.position(q) @ arm.effect_coordinates[coordinate])
 
 
 def spring_over(coordinate: str, x: NDArray[np.float64]) -> ActuatorEffect:
@@ -221,7 +209,7 @@ def effect_fault(arm: Arm, effect: ActuatorEffect, kinds: Collection[str] = EFFE
         effect: of any coordinate and kind.
         kinds: that are allowed here.
     """
-    coordinates = effect_coordinates(arm)
+    coordinates = arm.effect_coordinates
     if effect.coordinate not in coordinates:
         return f'coordinate is "{effect.coordinate}"; allowed: {", ".join(coordinates)}'
     if effect.kind not in kinds:

@@ -12,7 +12,6 @@ from dvrk_drake.dynamics.actuator_effects import (
     EFFECT_KINDS,
     POSITION_KINDS,
     ActuatorEffect,
-    effect_coordinates,
     effect_fault,
 )
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -38,7 +37,7 @@ def effect_shapes(
     """
     arm, q = regressor.arm, np.asarray(q, dtype=np.float64)
     a, a_dot = arm.transmission.position(q), arm.transmission.velocity(v)
-    rows = effect_coordinates(arm)
+    rows = arm.effect_coordinates
     weight = np.zeros_like(a)
     if any(EFFECT_KINDS[effect.kind].loaded for effect in effects):
         weight = nominal_weight(regressor, q)
@@ -50,7 +49,7 @@ def effect_shapes(
 def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.float64]:
     """(m, n) efforts of the actuators [N m, N] that bear the arm's weight at poses q (m, n), as the SDF states it."""
     rest = np.zeros_like(q, dtype=np.float64)
-    return regressor.arm.transmission.inverse().pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
+    return regressor.arm.transmission.inverse.pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
 
 
 #: An actuator that needs no more than this at so many poses bears no weight [N m, N].
@@ -113,11 +112,11 @@ class DynamicModel:
     def rigid_body_effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
         """(m, n) efforts of the actuators [N m, N] without effects, from motions (m, n) of the joints."""
         tau = self.regressor.torque(q, v, vd, self.parameters)
-        return self.arm.transmission.inverse().pull_back_effort(tau)
+        return self.arm.transmission.inverse.pull_back_effort(tau)
 
     def effect_effort(self, q: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
         """(m, n) efforts of the actuators [N m, N] against the effects, over an evenly sampled motion of the joints."""
-        rows = effect_coordinates(self.arm)
+        rows = self.arm.effect_coordinates
         tau = np.zeros(np.shape(q))
         shapes = effect_shapes(self.regressor, self.effects, q, v)
         for effect, coefficient, shape in zip(self.effects, self.coefficients, shapes, strict=True):

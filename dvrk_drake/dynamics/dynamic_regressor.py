@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,7 +33,7 @@ from dvrk_drake.dynamics.regressor_kernel import fill_regressor
 from dvrk_drake.dynamics.symbolic_plant import labelled_bodies
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.models.plant import shared_plant
 
 #: Samples that a thread takes at a time, and that `torque` keeps a regressor of.
 _CHUNK = 256
@@ -58,11 +60,17 @@ class DynamicRegressor:
             ArmError: a joint of its SDF neither turns, slides nor is fixed.
         """
         self.arm = arm
-        plant = make_arm_plant(arm)
+        plant = shared_plant(arm)
         self._tree = KinematicTree.from_plant(plant, arm)
         by_name = {inertia.link: inertia for inertia in link_inertias(arm)}
         self.links: tuple[LinkInertia, ...] = tuple(by_name[link] for link in self._tree.links)
         self.rotors: tuple[RotorInertia, ...] = rotor_inertias(plant, arm)
+
+    def with_gravity(self, gravity: Sequence[float]) -> DynamicRegressor:
+        """The same arm's under a gravity vector (3,) in its base frame [m/s^2]."""
+        other = copy.copy(self)
+        other.arm = self.arm.with_gravity(gravity)
+        return other
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -221,7 +229,7 @@ def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True)
     Raises:
         ArmError: the arm's SDF has no frames dh_1, dh_2, ...
     """
-    plant = make_arm_plant(model.arm)
+    plant = shared_plant(model.arm)
     bodies = labelled_bodies(plant, "dh")
     frames = _link_frames(model, plant, bodies)
     rotors = [rotor for rotor in model.rotors if coupled_rotors or rotor.actuators[0] == rotor.actuators[1]]

@@ -13,7 +13,7 @@ from pydrake.multibody.tree import RigidBody, SpatialInertia, UnitInertia
 
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.models.plant import shared_plant
 
 #: In this order everywhere; units kg, kg m, kg m^2.
 PARAMETER_NAMES = ("m", "mcx", "mcy", "mcz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
@@ -66,7 +66,7 @@ def link_inertias(arm: Arm) -> tuple[LinkInertia, ...]:
     """Every link of the arm that can move, linkage and instrument included, as its SDF has them."""
     return tuple(
         LinkInertia.from_spatial_inertia(body.name(), body.default_spatial_inertia())
-        for body in moving_bodies(make_arm_plant(arm))
+        for body in moving_bodies(shared_plant(arm))
     )
 
 
@@ -146,7 +146,7 @@ def rotor_inertias(plant: MultibodyPlant, arm: Arm) -> tuple[RotorInertia, ...]:
     for actuator in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
         row = arm.tree_joint_names.index(actuator.joint().name())
         D_tree[row, row] += actuator.default_rotor_inertia() * actuator.default_gear_ratio() ** 2
-    J_inverse = arm.transmission.inverse().matrix
+    J_inverse = arm.transmission.inverse.matrix
     G = arm.linkage.matrix
     D = J_inverse.T @ (G.T @ D_tree @ G) @ J_inverse
     names = arm.joint_names
@@ -162,7 +162,7 @@ def rotor_inertias(plant: MultibodyPlant, arm: Arm) -> tuple[RotorInertia, ...]:
 
 def rotor_links(arm: Arm) -> set[str]:
     """Links of the SDF that are rotors, balanced about their own axis: those that have no frame dh_<name>."""
-    plant = make_arm_plant(arm)
+    plant = shared_plant(arm)
     frames = [plant.get_frame(i) for i in plant.GetFrameIndices(plant.GetBodyByName("base_link").model_instance())]
     framed = {frame.body().name() for frame in frames if frame.name().startswith("dh_")}
     return {body.name() for body in moving_bodies(plant)} - framed

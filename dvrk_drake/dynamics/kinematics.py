@@ -12,7 +12,7 @@ from pydrake.multibody.tree import FrameIndex, JacobianWrtVariable
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
+from dvrk_drake.models.plant import set_arm_positions, shared_plant, tree_selector
 
 
 def handle_frame(arm: Arm) -> str:
@@ -21,7 +21,7 @@ def handle_frame(arm: Arm) -> str:
     Raises:
         ArmError: the SDF has no frame dh_0, dh_1, ...
     """
-    numbered = [name for name in _frame_names(make_arm_plant(arm)) if re.fullmatch(r"dh_\d+", name)]
+    numbered = [name for name in _frame_names(shared_plant(arm)) if re.fullmatch(r"dh_\d+", name)]
     if not numbered:
         raise ArmError(f"{arm.name}: its SDF has no frames dh_0, dh_1, ...; name the handle's frame")
     return max(numbered, key=lambda name: int(name.removeprefix("dh_")))
@@ -40,7 +40,7 @@ class ArmFrame:
             ArmError: the SDF has no such frame.
         """
         self._arm = arm
-        self._plant = make_arm_plant(arm)
+        self._plant = shared_plant(arm)
         if not self._plant.HasFrameNamed(frame_name):
             known = ", ".join(_frame_names(self._plant))
             raise ArmError(f'{arm.name}: its SDF has no frame "{frame_name}"; it has {known}')
@@ -106,7 +106,7 @@ class PsmInverseKinematics:
         not_a_psm = ArmError(f"{arm.name} has not the kinematics of a PSM with a wrist (roll, pitch, yaw)")
         if arm.num_joints < 6:
             raise not_a_psm
-        plant = make_arm_plant(arm)
+        plant = shared_plant(arm)
         context = plant.CreateDefaultContext()
         _, pitch_link, yaw_link = (plant.GetJointByName(name).child_body() for name in arm.joint_names[3:6])
         p_BWrist = pitch_link.EvalPoseInWorld(context).translation()

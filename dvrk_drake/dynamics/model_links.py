@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +18,7 @@ from dvrk_drake.dynamics.inertial_parameters import (
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.models.plant import shared_plant
 
 #: Least eigenvalue of a link's pseudo-inertia, as a share of that of the SDF's link in all directions.
 LEAST_SHARE = 0.01
@@ -66,14 +65,9 @@ def _map(link: LinkInertia) -> NDArray[np.float64]:
 
 def _is_rotor(arm: Arm, link: str) -> bool:
     """Links without a frame dh_<name> are centred on their axis, see `derive_gravity`, and must stay so."""
-    plant = _plant(arm)
+    plant = shared_plant(arm)
     frames = map(plant.get_frame, plant.GetFrameIndices(plant.GetBodyByName(link).model_instance()))
     return not any(f.name().startswith("dh_") and f.body().name() == link for f in frames)
-
-
-@cache
-def _plant(arm: Arm) -> MultibodyPlant:
-    return make_arm_plant(arm)
 
 
 def _equations(
@@ -209,7 +203,7 @@ def _place_rotors(
     that, which is all where one joint alone moves the motor. Where several do, a link that turns by J_k q takes it, as
     the SDF's own crank and motor_4 links do: about its axis, and half of it about the others, as bodies must.
     """
-    plant = make_arm_plant(arm)
+    plant = shared_plant(arm)
     turning = _turning_links(plant, arm)
     joints = np.zeros(arm.num_joints)
     lost = []

@@ -11,7 +11,7 @@ import sympy
 from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.dynamics import codegen
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates, joint_row
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, joint_row
 from dvrk_drake.dynamics.gravity_regressor import GRAVITY, SymbolicGravity, derive_gravity
 from dvrk_drake.models.arm import Arm
 
@@ -82,7 +82,7 @@ def _effect_columns(
     columns = []
     for effect in effects:
         row = [_number(r) for r in joint_row(arm, effect.coordinate).tolist()]
-        offset = effect_coordinates(arm)[effect.coordinate] @ arm.transmission.offset
+        offset = arm.effect_coordinates[effect.coordinate] @ arm.transmission.offset
         x = sum((r * q for r, q in zip(row, joint_positions, strict=True)), _number(float(offset)))
         columns.append(sympy.Matrix(row) * effect.of_position(x))
     return columns

@@ -14,7 +14,7 @@ from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import make_arm_plant, tree_selector
+from dvrk_drake.models.plant import shared_plant, tree_selector
 
 #: Coefficients are 1 or lengths in metres: below this one is a difference of equals.
 ROUNDING = 1e-14
@@ -133,7 +133,7 @@ class SymbolicPlant:
             ArmError: the SDF has no frames of that prefix.
         """
         self.arm, self._frames = arm, frames
-        self.numeric = make_arm_plant(arm)
+        self.numeric = shared_plant(arm)
         self.bodies = labelled_bodies(self.numeric, frames)
         self._plant = self.numeric.ToSymbolic()
         self._context = self._plant.CreateDefaultContext()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import Polynomial, chebyshev
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates, joint_row, position_along
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, joint_row, position_along
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import NUM_JOINTS, NUM_PARAMETERS, GravityCompensationFile
@@ -170,7 +170,7 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
     if model.dynamics is None:
         raise ModelError("the model has no dynamics, so it knows no friction; give it with --coulomb")
     arm = model.arm
-    rows = effect_coordinates(arm)
+    rows = arm.effect_coordinates
     friction = np.zeros(arm.num_joints)
     for effect in model.dynamics.effects:
         if effect.kind in DRY_KINDS:

@@ -23,7 +23,7 @@ from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.errors import ModelError
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import check_tolerance, round_up
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.models.plant import shared_plant
 
 ARM_JOINTS = ("yaw", "pitch", "insertion")
 NAMES = ("yaw", "intermediate yaw", "pitch 1", "pitch 2", "pitch 3", "insertion 1", "insertion 2")
@@ -94,7 +94,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
             above `tolerance` [N m, N]: joint effects, trust below 1.
     """
     arm = model.arm
-    plant = make_arm_plant(arm)
+    plant = shared_plant(arm)
     if arm.joint_names[:3] != ARM_JOINTS or not plant.HasBodyNamed("back_crank_link"):
         raise ModelError(f"{arm.name}: the controller's kinematic compensation file is one of a PSM; joints differ")
     check_tolerance(tolerance)

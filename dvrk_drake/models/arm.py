@@ -6,7 +6,7 @@ import dataclasses
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TypeVar
 
@@ -168,13 +168,26 @@ class Arm:
         """(n,) one number [rad, rad/s, ...] for the joints that turn, another [m, m/s, ...] for those that slide."""
         return np.where(self.prismatic, prismatic, revolute)
 
+    @cached_property
+    def effect_coordinates(self) -> dict[str, NDArray[np.float64]]:
+        """The coordinates that effects can act along: name -> row h (n,) with x = h a of the actuators' positions a.
+
+        "actuator.<name>", "joint.<name>" and the arm's own `friction_coordinates`. The actuators' efforts for an effort
+        f along x are h' f.
+        """
+        J_inverse = self.transmission.inverse.matrix
+        rows = {f"actuator.{name}": unit for name, unit in zip(self.joint_names, np.eye(self.num_joints), strict=True)}
+        rows |= {f"joint.{name}": row for name, row in zip(self.joint_names, J_inverse, strict=True)}
+        return rows | {name: row @ J_inverse for name, row in self.friction_coordinates.items()}
+
     def dry_friction(self) -> NDArray[np.float64]:
         """(n,) largest dry friction on each joint that the arm's effects state [N m, N]; 0 where they state none."""
-        rows = {f"joint.{name}": row for name, row in zip(self.joint_names, np.eye(self.num_joints), strict=True)}
-        actuators = zip(self.joint_names, self.transmission.matrix, strict=True)
-        rows |= {f"actuator.{name}": row for name, row in actuators} | self.friction_coordinates
-        dry = [abs(e.coefficient) * np.abs(rows[e.coordinate]) for e in self.effects.friction if e.kind != "viscous"]
-        return np.sum(dry, axis=0) if dry else np.zeros(self.num_joints)
+        dry = np.zeros(self.num_joints)
+        for effect in self.effects.friction:
+            if effect.kind != "viscous":
+                row = self.effect_coordinates[effect.coordinate] @ self.transmission.matrix
+                dry += np.abs(effect.coefficient * row)
+        return dry
 
     def limit_matrix(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """All limits as lower <= A q <= upper: the joint box first, then the coupled limits."""

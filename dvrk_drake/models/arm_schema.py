@@ -66,7 +66,7 @@ class MotionSettings:
 
     `acceleration_cut_off` [Hz] of the low-pass for accelerations, `effort_delay` [s] by which the recorded effort is
     later than the positions (negative: earlier). `known_effects` are what drives have beside friction: name of a
-    coordinate of the drive (`effect_coordinates`) -> "spring", "cable 1" (sine and cosine of one period a turn),
+    coordinate of the drive (`Arm.effect_coordinates`) -> "spring", "cable 1" (sine and cosine of one period a turn),
     "cable 2" (of two), "asymmetric friction". Of a mechanism also `base_may_tilt`, whether the direction of gravity is
     estimated from a motion, and `presliding_travels`, over which elasto-plastic elements give way, as shares of a
     coordinate's standard deviation of position.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.models.schema_fault import within
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LinearMap:
     """y = matrix x + offset, with velocities and efforts mapped as virtual work demands.
 
@@ -34,11 +35,10 @@ class LinearMap:
         """Effort on x that does the same work as `effort_y` on y: matrix' effort_y, (m,) or (samples, m)."""
         return np.asarray(effort_y, float) @ self.matrix
 
+    @cached_property
     def inverse(self) -> LinearMap:
-        """The map from y to x.
-
-        Raises:
-            numpy.linalg.LinAlgError: if the matrix is singular or not square.
-        """
+        """The map from y to x; raises numpy.linalg.LinAlgError if the matrix is singular or not square."""
         matrix = np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
-        return LinearMap(matrix, -matrix @ self.offset)
+        inverse = LinearMap(matrix, -matrix @ self.offset)
+        vars(inverse)["inverse"] = self
+        return inverse

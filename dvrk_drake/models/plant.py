@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
+from functools import cache
 from typing import get_args
 
 import numpy as np
@@ -108,6 +109,12 @@ def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic"
     add_arm(plant, arm, closure)
     plant.Finalize()
     return plant
+
+
+@cache
+def shared_plant(arm: Arm) -> MultibodyPlant:
+    """The finalized plant of an arm for those who only read it: made once for each Arm object."""
+    return make_arm_plant(arm)
 
 
 def set_joint_damping(plant: MultibodyPlant, arm: Arm, damping: ArrayLike) -> None:

@@ -7,7 +7,7 @@ import math
 from array import array
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Literal, get_args
@@ -19,6 +19,7 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.csv_rows import CsvReader, is_number, parse_finite, parse_or_nan, skipped_note
 from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
@@ -69,6 +70,8 @@ class Recording:
     lines: NDArray[np.int_] | None = None
     sha256: str = ""
     notes: tuple[str, ...] = ()
+    # The same recording in the other coordinates, by transmission.
+    _converted: dict[LinearMap, Recording] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:
         return len(self.q)
@@ -127,17 +130,7 @@ class Recording:
         Raises:
             RecordingError: wrong number of joints.
         """
-        self._check_joint_count(arm)
-        if self.coordinates == "joint":
-            return self
-        to_joint = arm.transmission.inverse()
-        return replace(
-            self,
-            q=to_joint.position(self.q),
-            qd=None if self.qd is None else to_joint.velocity(self.qd),
-            tau=None if self.tau is None else arm.transmission.pull_back_effort(self.tau),
-            coordinates="joint",
-        )
+        return self._in_coordinates("joint", arm)
 
     def in_actuator_coordinates(self, arm: Arm) -> Recording:
         """The same recording with q, qd and tau of the arm's actuators.
@@ -145,16 +138,24 @@ class Recording:
         Raises:
             RecordingError: wrong number of joints.
         """
+        return self._in_coordinates("actuator", arm)
+
+    def _in_coordinates(self, coordinates: Coordinates, arm: Arm) -> Recording:
         self._check_joint_count(arm)
-        if self.coordinates == "actuator":
+        if self.coordinates == coordinates:
             return self
-        return replace(
-            self,
-            q=arm.transmission.position(self.q),
-            qd=None if self.qd is None else arm.transmission.velocity(self.qd),
-            tau=None if self.tau is None else arm.transmission.inverse().pull_back_effort(self.tau),
-            coordinates="actuator",
-        )
+        # Mountings of an arm share their transmission.
+        if arm.transmission not in self._converted:
+            to_other = arm.transmission if coordinates == "actuator" else arm.transmission.inverse
+            converted = self._converted[arm.transmission] = replace(
+                self,
+                q=to_other.position(self.q),
+                qd=None if self.qd is None else to_other.velocity(self.qd),
+                tau=None if self.tau is None else to_other.inverse.pull_back_effort(self.tau),
+                coordinates=coordinates,
+            )
+            converted._converted[arm.transmission] = self
+        return self._converted[arm.transmission]
 
     def check_fits(self, arm: Arm) -> None:
         """Refuses poses that `arm` cannot have taken.

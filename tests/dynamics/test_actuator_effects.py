@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, effect_coordinates, slides
+from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, slides
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.arm import load_arm
@@ -50,7 +50,7 @@ def test_friction_under_load_is_coulomb_times_what_the_arm_weighs_there():
     q = arm.sample_poses(40, np.random.default_rng(0))
     v = np.random.default_rng(1).normal(size=q.shape)
     rest = np.zeros_like(q)
-    weight = arm.transmission.inverse().pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
+    weight = arm.transmission.inverse.pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
     for i, name in enumerate(arm.joint_names):
         plain, loaded = (ActuatorEffect(f"actuator.{name}", kind, 0.02) for kind in ("coulomb", "load coulomb"))
         a, b = effect_shapes(regressor, [plain, loaded], q, v)
@@ -61,7 +61,7 @@ def test_friction_under_load_is_coulomb_times_what_the_arm_weighs_there():
 def test_effects_do_the_same_work_on_actuators_and_along_their_coordinate():
     for name in ("mtmr", "psm"):
         arm = load_arm(name)
-        rows = effect_coordinates(arm)
+        rows = arm.effect_coordinates
         generator = np.random.default_rng(0)
         q = generator.normal(size=arm.num_joints)
         a = arm.transmission.position(q)
@@ -70,7 +70,7 @@ def test_effects_do_the_same_work_on_actuators_and_along_their_coordinate():
                 assert rows[f"joint.{joint}"] @ a == pytest.approx(q[j])
         assert len(rows) > arm.num_joints
     arm = load_arm("psm")
-    rows = effect_coordinates(arm)
+    rows = arm.effect_coordinates
     a = arm.transmission.position(q)
     assert rows["finger_1"] @ a == pytest.approx(q[5] - q[6] / 2)
     assert slides(arm, "actuator.insertion") and not slides(arm, "finger_1")

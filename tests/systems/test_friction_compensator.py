@@ -8,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.optimize import linprog
 
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.friction_compensation import (
     LARGEST_HYSTERESIS_RATIO,
     LARGEST_RATIO,
@@ -59,7 +59,7 @@ def motion(seed, steps=6000, period=1e-3):
 
 def friction_of_arm(q, v):
     """(m, n) efforts that the arm's own friction takes, by the columns that the identification uses."""
-    rows = effect_coordinates(ARM)
+    rows = ARM.effect_coordinates
     a, a_dot = ARM.transmission.position(q), ARM.transmission.velocity(v)
     efforts = np.zeros(a.shape)
     for effect, coefficient in zip(EFFECTS, COEFFICIENTS, strict=True):

@@ -13,7 +13,7 @@ from dvrk_drake.analysis.dynamic.normal_equations import solve, squared_errors
 from dvrk_drake.analysis.signals.low_pass import low_pass, resample
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of
-from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_coordinates
+from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.physical_consistency import LinkScale
@@ -62,7 +62,7 @@ class ChannelFit:
             RecordingError: the recording does not fit the arm, or is a motion that is too short or too coarse.
         """
         self.recording, self.arm = recording, arm
-        self._to_joint = arm.transmission.inverse()
+        self._to_joint = arm.transmission.inverse
         self._regressor, self._tilted = _regressors(arm)
         self.moves = bool(recording.motion(arm))
         if self.moves:
@@ -147,7 +147,7 @@ class ChannelFit:
         self._to_parameters = np.concatenate([*deviations, rotors])[:, None] * directions
         tilts = TILT_DEVIATION * np.linalg.norm(self.arm.gravity) * self._weights_of_unit_gravity(q)
         self._drive = drive = _drive_effects(self.arm, self._q, self._v, self.moves)
-        self._rows = np.array([effect_coordinates(self.arm)[effect.coordinate] for effect in drive.effects])
+        self._rows = np.array([self.arm.effect_coordinates[effect.coordinate] for effect in drive.effects])
         shapes = np.column_stack(list(effect_shapes(regressor, drive.effects, self._q, self._v)))
         shapes = self._sampled(low_pass(shapes, GRID_RATE, self._cut_off) if self.moves else shapes)
         self._effect_columns = [shapes * self._rows[:, i] for i in range(n)]
@@ -242,7 +242,8 @@ class ChannelFit:
 @cache
 def _regressors(arm: Arm) -> tuple[DynamicRegressor, list[DynamicRegressor]]:
     """The arm's regressor, and those of the arm under a gravity of 1 m/s^2 along the base's x and y."""
-    return DynamicRegressor(arm), [DynamicRegressor(arm.with_gravity(axis)) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
+    regressor = DynamicRegressor(arm)
+    return regressor, [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
 
 
 class _DriveEffects(NamedTuple):

@@ -43,7 +43,7 @@ def _wrong_sign(recording: Recording, joints: Recording, usable: NDArray[np.bool
     rows = np.linspace(0, len(joints) - 1, min(len(joints), MOST_COMPARED)).astype(int)
     gravity, tau = holding_torques(arm, joints.q[rows]), recording.measured_effort()[rows]
     if recording.coordinates == "actuator":
-        gravity = arm.transmission.inverse().pull_back_effort(gravity)
+        gravity = arm.transmission.inverse.pull_back_effort(gravity)
     findings = []
     for j, least in enumerate(arm.per_joint(*LEAST_GRAVITY)):
         use = usable[rows, j]

@@ -12,7 +12,6 @@ from dvrk_drake.analysis.signals.motion_grid import MotionGrid
 from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
     distinct_coordinates,
-    effect_coordinates,
     effect_fault,
     position_along,
     slides,
@@ -143,10 +142,10 @@ def dynamic_columns(
         rest = np.zeros_like(grid.q)
         for axis in np.eye(3)[:2]:
             # Efforts are linear in gravity: those at rest under a gravity of one are the derivative.
-            lying = DynamicRegressor(arm.with_gravity([float(g) for g in axis]))
+            lying = regressor.with_gravity(axis.tolist())
             tilts.append(_filtered(grid, lying.regressor(grid.q, rest, rest)[..., :p]))
     on_grid = np.column_stack(list(effect_shapes(regressor, effects, grid.q, grid.v)))
-    rows = np.array([effect_coordinates(arm)[effect.coordinate] for effect in effects])
+    rows = np.array([arm.effect_coordinates[effect.coordinate] for effect in effects])
     by_delay = {d: grid.behind_filter(grid.at_rows(on_grid, i)) for i, d in enumerate(grid.settings.effort_delay)}
     shapes = tuple(by_delay[d] for d in grid.settings.effort_delay)
     return DynamicColumns(
@@ -156,7 +155,7 @@ def dynamic_columns(
 
 def _filtered(grid: MotionGrid, Y: NDArray[np.float64]) -> NDArray[np.float64]:
     """(r, n, p) of the actuators behind the filter, from a regressor (m, n, p) of the joints on the grid."""
-    J_inverse = grid.arm.transmission.inverse().matrix
+    J_inverse = grid.arm.transmission.inverse.matrix
     out = np.zeros((len(range(*grid.inner.indices(len(grid.row_times)))), *Y.shape[1:]))
     for i in range(Y.shape[1]):
         of_actuator = sum(J_inverse[j, i] * Y[:, j] for j in np.flatnonzero(J_inverse[:, i]))
@@ -167,7 +166,7 @@ def _filtered(grid: MotionGrid, Y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _coordinates(arm: Arm, grid: MotionGrid) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
     """(name, x, v) of every coordinate of the drive."""
-    rows, a_dot = effect_coordinates(arm), arm.transmission.velocity(grid.v)
+    rows, a_dot = arm.effect_coordinates, arm.transmission.velocity(grid.v)
     names = distinct_coordinates(arm)
     return [(name, position_along(arm, name, grid.q), a_dot @ rows[name]) for name in names]
 

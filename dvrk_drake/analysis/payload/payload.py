@@ -22,7 +22,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.models.plant import shared_plant
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
 
@@ -161,7 +161,7 @@ def estimate_payload(
             f"{loaded.source or 'recording'}: shows no difference from the reference: they are the same recording"
         )
     Y = regressor.regressor(grid.q, grid.v, grid.vd)
-    J_inverse = model.arm.transmission.inverse().matrix
+    J_inverse = model.arm.transmission.inverse.matrix
     estimates = []
     for count, link in enumerate(wanted):
         k = names.index(link)
@@ -380,7 +380,7 @@ def _problem(
 
 def _in_base(arm: Arm, link: str, place: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3,) a point of a link in the base frame with all joints at 0."""
-    plant = make_arm_plant(arm)
+    plant = shared_plant(arm)
     context = plant.CreateDefaultContext()
     for name, x in zip(arm.tree_joint_names, arm.linkage.position(np.zeros(arm.num_joints)), strict=True):
         joint = plant.GetJointByName(name)

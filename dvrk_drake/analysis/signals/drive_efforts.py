@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid
-from dvrk_drake.dynamics.actuator_effects import effect_coordinates
 from dvrk_drake.dynamics.dynamic_model import DynamicModel, effect_shapes
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.recording import Recording
@@ -47,7 +46,7 @@ def drive_efforts(model: DynamicModel, grid: MotionGrid) -> DriveEfforts:
     """What `model` expects of the motion on `grid`."""
     other = model.rigid_body_effort(grid.q, grid.v, grid.vd)
     friction: dict[tuple[str, FrictionPart], NDArray[np.float64]] = {}
-    rows = effect_coordinates(model.arm)
+    rows = model.arm.effect_coordinates
     shapes = effect_shapes(model.regressor, model.effects, grid.q, grid.v)
     for effect, coefficient, shape in zip(model.effects, model.coefficients, shapes, strict=True):
         if not coefficient:

@@ -164,7 +164,7 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings) -> Mot
     raw = resample(clock.t, recording.q[clock.rows], t)
     a = low_pass(raw, GRID_RATE, settings.position_cut_off)
     slow = low_pass(raw, GRID_RATE, settings.acceleration_cut_off)
-    to_joint = arm.transmission.inverse()
+    to_joint = arm.transmission.inverse
     last = np.searchsorted(clock.rows, np.arange(len(recording)), side="right") - 1
     return MotionGrid(
         arm=arm,

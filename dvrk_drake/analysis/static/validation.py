@@ -87,7 +87,7 @@ def predict_static(model: IdentifiedModel, recording: Recording) -> NDArray[np.f
     tau = model.holding_torque(recording.in_joint_coordinates(arm).q)
     if recording.coordinates == "actuator":
         # tau_joint = J' tau_actuator, so the inverse map pulls back from joints to actuators.
-        tau = arm.transmission.inverse().pull_back_effort(tau)
+        tau = arm.transmission.inverse.pull_back_effort(tau)
     return tau
 
 

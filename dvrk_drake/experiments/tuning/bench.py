@@ -37,7 +37,7 @@ def counts(arm: Arm) -> NDArray[np.float64]:
     """(n,) what a joint's position is known to [rad, m]: a count of each of the encoders that it is computed from."""
     encoder = arm.effects.encoder
     table = per_actuator(encoder.resolution if encoder else {}, arm.joint_names, 0.0)
-    return np.abs(arm.transmission.inverse().matrix) @ table
+    return np.abs(arm.transmission.inverse.matrix) @ table
 
 
 def band(arm: Arm) -> NDArray[np.float64]:

@@ -197,7 +197,7 @@ class SilentEffort:
         """Check for the joints of `arm`."""
         self._commanded, self._time = settings.silent_effort * arm.effort_limits, settings.silent_time
         self._least = 0.1 * self._commanded
-        self._J, self._J_inverse = arm.transmission.matrix, arm.transmission.inverse().matrix
+        self._J, self._J_inverse = arm.transmission.matrix, arm.transmission.inverse.matrix
         self._largest = np.array([arm.effects.saturation.get(name, np.inf) for name in arm.joint_names])
 
     def begin(self, sample: Sample) -> Vector:
@@ -243,7 +243,7 @@ class Plausibility:
         """
         self.model, self._names = model, arm.joint_names
         resolution = arm.effects.encoder.resolution if arm.effects.encoder is not None else {}
-        counts = np.abs(arm.transmission.inverse().matrix) @ [resolution.get(name, 0.0) for name in arm.joint_names]
+        counts = np.abs(arm.transmission.inverse.matrix) @ [resolution.get(name, 0.0) for name in arm.joint_names]
         tolerance = arm.per_joint(settings.position_tolerance, 0.1 * settings.position_tolerance) + _COUNTS * counts
         self._detection_time = settings.detection_time
         self._checks: tuple[Check, ...] = (

@@ -11,7 +11,7 @@ from dvrk_drake.analysis.check.channel_check import check_channels
 from dvrk_drake.analysis.check.recording_check import check_with_channels
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_coordinates
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import load_arm
@@ -34,10 +34,10 @@ def motion(name):
     regressor = DynamicRegressor(arm)
     masses = np.repeat(generator.uniform(0.9, 1.1, len(regressor.links)), 10)
     parameters = regressor.values * np.append(masses, np.ones(len(regressor.values) - len(masses)))
-    tau = arm.transmission.inverse().pull_back_effort(regressor.torque(q, v, vd, parameters))
+    tau = arm.transmission.inverse.pull_back_effort(regressor.torque(q, v, vd, parameters))
     a, a_dot = arm.transmission.position(q), arm.transmission.velocity(v)
     for stated in [*arm.effects.friction, *arm.effects.cables, *arm.effects.springs]:
-        h = effect_coordinates(arm)[stated.coordinate]
+        h = arm.effect_coordinates[stated.coordinate]
         shape = ActuatorEffect(stated.coordinate, stated.kind, stated.scale).column(a @ h, a_dot @ h)
         tau += generator.uniform(0.8, 1.2) * stated.coefficient * np.outer(shape, h)
     tau += 0.02 * np.sqrt(np.mean(tau**2, axis=0)) * generator.normal(size=tau.shape)
@@ -151,7 +151,7 @@ def test_wrong_sign_or_scale_of_poses_is_warned_about(factor, kind):
 def test_a_scale_that_friction_may_hide_is_noted():
     """On a day with 1.5 times the friction, half the effort dissipates 0.75 times the stated power."""
     arm, recording = load_arm("mtmr"), motion("mtmr")
-    h = effect_coordinates(arm)["actuator.wrist_roll"]
+    h = arm.effect_coordinates["actuator.wrist_roll"]
     stated = [effect for effect in arm.effects.friction if effect.coordinate == "actuator.wrist_roll"]
     shapes = sum(
         e.coefficient * ActuatorEffect(e.coordinate, e.kind, e.scale).column(recording.q @ h, recording.qd @ h)

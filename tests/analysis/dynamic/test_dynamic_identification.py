@@ -1,6 +1,7 @@
 """Full dynamics of simulated arms whose truth is known, from motion to model file to prediction."""
 
 import dataclasses
+from collections import Counter
 from io import StringIO
 
 import numpy as np
@@ -16,7 +17,9 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError, RecordingError
-from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models import plant
+from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.reports.identification import print_dynamics
 from dvrk_drake.reports.terminal_tables import TABLE_WIDTH
@@ -194,6 +197,29 @@ def test_in_actuator_coordinates_it_is_the_same_model(case):
     np.testing.assert_allclose(
         [x.relative_error for x in a.actuators], [x.relative_error for x in b.actuators], rtol=1e-6, atol=0
     )
+
+
+def test_plants_inverses_and_conversions_are_made_once(case, monkeypatch):
+    """A plant for each mounting: as expected, and as the motion shows it."""
+    arm, _, recording, _ = case
+    made = Counter()
+
+    def counted(name, function):
+        def count(*arguments, **options):
+            made[name] += 1
+            return function(*arguments, **options)
+
+        return count
+
+    new = dataclasses.replace(arm, transmission=LinearMap(arm.transmission.matrix, arm.transmission.offset))
+    monkeypatch.setattr(plant, "make_arm_plant", counted("plants", plant.make_arm_plant))
+    monkeypatch.setattr(LinearMap.inverse, "func", counted("inverses", LinearMap.inverse.func))
+    monkeypatch.setattr(Arm.effect_coordinates, "func", counted("coordinates", Arm.effect_coordinates.func))
+    identify_dynamic(dataclasses.replace(recording), new)
+    assert made["inverses"] == 1
+    assert made["plants"] <= 2 and made["coordinates"] <= 2
+    assert recording.in_actuator_coordinates(arm) is recording.in_actuator_coordinates(arm)
+    assert recording.in_actuator_coordinates(arm).in_joint_coordinates(arm) is recording
 
 
 def test_what_is_no_motion_is_refused():

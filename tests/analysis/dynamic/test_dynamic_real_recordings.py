@@ -92,7 +92,7 @@ def test_the_verbs_take_a_real_motion(case, tmp_path):
     found = json.loads(errors.read_text())
     assert found["coordinates"] == "actuator" and found["mean_relative_error"] < TARGET[name] / 100
     assert main(["predict", str(model), str(path), "--output", str(tau)]) == 0
-    predicted = arm.transmission.inverse().pull_back_effort(np.loadtxt(tau, delimiter=",", skiprows=1))
+    predicted = arm.transmission.inverse.pull_back_effort(np.loadtxt(tau, delimiter=",", skiprows=1))
     measured = recording.in_actuator_coordinates(arm).tau
     ratio = np.linalg.norm((predicted - measured)[200:-200], axis=0) / np.linalg.norm(measured[200:-200], axis=0)
     assert np.all(ratio < 1)

@@ -12,7 +12,6 @@ from dvrk_drake.dynamics.actuator_effects import (
     POSITION_KINDS,
     ActuatorEffect,
     distinct_coordinates,
-    effect_coordinates,
     effect_fault,
     joint_row,
     position_along,
@@ -30,7 +29,7 @@ SCALES = {"offset": 0.0, "spring": 0.4, "cable sine": 2.0, "cable cosine": 1.5}
 
 def all_effects(arm):
     """Every kind that position alone decides, along every coordinate that can have it."""
-    effects = (ActuatorEffect(c, kind, SCALES[kind]) for c in effect_coordinates(arm) for kind in POSITION_KINDS)
+    effects = (ActuatorEffect(c, kind, SCALES[kind]) for c in arm.effect_coordinates for kind in POSITION_KINDS)
     return tuple(e for e in effects if not effect_fault(arm, e))
 
 
@@ -105,8 +104,8 @@ def test_poses_are_fitted_with_the_columns_that_a_motion_is_fitted_with(case):
     for effect, column in zip(effects, np.moveaxis(compiled, 2, 0), strict=True):
         np.testing.assert_allclose(column, effect_column(arm, effect, q), atol=1e-12, err_msg=str(effect))
         a = arm.transmission.position(q)
-        x = a @ effect_coordinates(arm)[effect.coordinate]
-        in_motion = effect.column(x, 0 * x)[:, None] * effect_coordinates(arm)[effect.coordinate]
+        x = a @ arm.effect_coordinates[effect.coordinate]
+        in_motion = effect.column(x, 0 * x)[:, None] * arm.effect_coordinates[effect.coordinate]
         np.testing.assert_allclose(column, arm.transmission.pull_back_effort(in_motion), atol=1e-12)
 
 
@@ -122,7 +121,7 @@ def test_no_effect_runs_away_outside_of_what_was_recorded():
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_coordinates_that_move_alike_are_asked_for_once(name):
     arm = load_arm(name)
-    rows = {c: joint_row(arm, c) for c in effect_coordinates(arm)}
+    rows = {c: joint_row(arm, c) for c in arm.effect_coordinates}
     kept = distinct_coordinates(arm)
     assert {f"actuator.{joint}" for joint in arm.joint_names} <= set(kept)
     unit = np.array([rows[c] / np.linalg.norm(rows[c]) for c in kept])
@@ -137,6 +136,6 @@ def test_coordinates_that_move_alike_are_asked_for_once(name):
 def test_the_work_along_a_coordinate_is_that_on_the_joints():
     arm, generator = load_arm("psm"), np.random.default_rng(5)
     q, dq = generator.normal(size=(2, 1, arm.num_joints))
-    for coordinate in effect_coordinates(arm):
+    for coordinate in arm.effect_coordinates:
         dx = position_along(arm, coordinate, q + dq) - position_along(arm, coordinate, q)
         assert dx[0] == pytest.approx(float(dq[0] @ joint_row(arm, coordinate)), abs=1e-12)

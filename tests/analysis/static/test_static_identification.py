@@ -150,7 +150,7 @@ def test_actuator_coordinates_give_the_same_model(arm):
     recording, _ = simulated(arm, noise=0.002)
     actuator = Recording(
         q=arm.transmission.position(recording.q),
-        tau=arm.transmission.inverse().pull_back_effort(recording.tau),
+        tau=arm.transmission.inverse.pull_back_effort(recording.tau),
         coordinates="actuator",
         source="simulated",
     )

@@ -11,7 +11,7 @@ from dvrk_drake.systems.arm_effects.motors import EffortSensor, Motors, in_steps
 
 ARM = load_arm("mtml")
 N = ARM.num_joints
-INVERSE = ARM.transmission.inverse()  # joints from actuators
+INVERSE = ARM.transmission.inverse  # joints from actuators
 
 # Motors
 

@@ -144,7 +144,7 @@ def test_saturation_shows_what_motors_cannot_follow():
     for parts in ("[]", "[saturation]"):
         simulation = simulate(load_scenario("mtml", [*settings, f"real_arm={parts}"]))
         error[parts] = np.abs(simulation.recording.q - simulation.desired).max()
-        effort[parts] = np.abs(arm.transmission.inverse().pull_back_effort(simulation.recording.tau)).max(axis=0)
+        effort[parts] = np.abs(arm.transmission.inverse.pull_back_effort(simulation.recording.tau)).max(axis=0)
     limit = np.array([arm.effects.saturation[joint] for joint in arm.joint_names])
     assert np.any(effort["[]"] > 1.1 * limit)
     assert np.all(effort["[saturation]"] <= limit * (1 + 1e-9))
@@ -162,7 +162,7 @@ def test_a_cable_of_a_scenario_stretches():
         simulation = simulate(load_scenario("mtml", settings))
         assert np.abs(simulation.state_true[-1, 7:]).max() < 0.02
         stretch[stiffness] = (simulation.recording.q - simulation.state_true[:, :7])[-1, 1]
-        load[stiffness] = arm.transmission.inverse().pull_back_effort(simulation.recording.tau[-1])[1]
+        load[stiffness] = arm.transmission.inverse.pull_back_effort(simulation.recording.tau[-1])[1]
         assert stretch[stiffness] == pytest.approx(load[stiffness] / stiffness, abs=friction / stiffness)
         assert abs(load[stiffness]) > 2 * friction
     assert abs(stretch[50.0]) > 2 * abs(stretch[200.0])

@@ -17,7 +17,7 @@ from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySetting
 PSM = load_arm("psm")
 MS = 1e-3
 SETTINGS = PlausibilitySettings()
-COUNTS = np.abs(ARM.transmission.inverse().matrix) @ [ARM.effects.encoder.resolution[name] for name in ARM.joint_names]
+COUNTS = np.abs(ARM.transmission.inverse.matrix) @ [ARM.effects.encoder.resolution[name] for name in ARM.joint_names]
 TOLERANCE = SETTINGS.position_tolerance + 3 * COUNTS
 JOINTS = range(N)
 
