@@ -365,9 +365,9 @@ def _nominal_dynamics(arm: Arm) -> DynamicSection:
         rotors=[RotorEstimate(name, rotor.value) for name, rotor in zip(arm.joint_names, rotors, strict=True)],
         effects=[ActuatorEffectEstimate(e.coordinate, e.kind, e.scale, e.coefficient) for e in drive],
         signals=SignalSettings(
-            acceleration_cut_off=list(arm.motion.acceleration_cut_off),
-            effort_cut_off=arm.effort_cut_off,
-            effort_delay=list(arm.motion.effort_delay),
+            acceleration_cut_off=list(arm.identification.acceleration_cut_off),
+            effort_cut_off=arm.identification.effort_cut_off,
+            effort_delay=list(arm.identification.effort_delay),
         ),
         gravity_expected=gravity,
     )

@@ -65,7 +65,7 @@ def bounding_boxes(arm: Arm) -> dict[str, BoundingBox]:
 def _shapes_of_links(arm: Arm) -> dict[str, BoundingShapes]:
     """Link -> the settings that stand beside the SDF file that it is first named in."""
     settings: dict[str, BoundingShapes] = {}
-    for url, shapes in zip(arm.sdf, arm.bounding_shapes, strict=True):
+    for url, shapes in zip(arm.sdf, arm.identification.bounding_shapes, strict=True):
         names = [link.get("name", "") for link in compose_sdf([url]).iterfind("model/link")]
         if unknown := set(shapes.boxes) - set(names):
             raise ArmError(f"{arm.name}: bounding_shapes.boxes names {', '.join(sorted(unknown))}, no link of {url}")

@@ -19,13 +19,12 @@ from dvrk_drake.models.arm_schema import (
     EFFORTS,
     GRAVITIES,
     ArmDescription,
-    BoundingShapes,
     CoupledLimit,
     Gains,
+    IdentificationSettings,
     Instrument,
     LoopClosure,
     Mechanism,
-    MotionSettings,
 )
 from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_limit_fault, limits_fault
 from dvrk_drake.models.effects_schema import ArmEffects
@@ -68,9 +67,7 @@ class Arm:
         gravity: (3,) gravity vector in the base frame [m/s^2].
         gains: default gains of the controller.
         friction_coordinates: name -> (n,) coefficients of the joints: where parts rub beside joints and actuators.
-        motion: how the signals of a recorded motion are treated, one value a joint.
-        effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].
-        bounding_shapes: where the mass of the links of each file of `sdf` can be, see `bounding_boxes`.
+        identification: how recordings of the arm are treated, and what its links can be.
         effects: what the real arm has beside all that; only a simulation that asks for them has them.
 
     Example:
@@ -101,9 +98,7 @@ class Arm:
     gravity: NDArray[np.float64] = field(metadata=GRAVITIES)
     gains: Gains
     friction_coordinates: dict[str, NDArray[np.float64]] = field(metadata=COUPLINGS)
-    motion: MotionSettings
-    effort_cut_off: float = field(metadata=within(0.1, 1000.0, "Hz"))
-    bounding_shapes: tuple[BoundingShapes, ...]
+    identification: IdentificationSettings
     effects: ArmEffects
 
     def __post_init__(self) -> None:
@@ -349,7 +344,6 @@ def _build_arm(
         raise ArmError(f"{path}: its SDF has no joint {', '.join(sorted(missing))}")
     limits = np.array([_lower_and_upper(path, f"position_limits.{j}", position_limits[j]) for j in joints])
     gains = Gains(*(getattr(mechanism.gains, k) + getattr(instrument.gains, k) for k in ("kp", "kd", "ki")))
-    motion = _motion_settings(path, mechanism, instrument)
     G = np.zeros((len(facts.joint_names), len(joints)))
     c = np.zeros(len(facts.joint_names))
     for row, name in enumerate(facts.joint_names):
@@ -378,14 +372,12 @@ def _build_arm(
             name: _row(path, f"friction_coordinates.{name}", terms, joints)
             for name, terms in instrument.friction_coordinates.items()
         },
-        motion=motion,
-        effort_cut_off=mechanism.effort_cut_off,
-        bounding_shapes=tuple(part.bounding_shapes for part in (mechanism, instrument) if part.sdf),
+        identification=_identification_settings(path, mechanism, instrument),
         effects=_checked_effects(path, mechanism.effects.joined(instrument.effects), joints),
     )
 
 
-def _motion_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -> MotionSettings:
+def _identification_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -> IdentificationSettings:
     """The mechanism's with the instrument's appended; what one of them does not state is 20 Hz and no delay."""
     both: dict[str, list[float]] = {}
     for which, default in (("acceleration_cut_off", 20.0), ("effort_delay", 0.0)):
@@ -396,11 +388,10 @@ def _motion_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -
                 raise ArmError(f"{path}: motion.{which} has {len(values)} numbers for {len(part.joints)} joints")
             both[which] += values or [default] * len(part.joints)
     known = {**mechanism.motion.known_effects, **instrument.motion.known_effects}
-    return dataclasses.replace(
-        mechanism.motion,
-        acceleration_cut_off=both["acceleration_cut_off"],
-        effort_delay=both["effort_delay"],
-        known_effects=known,
+    return IdentificationSettings(
+        **{**vars(mechanism.motion), **both, "known_effects": known},
+        effort_cut_off=mechanism.effort_cut_off,
+        bounding_shapes=tuple(part.bounding_shapes for part in (mechanism, instrument) if part.sdf),
     )
 
 

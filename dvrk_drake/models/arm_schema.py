@@ -101,6 +101,19 @@ class BoundingShapes:
     boxes: dict[str, BoxCorners] = field(default_factory=dict)
 
 
+@dataclass(kw_only=True)
+class IdentificationSettings(MotionSettings):
+    """How recordings of an arm are treated, and what its links can be.
+
+    Attributes:
+        effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].
+        bounding_shapes: where the mass of the links of each of the arm's SDF files can be, see `bounding_boxes`.
+    """
+
+    effort_cut_off: float = field(metadata=_CUT_OFFS)
+    bounding_shapes: tuple[BoundingShapes, ...]
+
+
 @dataclass
 class Mechanism:
     """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common.

@@ -58,14 +58,18 @@ def test_bounds_that_are_reached_are_named():
     assert reached_bounds(far, nominal, box) == ["mass at 0.1 x the SDF's", "mass fills its box along y"]
 
 
+def with_shapes(arm, shapes):
+    return dataclasses.replace(arm, identification=dataclasses.replace(arm.identification, bounding_shapes=(shapes,)))
+
+
 def test_links_whose_place_nobody_states_are_refused():
     arm = load_arm("mtmr")
     with pytest.raises(ArmError, match=r"motor_4_link has no <collision> in its SDF.*give it a box"):
-        bounding_boxes(dataclasses.replace(arm, bounding_shapes=(BoundingShapes(),)))
+        bounding_boxes(with_shapes(arm, BoundingShapes()))
     box = BoxCorners([0, 0, 0], [1, -1, 1])
     with pytest.raises(ArmError, match="lower and upper of crank_link must be three numbers each"):
-        shapes = dataclasses.replace(arm.bounding_shapes[0], boxes={"crank_link": box})
-        bounding_boxes(dataclasses.replace(arm, bounding_shapes=(shapes,)))
+        shapes = dataclasses.replace(arm.identification.bounding_shapes[0], boxes={"crank_link": box})
+        bounding_boxes(with_shapes(arm, shapes))
     with pytest.raises(ArmError, match="boxes names elbow, no link of"):
-        shapes = dataclasses.replace(arm.bounding_shapes[0], boxes={"elbow": box})
-        bounding_boxes(dataclasses.replace(arm, bounding_shapes=(shapes,)))
+        shapes = dataclasses.replace(arm.identification.bounding_shapes[0], boxes={"elbow": box})
+        bounding_boxes(with_shapes(arm, shapes))

@@ -58,7 +58,7 @@ def true_dynamics(
         for name, rotor in zip(arm.joint_names, regressor.rotors, strict=False)
     ]
     n = arm.num_joints
-    settings = SignalSettings(50.0, [20.0] * n, arm.effort_cut_off, [0.0] * n)
+    settings = SignalSettings(50.0, [20.0] * n, arm.identification.effort_cut_off, [0.0] * n)
     return DynamicModel(arm, DynamicSection([float(g) for g in arm.gravity], links, rotors, effects, [], settings))
 
 
@@ -71,7 +71,7 @@ def recorded(
     """
     t, q, v, vd = motion
     J = model.arm.transmission
-    late = zip(model.arm.motion.effort_delay, model.effort(q, v, vd).T, strict=True)
+    late = zip(model.arm.identification.effort_delay, model.effort(q, v, vd).T, strict=True)
     tau = np.column_stack([np.interp(t - delay, t, effort) for delay, effort in late])
     tau = tau + noise * np.sqrt(np.mean(tau**2, axis=0)) * generator.normal(size=tau.shape)
     every = slice(None, None, round(1000 / rate))

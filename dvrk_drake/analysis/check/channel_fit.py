@@ -67,7 +67,7 @@ class ChannelFit:
         self.moves = bool(recording.motion(arm))
         if self.moves:
             grid = motion_grid(recording, arm, default_settings(arm))
-            self._cut_off = min(arm.effort_cut_off, 0.4 * grid.rate)
+            self._cut_off = min(arm.identification.effort_cut_off, 0.4 * grid.rate)
             self._half_step = max(int(GRID_RATE / (2 * OVERSAMPLING * self._cut_off)), 1)
             self._q, self._v, self._vd = grid.q, grid.v, grid.vd
             self._tau = self._sampled_efforts(grid)

@@ -239,7 +239,7 @@ def _noise(
         what = "the motion does not repeat, so no repeatability floor can be computed"
         advice = "let an excitation motion run twice or more: the floor tells how good a model can be"
         return replace(report, joints=tuple(joints)), [Finding("note", "no repetition", "motion", what, advice)]
-    floor = repeatability_floor(tau, rate, period, arm.effort_cut_off)
+    floor = repeatability_floor(tau, rate, period, arm.identification.effort_cut_off)
     joints = [replace(joint, floor=float(value)) for joint, value in zip(joints, floor, strict=True)]
     what = f"repeats every {period:.4f} s ({1 / period:.4f} Hz), {len(tau) / rate / period:.1f} times"
     advice = (
@@ -255,4 +255,6 @@ def _noise(
             findings.append(
                 Finding("note", "narrow-band noise", name, what, "filter below it before a fit", (j,), band.share)
             )
-    return replace(report, joints=tuple(joints), period=period, floor_cut_off=arm.effort_cut_off), findings
+    return replace(
+        report, joints=tuple(joints), period=period, floor_cut_off=arm.identification.effort_cut_off
+    ), findings

@@ -60,13 +60,13 @@ def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
     Raises:
         ArmError: the file names a coordinate or a kind that there is not.
     """
-    known = arm.motion.known_effects
+    known = arm.identification.known_effects
     if unknown := set(known) - set(distinct_coordinates(arm)):
         raise ArmError(
             f"{arm.source}: motion.known_effects: unknown coordinate {', '.join(sorted(unknown))}; "
             f"known: {', '.join(distinct_coordinates(arm))}"
         )
-    effects, travels = [], arm.motion.presliding_travels
+    effects, travels = [], arm.identification.presliding_travels
     for name, x, v in _coordinates(arm, grid):
         if name.startswith("actuator."):
             effects.append(ActuatorEffect(name, "offset"))
@@ -81,7 +81,7 @@ def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
 def named_effects(arm: Arm, q: NDArray[np.float64]) -> list[ActuatorEffect]:
     """Springs and cables that the arm's file names (`motion.known_effects`), over positions q (m, n) of the joints."""
     effects = []
-    for name, kinds in arm.motion.known_effects.items():
+    for name, kinds in arm.identification.known_effects.items():
         x = position_along(arm, name, q)
         effects += [e for kind in kinds if kind != ASYMMETRIC for e in _named(arm, name, kind, x, np.zeros_like(x))]
     return effects
@@ -95,7 +95,7 @@ def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
             continue
         kinds = ["stribeck", "load coulomb"] if name.startswith("actuator.") else ["stribeck"]
         effects += [ActuatorEffect(name, kind, _rounded(DIRECTION_WIDTH * v.std())) for kind in kinds]
-        known = arm.motion.known_effects.get(name, [])
+        known = arm.identification.known_effects.get(name, [])
         for which in NAMED_EFFECTS:
             # Beside known torques by position, others say the same between the poses of a motion, and run apart beyond.
             by_position = which != ASYMMETRIC
@@ -138,7 +138,7 @@ def dynamic_columns(
     p = len(regressor.values) - len(regressor.rotors) + n
     rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd)[..., :p])
     tilts = []
-    if arm.motion.base_may_tilt:
+    if arm.identification.base_may_tilt:
         rest = np.zeros_like(grid.q)
         for axis in np.eye(3)[:2]:
             # Efforts are linear in gravity: those at rest under a gravity of one are the derivative.

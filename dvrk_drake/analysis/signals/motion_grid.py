@@ -133,10 +133,10 @@ class MotionGrid:
 
 def default_settings(arm: Arm) -> SignalSettings:
     """What the arm's files say."""
-    motion = arm.motion
+    motion = arm.identification
     return SignalSettings(
         acceleration_cut_off=list(motion.acceleration_cut_off),
-        effort_cut_off=arm.effort_cut_off,
+        effort_cut_off=arm.identification.effort_cut_off,
         effort_delay=list(motion.effort_delay),
     )
 

@@ -91,7 +91,7 @@ def candidate_effects(problem: StaticProblem) -> list[list[ActuatorEffect]]:
 
 def _known_spring(problem: StaticProblem, joint: str) -> list[ActuatorEffect]:
     name = f"actuator.{joint}"
-    if "spring" not in problem.arm.motion.known_effects.get(name, []):
+    if "spring" not in problem.arm.identification.known_effects.get(name, []):
         return []
     x = position_along(problem.arm, name, problem.q)
     return [spring_over(name, x)] if np.ptp(x) >= LEAST_SPAN["spring"] else []

@@ -42,7 +42,7 @@ def test_floor_is_the_noise_that_was_put_into_the_efforts(name):
     arm = load_arm(name)
     report = check_recording(clean_motion(name), arm)
     white = np.random.default_rng(0).normal(size=(20000, 1)) * EFFORT_NOISE
-    passed = float(np.std(low_pass(white, RATE, arm.effort_cut_off)))
+    passed = float(np.std(low_pass(white, RATE, arm.identification.effort_cut_off)))
     # In actuator coordinates noise of coupled joints adds; the first is driven by its own motor.
     assert report.joints[0].floor == pytest.approx(passed, rel=0.15)
 

@@ -17,9 +17,8 @@ FOLDS, ROWS = 12, 1200
 
 def arm_that_knows(**known):
     arm = load_arm("psm")
-    return replace(
-        arm, motion=replace(arm.motion, known_effects={f"actuator.{j}": kinds for j, kinds in known.items()})
-    )
+    known_effects = {f"actuator.{joint}": kinds for joint, kinds in known.items()}
+    return replace(arm, identification=replace(arm.identification, known_effects=known_effects))
 
 
 def moving(arm):
