@@ -73,7 +73,7 @@ class lcmt_dvrk_status(object):
     REFUSAL_WRONG_SESSION = 7
     """ session_id is not this arm's: the arm was restarted, or a log is replayed """
     REFUSAL_STALE = 8
-    """ status_utime is older than 50 ms, or from the future """
+    """ status_utime is older than 50 ms, or from the future; or HOLD for motors without power, of an unknown pose """
     REFUSAL_OUT_OF_ORDER = 9
     """ sequence is not above that of the last command of this sender """
     REFUSAL_CLOCK_JUMP = 10

@@ -162,6 +162,8 @@ class CommandGuard:
         )
         self._force = CommandInForce()
         self._powered = True
+        #: What is wrong with the last measurement, in words; or "".
+        self._problem = ""
         self._measured = Measurement(arm.num_joints, round(1e6 * self.settings.measurement_age))
         self._plausibility = Plausibility(arm, model, self.settings.plausibility, self.limits.speed)
         self._period, self._oscillation = PeriodMonitor(self.settings), OscillationMonitor(self.settings, arm)
@@ -249,7 +251,7 @@ class CommandGuard:
         self.counts.refused += 1
         self.refusal_code = code
         if code not in OUT_OF_STREAM and self.state == lcmt_dvrk_status.STATE_STARTING:
-            self._hold()
+            self._take_over(f"a command was refused while a mode began (refusal code {code})")
         return code
 
     def ignore(self, code: int, count: int = 1) -> None:
@@ -324,7 +326,8 @@ class CommandGuard:
         first = measured.q is None
         begins = plausibility.begins or measured.time_since(measured_utime) >= _LONGEST_GAP
         implausible_pose = self.limits.implausible_pose if begins else None
-        if problem := measured.take(measured_utime, q, v, effort, implausible_pose):
+        self._problem = problem = measured.take(measured_utime, q, v, effort, implausible_pose)
+        if problem:
             if first or measured.bad > self.settings.plausibility.bad_samples:
                 # An arm that was never measured has no pose that it could be held at.
                 self.report_fault(problem, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=not first)
@@ -400,6 +403,8 @@ class CommandGuard:
             return lcmt_dvrk_status.REFUSAL_NONE
         if command.control_mode < 0 or not self.accepted_modes >> command.control_mode & 1:
             return lcmt_dvrk_status.REFUSAL_BAD_MODE
+        if command.control_mode == lcmt_dvrk_command.HOLD and self._measured.bad and not self._powered:
+            return lcmt_dvrk_status.REFUSAL_STALE  # nobody knows where it would be held
         if command.control_mode in _ACTIVE:
             return self.limits.refusal_to_start(command, self._q(), self._measured.effort, self._plausibility.gravity)
         return lcmt_dvrk_status.REFUSAL_NONE
@@ -416,7 +421,11 @@ class CommandGuard:
         if mode == lcmt_dvrk_command.OFF:
             self.state, self._powered = lcmt_dvrk_status.STATE_OFF, False
         elif mode == lcmt_dvrk_command.HOLD:
-            if resets and not self.limits.implausible_pose(self._q()):
+            # A pose that is not measured now, or that no arm has, is not where a reset may hold the arm.
+            problem = self._problem or self.limits.implausible_pose(self._q())
+            if resets and problem and self.state == lcmt_dvrk_status.STATE_FAULT:
+                self.fault_text = problem
+            elif resets and not problem:
                 self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
                 self.hold_reason = ""
                 if self._plausibility.invalid.any() or not self._follower.is_near(self._q()):
@@ -438,7 +447,7 @@ class CommandGuard:
             self._follower.begin_position()
         else:
             self._oscillation.restart()
-            self._follower.begin_effort(self._measured.effort, self._q(), self._measured.v)
+            self._follower.begin_effort(self._measured.effort, self._q())
 
     def _hold(self) -> None:
         """To HOLD, at the pose that is held already or else at the measured one."""

@@ -14,10 +14,14 @@ if TYPE_CHECKING:
 
 #: Most commands that are kept from one step to the next, of the sender in command and of all others [each].
 _CAPACITY = 16
-#: Where sender_id and session_id are in an encoded command, and where arm_name begins [bytes].
-_SENDER, _SESSION, _NAME = slice(24, 32), slice(32, 40), 48
+#: Where sequence, sender_id and session_id are in an encoded command, and where arm_name begins [bytes].
+_SEQUENCE, _SENDER, _SESSION, _NAME = slice(16, 24), slice(24, 32), slice(32, 40), 48
 
 _UNREADABLE = lcmt_dvrk_status.REFUSAL_UNREADABLE
+
+
+def _sequence(data: bytes) -> int:
+    return int.from_bytes(data[_SEQUENCE], signed=True)
 
 
 class CommandInbox:
@@ -25,8 +29,9 @@ class CommandInbox:
 
     `put` looks at the bytes only: length, type, arm, session and, with a key, the authentication code. What fails is
     counted and dropped, in a few microseconds. Of the rest it keeps a bounded number, with room of its own for the
-    sender in command, so that a flood of other senders does not displace its commands. `deliver` decodes what was kept
-    and gives it to the guard.
+    sender in command, so that a flood of other senders does not displace its commands. Of these it keeps the latest in
+    sequence, so that a flood of copies of earlier ones does not either. `deliver` decodes what was kept and gives it to
+    the guard.
     """
 
     def __init__(self, guard: CommandGuard, key: MessageKey | None = None, capacity: int = _CAPACITY) -> None:
@@ -55,9 +60,13 @@ class CommandInbox:
         code = self._refusal(data)
         if code == lcmt_dvrk_status.REFUSAL_NONE:
             messages = self._own if data[_SENDER] == self._sender else self._others
-            if len(messages) < self._capacity:
-                messages.append(data)
+            messages.append(data)
+            if len(messages) <= self._capacity:
                 return
+            if messages is self._own:
+                messages.remove(min(messages, key=_sequence))
+            else:
+                messages.pop()
             code = lcmt_dvrk_status.REFUSAL_FLOOD
         self._ignored += 1
         self._code = code

@@ -156,8 +156,8 @@ class CommandStream:
         """Returns REFUSAL_* of a command that does not continue its sender's stream, or REFUSAL_NONE."""
         if self.is_other_sender(command, utime):
             return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
-        same_sender = command.sender_id == self.sender_id
-        if same_sender and self._last is not None and utime - self._arrival <= self.expiry:
+        # A sender that is not another one and was heard lately is the same.
+        if self._last is not None and utime - self._arrival <= self.expiry:
             step = command.sequence - self._last.sequence
             if step <= 0:
                 return lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER
@@ -165,6 +165,7 @@ class CommandStream:
                 return lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP
             if self._jumped(command.utime - self._last.utime, utime - self._arrival):
                 return lcmt_dvrk_status.REFUSAL_CLOCK_JUMP
+        same_sender = command.sender_id == self.sender_id
         if command.control_mode == lcmt_dvrk_command.OFF and not (same_sender and self._can_turn_off):
             return lcmt_dvrk_status.REFUSAL_SUDDEN_OFF
         return lcmt_dvrk_status.REFUSAL_NONE

@@ -113,19 +113,18 @@ class Follower:
             f"{self._limits.following_error[j]:.3g} away is allowed"
         )
 
-    def begin_effort(self, effort: Vector, q: Vector, v: Vector) -> None:
-        """Effort commands act from now on, from the measured effort at q, v [N m, N, rad, m, rad/s, m/s]."""
+    def begin_effort(self, effort: Vector, q: Vector) -> None:
+        """Effort commands act from now on, from the measured effort at the pose q [N m, N, rad, m]."""
         limit = self._limits.command_limits
         self._effort = clip(effort, -limit, limit)
-        # What the walls add at once where efforts begin to act; it is taken back, less and less.
-        self._kick = self._limits.restrain_effort(self._effort, q, v)[0] - self._effort
+        # What the walls add at once to an arm at rest. `follow_effort` leaves it out, less and less.
+        self._kick = self._limits.wall_effort(q, self._zero)[0]
 
     def follow_effort(self, effort: Vector, q: Vector, v: Vector, dt: float, begun: float) -> GuardOutput:
         """`dt` seconds on towards an effort, at q, v; `begun` says which share of the beginning has passed, 0 to 1."""
         self._effort, flags = self._limits.follow_effort(effort, self._effort, dt)
-        restrained, walls = self._limits.restrain_effort(self._effort, q, v)
-        limit = self._limits.effort_limits
-        applied = clip(restrained - (1.0 - begun) * self._kick, -limit, limit)
+        left_out = None if begun == 1.0 else (1.0 - begun) * self._kick
+        applied, walls = self._limits.restrain_effort(self._effort, q, v, left_out)
         return self._output(lcmt_dvrk_command.EFFORT, q, effort=applied, flags=flags | walls)
 
     def _output(

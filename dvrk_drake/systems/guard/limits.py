@@ -152,21 +152,30 @@ class GuardLimits:
             return effort, np.zeros(len(effort), np.int8)
         return effort, (clamped != command) * _CLAMPED | (effort != clamped) * _RATE_LIMITED
 
-    def restrain_effort(self, effort: Vector, q: Vector, v: Vector) -> tuple[Vector, Flags]:
+    def wall_effort(self, q: Vector, v: Vector) -> tuple[Vector, Flags]:
+        """What the walls add at q, v, all (n,); joint flags."""
+        flags = np.zeros(len(q), np.int8)
+        c = self.A.dot(q) + self._wall_look_ahead * self.A.dot(v)
+        if not is_any(np.abs(c - self._middle) > self._free):
+            return np.zeros(len(q)), flags
+        to_upper, to_lower = (self.upper - c) / self.wall_width, (c - self.lower) / self.wall_width
+        walls = 2 * self._wall_effort * (clip(1 - to_lower, 0, 1) - clip(1 - to_upper, 0, 1))
+        for k in np.flatnonzero(walls):
+            flags[self.A[k] != 0] |= self._wall_flags[k]
+        return walls @ self.A, flags
+
+    def restrain_effort(
+        self, effort: Vector, q: Vector, v: Vector, left_out: Vector | None = None
+    ) -> tuple[Vector, Flags]:
         """`effort` with what the walls and the speed limit add at q, v, all (n,); joint flags.
 
-        Not limited in rate: it must not come late, and it is continuous in the state.
+        Not limited in rate: it must not come late, and it is continuous in the state. `left_out` (n,) of what the walls
+        add is not added, at most all of it.
         """
         limit = self.effort_limits
-        flags = np.zeros(len(effort), np.int8)
-        added = np.zeros(len(effort))
-        c = self.A.dot(q) + self._wall_look_ahead * self.A.dot(v)
-        if is_any(np.abs(c - self._middle) > self._free):
-            to_upper, to_lower = (self.upper - c) / self.wall_width, (c - self.lower) / self.wall_width
-            walls = 2 * self._wall_effort * (clip(1 - to_lower, 0, 1) - clip(1 - to_upper, 0, 1))
-            added = walls @ self.A
-            for k in np.flatnonzero(walls):
-                flags[self.A[k] != 0] |= self._wall_flags[k]
+        added, flags = self.wall_effort(q, v)
+        if left_out is not None:
+            added = added - clip(left_out, np.minimum(added, 0.0), np.maximum(added, 0.0))
         too_fast = np.abs(v) > self.speed
         if is_any(too_fast):
             added = added - 4 * limit * np.sign(v) * clip(np.abs(v) / self.speed - 1, 0.0, 0.5)

@@ -87,7 +87,9 @@ def test_good_commands_of_any_arm_come_through(name, key):
     assert bench.guard.counts.accepted == 261
 
 
-@pytest.mark.parametrize("kind", ["garbage", "other session", "other senders", "signed by somebody else"])
+@pytest.mark.parametrize(
+    "kind", ["garbage", "other session", "other senders", "signed by somebody else", "copies of the sender's own"]
+)
 @pytest.mark.parametrize("key", [None, KEY])
 def test_a_flood_does_not_displace_the_sender_in_command(kind, key):
     bench = Networked(key).acting()
@@ -97,12 +99,14 @@ def test_a_flood_does_not_displace_the_sender_in_command(kind, key):
             "other session": [stranger(bench, session_id=5)] * FLOOD,
             "other senders": [stranger(bench, sender_id=1000 + k) for k in range(FLOOD)],
             "signed by somebody else": [MessageKey(bytes(32)).sign(stranger(bench, sender_id=9))] * FLOOD,
+            "copies of the sender's own": bench.sent[-FLOOD:],
         }[kind]
         output = bench.round(flood, flood)
         assert output.control_mode == Command.EFFORT
     np.testing.assert_allclose(output.effort, 0.05 * LIMIT, atol=1e-12)
-    assert bench.guard.counts.ignored == 200 * 2 * FLOOD
-    assert (bench.guard.counts.accepted, bench.guard.counts.refused) == (460, 0)
+    assert bench.guard.counts.ignored + bench.guard.counts.refused == 200 * 2 * FLOOD
+    assert bench.guard.counts.accepted == 460
+    assert bench.guard.counts.refused == 0 or "copies" in kind
 
 
 def test_of_a_flood_a_bounded_number_is_decoded():

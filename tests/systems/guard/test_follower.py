@@ -123,12 +123,60 @@ def test_positions_that_begin_forget_how_late_the_arm_was():
     np.testing.assert_array_equal(follower.target, target)
 
 
+# A hold
+
+
+@pytest.mark.parametrize("joint", range(N))
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("share", [0.3, 1.0, 9.0])
+def test_a_joint_that_moves_when_it_is_held_may_go_on_until_it_is_braked(joint, side, share):
+    error, way = LIMITS.following_error[joint], side * min(share, 1.0) * 0.1 * LIMITS.speed[joint]
+    follower, q = at(STILL), Q.copy()
+    follower.latch(q, side * share * LIMITS.speed * E[joint])
+    q[:] = 9.0
+    np.testing.assert_array_equal(follower.target, Q)
+
+    def astray(away):
+        return bool(follower.astray(Q + away * E[joint]))
+
+    assert not astray(way + 0.999 * side * error) and astray(way + 1.001 * side * error)
+    assert not astray(-0.999 * side * error) and astray(-1.001 * side * error)
+    for _ in range(20):
+        np.testing.assert_array_equal(follower.hold(0.05).position, Q)
+    assert not astray(0.999 * side * error) and astray(1.001 * side * error)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_in_a_fault_joints_with_a_valid_position_are_held_with_bounded_efforts(side):
+    """At most `fault_effort`, or a third of it more than gravity needs, and never more than the motor has."""
+    bound, valid = LIMITS.fault_effort, np.ones(N, bool)
+    for gravity, most in ((STILL, bound), (0.5 * LIMIT, 0.5 * LIMIT + bound / 3), (0.95 * LIMIT, LIMIT)):
+        for away, expected in ((9.0, side * most), (-9.0, -side * bound)):
+            output = at().hold_valid_joints(Q - side * away, STILL, valid, side * gravity)
+            np.testing.assert_allclose(output.effort, expected, atol=1e-12)
+    assert output.control_mode == Command.EFFORT
+    # Below the bounds they are those of the arm's own gains.
+    gravity, v = 0.02 * side * LIMIT, side * 0.01 * LIMITS.fault_effort / LIMITS.kd
+    q = Q - 0.02 * side * LIMITS.fault_effort / LIMITS.kp
+    output = at().hold_valid_joints(q, v, valid, gravity)
+    np.testing.assert_allclose(output.effort, gravity + 0.01 * side * LIMITS.fault_effort, atol=1e-12)
+    np.testing.assert_array_equal(output.joint_flags, 0)
+    np.testing.assert_array_equal(output.position, q)
+
+
+def test_in_a_fault_joints_without_a_valid_position_get_their_gravity_effort():
+    valid = np.arange(N) != 3
+    output = at().hold_valid_joints(Q - 9.0, STILL + 9.0, valid, 0.1 * LIMIT)
+    assert output.effort[3] == pytest.approx(0.1 * LIMIT[3])
+    np.testing.assert_array_equal(output.joint_flags, np.where(valid, 0, Status.FLAG_IMPLAUSIBLE))
+
+
 # Efforts
 
 
 def test_efforts_begin_at_the_measured_ones_and_go_at_their_rate():
     follower, measured = at(), LIMIT * [0.3, -0.3, 0.0, 1.2, -1.2, 0.1, 0.0]
-    follower.begin_effort(measured, Q, STILL)
+    follower.begin_effort(measured, Q)
     start = np.clip(measured, -LIMIT, LIMIT)
     np.testing.assert_allclose(follower.follow_effort(start, Q, STILL, 1e-3, 0.0).effort, start, atol=1e-12)
     output = follower.follow_effort(start - 0.1 * LIMIT, Q, STILL, 1e-3, 0.5)
@@ -142,9 +190,9 @@ def test_efforts_begin_at_the_measured_ones_and_go_at_their_rate():
 
 def test_commands_that_may_use_a_fraction_begin_at_it():
     follower = Follower(GuardLimits(ARM, GuardSettings(effort_fraction=0.2)))
-    follower.begin_effort(0.25 * LIMIT, Q, STILL)
+    follower.begin_effort(0.25 * LIMIT, Q)
     np.testing.assert_allclose(follower.follow_effort(LIMIT, Q, STILL, 1e-3, 0.0).effort, 0.2 * LIMIT, atol=1e-12)
-    follower.begin_effort(-0.25 * LIMIT, Q, STILL)
+    follower.begin_effort(-0.25 * LIMIT, Q)
     np.testing.assert_allclose(follower.follow_effort(-LIMIT, Q, STILL, 1e-3, 0.0).effort, -0.2 * LIMIT, atol=1e-12)
 
 
@@ -153,24 +201,38 @@ def test_a_wall_that_efforts_begin_inside_comes_on_gradually(side):
     q = Q.copy()
     q[0] = (ARM.position_upper if side > 0 else ARM.position_lower)[0]
     push = side * 0.25 * LIMIT * E[0]
-    wall = LIMITS.restrain_effort(push, q, STILL)[0] - push
-    assert wall[0] == pytest.approx(-side * 1.25 * LIMIT[0])  # to all that the motor has, inward
+    wall = LIMITS.wall_effort(q, STILL)[0]
+    assert wall[0] == pytest.approx(-side * 2 * LIMIT[0])  # twice what the motor has, inward
     follower = at(q)
-    follower.begin_effort(push, q, STILL)
+    follower.begin_effort(push, q)
     for share in (0.0, 0.25, 0.5, 1.0):
         output = follower.follow_effort(push, q, STILL, 1e-3, share)
-        np.testing.assert_allclose(output.effort, push + share * wall, atol=1e-12)
+        np.testing.assert_allclose(output.effort, np.clip(push + share * wall, -LIMIT, LIMIT), atol=1e-12)
         assert output.joint_flags[0] == Status.FLAG_POSITION_LIMIT
     # What is taken back does not push an arm outward beyond its motors when it has left the wall.
     inside = follower.follow_effort(side * LIMIT * E[0], Q, STILL, 1.0, 0.0)
     np.testing.assert_allclose(inside.effort, side * LIMIT * E[0], atol=1e-12)
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_wall_that_efforts_begin_inside_never_pulls_outward(side):
+    """Nothing is left out that the wall does not add now: the arm has left it, or the speed limit brakes."""
+    q = Q.copy()
+    q[0] = (ARM.position_upper if side > 0 else ARM.position_lower)[0]
+    follower = at(q)
+    follower.begin_effort(STILL, q)
+    np.testing.assert_array_equal(follower.follow_effort(STILL, Q, STILL, 1e-3, 0.0).effort, STILL)
+    fast = 1.2 * side * LIMITS.speed[0] * E[0]
+    brake = LIMITS.restrain_effort(STILL, Q, fast)[0]
+    assert side * brake[0] < 0
+    np.testing.assert_array_equal(follower.follow_effort(STILL, Q, fast, 1e-3, 0.0).effort, brake)
+
+
 def test_flags_of_commands_and_of_walls_come_together():
     q = Q.copy()
     q[0] = ARM.position_upper[0]
     follower = at(q)
-    follower.begin_effort(STILL, q, STILL)
+    follower.begin_effort(STILL, q)
     flags = follower.follow_effort(2 * LIMIT * E[0], q, STILL, 1e-3, 1.0).joint_flags
     assert flags[0] == Status.FLAG_EFFORT_CLAMPED | Status.FLAG_RATE_LIMITED | Status.FLAG_POSITION_LIMIT
     assert not np.any(flags[1:])

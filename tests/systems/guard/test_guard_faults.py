@@ -113,6 +113,59 @@ def test_a_few_bad_measurements_while_holding_change_nothing():
     np.testing.assert_array_equal(bench.output.position, Q)
 
 
+@pytest.mark.parametrize("joint", range(N))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_wrong_velocity_while_efforts_begin_is_not_felt_afterwards(joint, side):
+    """The brake of the speed limit acts on that one sample, and nothing takes it back in the next 250 ms."""
+    bench = Bench().at_rest()
+    commanded = bench.effort.copy()
+    while bench.guard.state != Status.STATE_EFFORT:
+        bench.v = 3.0 * side * bench.guard.limits.speed * np.eye(N)[joint]
+        bench.send(Command.EFFORT, effort=list(commanded))
+        bench.tick()
+    bench.v = np.zeros(N)
+    for _ in range(300):
+        bench.send(Command.EFFORT, effort=list(commanded))
+        np.testing.assert_allclose(bench.tick().effort, commanded, rtol=0, atol=1e-12)
+
+
+def test_a_pose_that_is_not_measured_now_is_not_where_a_reset_holds():
+    bench = Bench(modes=WITH_OFF, checks=True, model=Heavy()).at_rest()
+    good = bench.q
+    # Off: neither a hold nor a reset of a fault gives power.
+    bench.run(Command.HOLD, 5)
+    bench.run(Command.OFF, 5)
+    bench.q = good * np.nan
+    bench.tick()
+    healthy = {"position": list(good), "effort": [0.0] * N}
+    for _ in range(10):
+        assert bench.send(Command.HOLD, **healthy) == Status.REFUSAL_STALE
+        assert bench.tick().control_mode == Command.OFF
+    bench.tick(BAD)
+    assert (bench.guard.state, bench.output.control_mode) == (Status.STATE_FAULT, Command.OFF)
+    for reset in (False, True, False, True):
+        bench.send(Command.HOLD, reset_fault=reset, **healthy)
+        assert bench.tick().control_mode == Command.OFF
+    bench.q = good - 0.1
+    bench.tick()
+    for reset in (False, True):
+        bench.send(Command.HOLD, reset_fault=reset)
+        output = bench.tick()
+    assert (output.control_mode, bench.guard.state) == (Command.HOLD, Status.STATE_HOLD)
+    np.testing.assert_array_equal(output.position, good - 0.1)
+    # With power: where the measurements return, not where they were lost.
+    bench.q = good * np.nan
+    bench.tick(BAD + 5)
+    bench.run(Command.HOLD, 1, **healthy)
+    bench.send(Command.HOLD, reset_fault=True, **healthy)
+    bench.q = good
+    bench.tick()
+    assert bench.guard.state == Status.STATE_FAULT
+    bench.run(Command.HOLD, 1)
+    output = bench.run(Command.HOLD, 1, reset_fault=True)
+    np.testing.assert_array_equal(output.position, good)
+
+
 def test_bad_measurements_before_any_good_one_leave_the_motors_without_power():
     guard = CommandGuard(ARM, SESSION, Weightless())
     output = guard.step(0, 0, Q * np.nan, 0 * Q, 0 * Q)

@@ -119,6 +119,22 @@ def test_a_sender_that_stops_while_it_changes_the_mode_waits_for_an_operator():
     assert bench.send(Command.EFFORT) == Status.REFUSAL_RESUME
 
 
+@pytest.mark.parametrize(
+    "bad", [{"position": [np.nan] * N}, {"control_mode": 0}, {"position": list(Q + 9)}, {"effort": [1e308] * N}]
+)
+def test_a_refused_command_while_the_mode_changes_waits_for_an_operator(bad):
+    bench = Bench().started()
+    fields = {"control_mode": Command.POSITION, "position": list(Q)}
+    bench.send(**fields)
+    bench.tick()
+    assert bench.guard.state == Status.STATE_STARTING
+    assert bench.send(**{**fields, **bad}) != Status.REFUSAL_NONE
+    assert bench.tick().control_mode == Command.HOLD
+    assert bench.guard.hold_reason.startswith("a command was refused while a mode began")
+    bench.tick(1000)
+    assert bench.send(Command.EFFORT) == Status.REFUSAL_RESUME
+
+
 def test_refused_commands_of_one_sender_do_not_keep_an_operator_from_a_reset():
     bench = Bench().started()
     expire(bench)

@@ -100,6 +100,16 @@ def test_efforts_of_normal_use_do_not_oscillate(wave):
     assert reversals(OscillationMonitor(SETTINGS, ARM), wave) == (None, None)
 
 
+@pytest.mark.parametrize(("half_period", "restart", "found"), [(0.1, 99, True), (0.1, 4, False), (5.0, 99, False)])
+def test_reversals_fade_and_a_restart_forgets_them(half_period, restart, found):
+    monitor, joints = OscillationMonitor(SETTINGS, ARM), []
+    for k in range(20):
+        if k % restart == 0:
+            monitor.restart()
+        joints += [monitor.add((-1.0) ** k * LIMIT, 1e-3) for _ in range(round(1e3 * half_period))]
+    assert any(joint is not None for joint in joints) == found
+
+
 def test_a_guard_holds_an_arm_whose_effort_commands_oscillate():
     bench = Bench().started()
     for k in range(2000):
