@@ -3,7 +3,8 @@
     python benchmarks/sensor_faults.py [--arms mtml psm] [--uses effort position hold] [--processes 2]
 
 Each fault of tests/support/faulty_arm.py begins on each joint of a simulated arm with all effects of its file, while
-the joints move at up to 0.5 rad/s (50 mm/s) under effort or position commands, or stand.
+the joints move at up to 0.5 rad/s (50 mm/s) under effort or position commands, or stand. Each fault begins at three
+instants of two motions; the largest values are printed.
 """
 
 from __future__ import annotations
@@ -19,44 +20,53 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 from faulty_arm import FAULTS, PERIOD, FaultyArm
 
-#: When the fault begins [s]: all joints move then.
-BEGIN = 2.6
+from dvrk_drake.models.arm import load_arm
+
+#: When the fault begins [s] and the seed of the motion and the noise; all joints move then.
+TRIALS = ((2.6, 0), (3.2, 1), (3.8, 0))
 
 
-class Table:
-    """Outcomes of all faults on all joints of one arm in one use."""
+class Trial:
+    """An arm in motion, at the instant before a fault."""
 
-    def __init__(self, name, use, faults):
-        self.arm = FaultyArm(name, use)
-        self.title = f"{name}, {use}"
-        self.tasks = [(fault, joint) for fault in faults for joint in range(self.arm.arm.num_joints)]
-        while self.arm.ticks * PERIOD < BEGIN:
+    def __init__(self, name, use, begin, seed):
+        self.begin, self.arm = begin, FaultyArm(name, use, seed=seed)
+        while self.arm.ticks * PERIOD < begin:
             self.arm.step()
 
     def outcome(self, task):
         """Outcome of one (fault, joint); for a process of its own, which is a copy of the arm that moves."""
-        return self.arm.fail(*task, BEGIN)
+        return self.arm.fail(*task, self.begin)
 
-    def print(self, outcomes):
-        """Prints a line for each fault and joint, and the counts."""
-        arm = self.arm.arm
-        print(f"\n{self.title}. Movement in rad, of prismatic joints in dm; speed in rad/s, dm/s; effort / limit")
-        columns = f"{'detected ms':>11} {'moved until':>11} {'after':>7} {'speed':>6} {'effort':>6}  guard"
-        print(f"{'fault':18} {'joint':16} {columns}")
-        far = 0
-        for (fault, joint), o in zip(self.tasks, outcomes, strict=True):
-            scale = 10.0 if arm.prismatic[joint] else 1.0
-            far += scale * o.before > 0.05
-            print(
-                f"{fault:18} {arm.joint_names[joint]:16} {1e3 * o.detected:11.0f} {scale * o.before:11.3f} "
-                f"{scale * o.after:7.3f} {o.speed:6.2f} {o.effort:6.2f}  {o.text}"
-            )
-        times = [1e3 * o.detected for o in outcomes if np.isfinite(o.detected)]
+
+def print_table(title, arm, tasks, trials):
+    """Prints the worst values of each fault on each joint, and the counts; trials[k][i] is the outcome of tasks[i]."""
+    print(f"\n{title}. Largest of {len(trials)}. Movement in rad, of prismatic joints in dm; speed in rad/s, dm/s;")
+    print("effort / limit. `before`: from the fault to its detection; `after`: from then on.")
+    print(
+        f"{'fault':18} {'joint':16} {'found':>5} {'ms':>5} {'before':>7} {'after':>6} {'speed':>6} {'effort':>6}  guard"
+    )
+    for (fault, joint), outcomes in zip(tasks, zip(*trials, strict=True), strict=True):
+        scale = 10.0 if arm.prismatic[joint] else 1.0
+        found = [o for o in outcomes if np.isfinite(o.detected)]
+        worst = max(found, key=lambda o: o.detected, default=outcomes[0])
+        milliseconds = f"{1e3 * worst.detected:.0f}" if found else "-"
+        before, after = (scale * max(getattr(o, name) for o in outcomes) for name in ("before", "after"))
+        speed, effort = (max(getattr(o, name) for o in outcomes) for name in ("speed", "effort"))
         print(
-            f"{len(times)} of {len(self.tasks)} detected, after {np.median(times):.0f} ms (median); "
-            f"{far} moved more than 0.05 before",
-            flush=True,
+            f"{fault:18} {arm.joint_names[joint]:16} {len(found):3}/{len(outcomes)} {milliseconds:>5} {before:7.3f} "
+            f"{after:6.2f} {speed:6.2f} {effort:6.2f}  {worst.text}"
         )
+    flat = [(10.0 if arm.prismatic[joint] else 1.0, o) for t in trials for (_, joint), o in zip(tasks, t, strict=True)]
+    found = [(scale, o) for scale, o in flat if np.isfinite(o.detected)]
+    print(
+        f"{len(found)} of {len(flat)} detected, median {1e3 * np.median([o.detected for _, o in found]):.0f} ms; of these "
+        f"{sum(scale * o.before <= 0.05 for scale, o in found)} moved at most 0.05 before, "
+        f"{sum(o.speed <= 0.5 for _, o in found)} at most 0.5/s after, "
+        f"{sum(o.effort <= 0.4 for _, o in found)} with at most 0.4 of the effort. "
+        f"{sum(scale * o.before > 0.05 for scale, o in flat if np.isinf(o.detected))} undetected moved more than 0.05",
+        flush=True,
+    )
 
 
 def main():
@@ -67,21 +77,25 @@ def main():
     parser.add_argument("--faults", nargs="+", default=list(FAULTS))
     parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()
-    for arm in arguments.arms:
+    for name in arguments.arms:
         for use in arguments.uses:
-            table = Table(arm, use, arguments.faults)
-            TABLES.append(table)
-            with multiprocessing.get_context("fork").Pool(arguments.processes, maxtasksperchild=1) as pool:
-                table.print(pool.map(newest_outcome, table.tasks, chunksize=1))
+            arm = load_arm(name)
+            tasks = [(fault, joint) for fault in arguments.faults for joint in range(arm.num_joints)]
+            outcomes = []
+            for begin, seed in TRIALS[:1] if use == "hold" else TRIALS:
+                LAST.append(Trial(name, use, begin, seed))
+                with multiprocessing.get_context("fork").Pool(arguments.processes, maxtasksperchild=1) as pool:
+                    outcomes.append(pool.map(last_outcome, tasks, chunksize=1))
+            print_table(f"{name}, {use}", arm, tasks, outcomes)
 
 
-#: The tables so far; a forked process takes the newest one.
-TABLES = []
+#: The trials so far; a forked process takes the last one.
+LAST = []
 
 
-def newest_outcome(task):
-    """Outcome of a task of the newest table."""
-    return TABLES[-1].outcome(task)
+def last_outcome(task):
+    """Outcome of a task in the last trial."""
+    return LAST[-1].outcome(task)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.lcm_messages import describe_refusal
 from dvrk_drake.systems.guard.command_expiry import CommandExpiry
 from dvrk_drake.systems.guard.command_stream import (
     FOREIGN,
@@ -251,7 +252,7 @@ class CommandGuard:
         self.counts.refused += 1
         self.refusal_code = code
         if code not in OUT_OF_STREAM and self.state == lcmt_dvrk_status.STATE_STARTING:
-            self._take_over(f"a command was refused while a mode began (refusal code {code})")
+            self._take_over(f"a command was refused while its mode began: {describe_refusal(code)}")
         return code
 
     def ignore(self, code: int, count: int = 1) -> None:

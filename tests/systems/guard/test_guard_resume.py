@@ -130,7 +130,7 @@ def test_a_refused_command_while_the_mode_changes_waits_for_an_operator(bad):
     assert bench.guard.state == Status.STATE_STARTING
     assert bench.send(**{**fields, **bad}) != Status.REFUSAL_NONE
     assert bench.tick().control_mode == Command.HOLD
-    assert bench.guard.hold_reason.startswith("a command was refused while a mode began")
+    assert bench.guard.hold_reason.startswith("a command was refused while its mode began: ")
     bench.tick(1000)
     assert bench.send(Command.EFFORT) == Status.REFUSAL_RESUME
 
