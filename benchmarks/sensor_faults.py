@@ -59,8 +59,9 @@ def print_table(title, arm, tasks, trials):
         )
     flat = [(10.0 if arm.prismatic[joint] else 1.0, o) for t in trials for (_, joint), o in zip(tasks, t, strict=True)]
     found = [(scale, o) for scale, o in flat if np.isfinite(o.detected)]
+    median = 1e3 * np.median([o.detected for _, o in found])
     print(
-        f"{len(found)} of {len(flat)} detected, median {1e3 * np.median([o.detected for _, o in found]):.0f} ms; of these "
+        f"{len(found)} of {len(flat)} detected, after {median:.0f} ms (median); of these "
         f"{sum(scale * o.before <= 0.05 for scale, o in found)} moved at most 0.05 before, "
         f"{sum(o.speed <= 0.5 for _, o in found)} at most 0.5/s after, "
         f"{sum(o.effort <= 0.4 for _, o in found)} with at most 0.4 of the effort. "

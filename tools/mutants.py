@@ -159,6 +159,7 @@ def main() -> None:
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("path", type=Path, help="module or folder, e.g. dvrk_drake/systems/guard")
     parser.add_argument("--tests", nargs="+", help="what pytest runs; default: the folder in tests/ of the same name")
+    parser.add_argument("--every", type=int, default=1, help="make only every such mutant; default: %(default)s")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="mutants at a time; default: %(default)s")
     options = parser.parse_args()
     path = options.path.resolve()
@@ -175,7 +176,7 @@ def main() -> None:
         if not name.startswith("dvrk_drake") and name.rpartition(".")[2] not in own:
             with suppress(Exception):
                 importlib.import_module(name)
-    todo = [mutant for file in files for mutant in mutants(file)]
+    todo = [mutant for file in files for mutant in mutants(file)][:: options.every]
     survived = Counter[Path]()
     with ThreadPoolExecutor(options.jobs) as pool:
         codes = pool.map(lambda mutant: tests(3 * needed + 10, mutant).exit_code(), todo)
