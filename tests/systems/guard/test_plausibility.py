@@ -79,6 +79,11 @@ def test_a_jump_is_found_however_fast_the_joint_seems_to_be():
     sensors = Sensors()
     v = unit(0, 0.3 / MS)
     assert "jumps" in sensors.move(v)[0]
+    reach = (MS + SETTINGS.jitter) * 1.5 * GuardLimits(ARM, GuardSettings()).speed[0] + TOLERANCE[0]
+    for factor, found in ((0.99, False), (1.01, True)):
+        sensors = Sensors()
+        sensors.v, sensors.q = v, sensors.q + unit(0, factor * reach)
+        assert ("jumps" in sensors.measure()) == found
 
 
 def test_a_late_measurement_may_have_moved_on():
@@ -110,6 +115,22 @@ def test_a_velocity_that_disagrees_with_the_position_is_found_in_time(joint, spe
     assert MS * ticks == pytest.approx(expected, abs=4 * MS)
 
 
+@pytest.mark.parametrize(
+    ("arm", "smallest"),
+    [
+        (ARM, [0.073, 0.073, 0.078, 0.100, 0.57, 0.57, 1.07]),
+        (PSM, [0.068, 0.068, 0.0070, 0.103, 0.090, 0.115, 0.124]),
+    ],
+)
+def test_the_smallest_drift_that_is_found(arm, smallest):
+    """At rest, of a position whose velocity is measured as zero: the table of docs/safety.md [rad/s, m/s]."""
+    for joint, drift in enumerate(smallest):
+        for share, found in ((0.95, False), (1.05, True)):
+            rate = share * drift * np.eye(arm.num_joints)[joint]
+            fault, _ = Sensors(arm).move(rate, ticks=1500, measured_v=np.zeros_like)
+            assert bool(fault) == found, (arm.joint_names[joint], share)
+
+
 def test_a_velocity_with_the_delay_of_a_filter_is_plausible():
     """A first-order filter of 30 Hz, as in the arm files, at up to 0.4 of the speed limit in both directions."""
     sensors = Sensors()
@@ -122,14 +143,16 @@ def test_a_velocity_with_the_delay_of_a_filter_is_plausible():
 
 
 @pytest.mark.parametrize("joint", JOINTS)
-def test_a_position_that_stays_the_same_under_a_changing_effort_is_frozen(joint):
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_position_that_stays_the_same_under_a_changing_effort_is_frozen(joint, side):
     time = SETTINGS.frozen_time + COUNTS[joint] / SETTINGS.frozen_speed
     for factor, found in ((0.99, False), (1.01, True)):
         sensors = Sensors()
         sensors.move(np.zeros(N), ticks=1000)  # it may have stood before
-        sensors.effort = unit(joint, factor * SETTINGS.frozen_effort * LIMIT[joint])
+        sensors.effort = unit(joint, side * factor * SETTINGS.frozen_effort * LIMIT[joint])
         fault, ticks = sensors.move(np.zeros(N), ticks=500)
         assert ("does not change although" in fault) == found
+        np.testing.assert_array_equal(sensors.checks.invalid, unit(joint).astype(bool) & found)
         if found:
             assert fault.startswith(ARM.joint_names[joint])
             assert MS * ticks == pytest.approx(time, abs=1.5 * MS)
@@ -174,6 +197,15 @@ def test_a_motion_that_does_not_follow_from_the_effort_is_found(joint):
             sensors.q = sensors.q + MS * sensors.v
             fault = fault or sensors.measure()
         assert (fault == f"{ARM.joint_names[joint]}: the motion does not follow from the effort") == found
+        assert sensors.checks.invalid[joint] == found
+
+
+def test_the_mass_matrix_is_that_of_the_last_50_ms():
+    model = Unity()
+    poses = []
+    model.mass_matrix = lambda q: (poses.append(q), np.eye(N))[1]
+    Sensors(model=model).move(np.zeros(N), ticks=1000)
+    assert 15 <= len(poses) <= 25
 
 
 def test_an_error_of_the_model_that_grows_slowly_is_accepted():
