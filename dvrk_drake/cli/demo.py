@@ -1,4 +1,4 @@
-"""The verbs that show what all of it is for, on simulated arms."""
+"""The verbs `demo`, `teleop` and `reproduce`: experiments on simulated arms."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from dvrk_drake.cli.support import (
     quiet_drake,
     seed,
 )
+
+NAMES = ("table1", "fig4", "fig5", "fig6", "fig7", "psm", "transparency")
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -31,6 +33,20 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     add_overwrite(verb)
     verb.add_argument("--port", type=int, help="of the page; default: a free one")
     verb.set_defaults(run=_teleop)
+
+    verb = verbs.add_parser(
+        "reproduce", help="redo the paper's figures and tables beside its published numbers; writes a folder"
+    )
+    verb.add_argument("what", nargs="?", choices=(*NAMES, "all"), default="all", help="default: all")
+    verb.add_argument("--output", default="reproduction", metavar="DIR", help="default: reproduction")
+    verb.add_argument(
+        "--data",
+        metavar="DIR",
+        help="folder with the paper's recording mtm_2015_good72.csv (docs/reproduction.md); default: "
+        "$DVRK_DRAKE_SHARED/data/mtm_static; without it Fig. 4 cannot be made and others have another arm",
+    )
+    verb.add_argument("--seed", type=seed, default=0, help="of simulated arms, poses and noise; default: 0")
+    verb.set_defaults(run=_reproduce)
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -70,3 +86,18 @@ def _teleop(options: argparse.Namespace) -> None:
     with atomic_write(options.html) as stream:
         stream.write(meshcat.StaticHtml())
     print_teleoperation(make_console(), result, options.html)
+
+
+def _reproduce(options: argparse.Namespace) -> None:
+    from dvrk_drake.experiments.reproduction.published import PaperRecordings
+    from dvrk_drake.reports.reproduction.run import reproduce
+
+    quiet_drake()
+    recordings = PaperRecordings.find(options.data)
+    if options.what == "fig4":
+        _ = recordings.poses  # refuses before a folder is made
+    output = made_folder(options.output)
+    names = NAMES if options.what == "all" else (options.what,)
+    with ProgressBar("") as bar:
+        page = reproduce(names, output, recordings, bar, seed=options.seed)
+    print(f"written: {page}")

@@ -63,32 +63,34 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
     add_overwrite(verb)
     verb.set_defaults(run=_predict)
 
-    verb = verbs.add_parser("convert", help="turn a recording (CSV, LCM log, team .mat, WPI CSV) into our CSV")
-    verb.add_argument("input", metavar="INPUT")
-    verb.add_argument("output", metavar="OUTPUT.csv")
-    verb.add_argument("--format", choices=("csv", "team-mat", "wpi-csv", "lcm-log"), help="default: detected")
-    verb.add_argument(
-        "--coordinates",
-        choices=("joint", "actuator"),
-        help="what q and tau of a CSV with a header are of; needed there, the other formats define it",
+    verb = verbs.add_parser(
+        "recalibrate",
+        help="refit a model's friction and offsets to a short motion of another day",
+        description="Refit a model's friction and offsets to a short motion of another day. The gain is for motions "
+        "like that one; at other positions and speeds it can be much smaller (docs/payload.md).",
     )
-    verb.add_argument("--variable", metavar="NAME", help="the .mat's variable, where several fit")
-    verb.add_argument(
-        "--rate",
-        type=float,
-        metavar="HZ",
-        help="samples a second of a CSV without time stamps; default: WPI 200, with a header none are written",
-    )
-    verb.add_argument(
-        "--arm", help="e.g. psm; CSV, WPI: write its joint coordinates, not the actuators'; LCM log: which arm"
-    )
-    verb.add_argument(
-        "--skip-invalid",
-        action="store_true",
-        help="leave out rows with an empty cell, a NaN or an infinity, and count them",
-    )
+    verb.add_argument("model", metavar="MODEL.yaml", help="a model that was identified from a motion")
+    add_recording(verb)
+    verb.add_argument("--output", required=True, metavar="NEW.yaml", help="the model file to write")
     add_overwrite(verb)
-    verb.set_defaults(run=_convert)
+    verb.set_defaults(run=_recalibrate)
+
+    verb = verbs.add_parser("payload", help="say what was added to an arm between two recordings of one motion")
+    verb.add_argument("reference", metavar="REFERENCE", help="recording of the motion without the payload")
+    verb.add_argument("loaded", metavar="LOADED", help="recording of the same motion with it")
+    source = verb.add_mutually_exclusive_group(required=True)
+    source.add_argument(
+        "--arm", help="the arm: mtml, mtmr, psm, or a YAML file; its model is identified from REFERENCE"
+    )
+    source.add_argument("--model", metavar="MODEL.yaml", help="its model, identified from a motion")
+    verb.add_argument("--link", help="link of the SDF that carries it, compared with all others; default: the best")
+    verb.add_argument(
+        "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
+    )
+    verb.add_argument("--json", metavar="FILE", help="write the estimates as JSON")
+    add_overwrite(verb)
+    add_gravity(verb)
+    verb.set_defaults(run=_payload)
 
 
 def _identify(options: argparse.Namespace) -> None:
@@ -175,25 +177,45 @@ def _predict(options: argparse.Namespace) -> None:
     write_csv(options.output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
 
 
-def _convert(options: argparse.Namespace) -> None:
-    from dvrk_drake.recordings.conversion import convert
+def _recalibrate(options: argparse.Namespace) -> None:
+    from dvrk_drake.reports.identification import print_recalibration
     from dvrk_drake.reports.terminal_tables import make_console
 
-    check_output(options.output, options.input, overwrite=options.overwrite)
+    check_output(options.output, options.recording, options.model, overwrite=options.overwrite)
+    model = dvrk.IdentifiedModel.load(options.model)
+    recording = dvrk.read_recording(options.recording, model.arm, options.coordinates)
+    print_notes(options.recording, recording.notes)
+    with ProgressBar("recalibrating") as bar:
+        result = dvrk.recalibrate(model, recording, progress=bar)
     console = make_console()
-    recording = convert(
-        options.input,
-        options.output,
-        format=options.format,
-        coordinates=options.coordinates,
-        variable=options.variable,
-        rate=options.rate,
-        arm=None if options.arm is None else dvrk.load_arm(options.arm),
-        skip_invalid=options.skip_invalid,
-    )
-    for note in recording.notes:
-        console.print(note, soft_wrap=True)
-    console.print(f"{options.output}: {len(recording)} rows, {recording.coordinates} coordinates", soft_wrap=True)
+    print_recalibration(console, result)
+    result.save(options.output, overwrite=True)
+    console.print(f"model: {options.output}")
+
+
+def _payload(options: argparse.Namespace) -> None:
+    from dvrk_drake.reports.payload import print_links, print_payload
+    from dvrk_drake.reports.terminal_tables import make_console
+
+    model = None if options.model is None else dvrk.IdentifiedModel.load(options.model)
+    if model is not None and options.gravity is not None:
+        raise ModelError(f"{options.model}: states its gravity; --gravity is for --arm")
+    arm = mounted(dvrk.load_arm(options.arm), options.gravity) if model is None else model.arm
+    if options.json is not None:
+        check_output(options.json, options.reference, options.loaded, overwrite=options.overwrite)
+    reference, loaded = (dvrk.read_recording(p, arm, options.coordinates) for p in (options.reference, options.loaded))
+    for recording in (reference, loaded):
+        print_notes(recording.source, recording.notes)
+    with ProgressBar("estimating") as bar:
+        result = dvrk.payload(reference, loaded, model or arm, options.link, progress=bar)
+    console = make_console()
+    other_link = [warning for warning in result.warnings if warning.kind == "other link"]
+    if options.link is None or other_link:
+        print_links(console, result.estimates)
+    print_warnings(console, other_link)
+    print_payload(console, result.payload, result.estimates)
+    if options.json is not None:
+        write_json(options.json, result.as_dicts())
 
 
 _slow_parts_help = "of a motion without rests, take where a joint is slow as poses"

@@ -13,28 +13,13 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import NoReturn
 
-from dvrk_drake.cli import (
-    check,
-    collect,
-    demo,
-    export,
-    identify,
-    lcm,
-    model,
-    payload,
-    recalibrate,
-    reproduce,
-    simulate,
-)
+from dvrk_drake.cli import collect, demo, export, identify, lcm, model, recordings, simulate
 from dvrk_drake.cli.support import folders_only_for_results, import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
 
 # Matrices are small here: more threads of BLAS only wait for each other, for minutes where the cores are busy. Said
 # before numpy is imported, which the verbs do.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-_OF_RECORDINGS = (check, identify, recalibrate, payload, export)
-_SIMULATED = (simulate, reproduce, demo)
 
 
 def run(arguments: Sequence[str] | None) -> int:
@@ -83,6 +68,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version("dvrk-drake"))
     verbs = parser.add_subparsers(required=True, metavar="VERB")
-    for module in (model, *_OF_RECORDINGS, *_SIMULATED, lcm, collect):
+    for module in (model, recordings, identify, export, simulate, demo, lcm, collect):
         module.add_verbs(verbs)
     return parser

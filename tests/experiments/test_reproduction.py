@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from paper_regressor import paper_regressor
 
+from dvrk_drake.cli import demo as verb
 from dvrk_drake.cli import main
-from dvrk_drake.cli import reproduce as verb
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.experiments.ground_truth import GroundTruth, unlike_its_drawing

@@ -14,8 +14,8 @@ from dvrk_drake.dynamics.actuator_effects import effect_step
 from dvrk_drake.dynamics.codegen import entry_point
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
+from dvrk_drake.systems.arm_effects.drive_force import in_steps
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
-from dvrk_drake.systems.arm_effects.motors import in_steps
 
 
 class DriveStep(LeafSystem):

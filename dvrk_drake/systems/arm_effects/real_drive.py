@@ -13,10 +13,9 @@ from pydrake.systems.primitives import DiscreteTimeDelay, PassThrough
 
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect
-from dvrk_drake.systems.arm_effects.drive_force import DriveForce
+from dvrk_drake.systems.arm_effects.drive_force import DriveForce, EffortSensor, Motors
 from dvrk_drake.systems.arm_effects.drive_step import DriveStep
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
-from dvrk_drake.systems.arm_effects.motors import EffortSensor, Motors
 from dvrk_drake.systems.ideal_drive import DrivePorts, PlantJoints, add_true_state
 
 

@@ -6,8 +6,8 @@ from real_arm import Run, middle, weightless
 
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, EffortEffect
+from dvrk_drake.systems.arm_effects.drive_force import EffortSensor, Motors, in_steps
 from dvrk_drake.systems.arm_effects.drive_step import _follow, _measure_into
-from dvrk_drake.systems.arm_effects.motors import EffortSensor, Motors, in_steps
 
 ARM = load_arm("mtml")
 N = ARM.num_joints
