@@ -47,9 +47,9 @@ def main() -> int:
         for estimate, value in zip(model.base_parameters, beta, strict=True):
             base.append(abs(estimate.value - value) < 1.96 * estimate.standard_error)
         for e in model.effects:
-            value = TRUE_EFFECTS.get(e.effect)
+            value = TRUE_EFFECTS.get(ActuatorEffect.of(e))
             spurious += value is None
-            effects.append(abs(e.value - (value or 0.0)) < 1.96 * e.standard_error)
+            effects.append(abs(e.coefficient - (value or 0.0)) < 1.96 * e.standard_error)
     print(f"{options.recordings} recordings of {options.poses} poses, noise {options.noise:g} of the effort limit")
     print(f"95 % intervals hold the truth: base parameters {np.mean(base):.0%}, chosen effects {np.mean(effects):.0%}")
     of_base, of_effects = np.mean(np.array(given)[:, : len(beta)]), np.mean(np.array(given)[:, len(beta) :])

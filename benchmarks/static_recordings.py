@@ -19,6 +19,7 @@ from rich.table import Table
 
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.analysis.static.validation import validate_static
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.recording import Recording, read_recording
@@ -75,7 +76,7 @@ def main() -> int:
             table.add_row("", "paper", *(f"{j.rms_error_undoubted:.4f}" for j in by_paper))
             table.add_row("", "ours", *(f"{j.rms_error_undoubted:.4f}" for j in by_ours))
         console.print(table)
-        effects = ", ".join(f"{e.effect} {e.value:+.3f}" for e in ours.model.effects)
+        effects = ", ".join(f"{ActuatorEffect.of(e)} {e.coefficient:+.3f}" for e in ours.model.effects)
         trusts = ", ".join(f"{j.name} {j.trust:.2f}" for j in ours.model.joints if j.trust < 1)
         console.print(f"effects chosen: {effects or 'none'}; trust below 1: {trusts or 'none'}\n")
     return 0

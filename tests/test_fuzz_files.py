@@ -26,7 +26,6 @@ from public_files import team_array, wpi_rows
 from status_logs import log_bytes, statuses
 
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.experiments.reproduction.published import PaperRecordings
@@ -38,6 +37,7 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensa
 from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.arm_schema import load_gains
+from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
 from dvrk_drake.processes.simulated_arm import load_driver
 from dvrk_drake.recordings.conversion import convert
@@ -88,7 +88,7 @@ def dynamic_model() -> IdentifiedModel:
     """A model of a PSM with dynamics, friction and effects of position."""
     arm = load_arm("psm")
     kinds = [("viscous", 0.0), ("coulomb", 0.1), ("presliding", 0.02), ("cable sine", 1.0), ("spring", 0.4)]
-    effects = [ActuatorEffectEstimate(f"actuator.{arm.joint_names[0]}", kind, scale, 0.1) for kind, scale in kinds]
+    effects = [DriveEffect(f"actuator.{arm.joint_names[0]}", kind, scale, 0.1) for kind, scale in kinds]
     section = true_dynamics(arm, np.random.default_rng(0), effects).section
     return replace(IdentifiedModel.from_arm(arm), dynamics=section)
 

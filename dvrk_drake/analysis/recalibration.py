@@ -19,9 +19,10 @@ from dvrk_drake.analysis.signals.drive_efforts import (
 from dvrk_drake.analysis.signals.motion_grid import MotionGrid, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of, phase_folds
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
+from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
@@ -98,7 +99,7 @@ def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progr
         >>> arm = dvrk.load_arm("psm")
         >>> model, today = (dvrk.IdentifiedModel.from_arm(arm, dynamics=True) for _ in range(2))
         >>> for effect in today.dynamics.effects:
-        ...     effect.value *= 1.5 if effect.kind == "presliding" else 1.0
+        ...     effect.coefficient *= 1.5 if effect.kind == "presliding" else 1.0
         >>> t, w, reach = np.arange(0, 12, 0.01)[:, None], 1 + 0.25 * np.arange(7), 0.3 * arm.position_upper
         >>> q, v, vd = reach * (1 + np.sin(w * t)), reach * w * np.cos(w * t), -reach * w**2 * np.sin(w * t)
         >>> tau = arm.transmission.pull_back_effort(today.dynamic_model.effort(q, v, vd))
@@ -273,14 +274,14 @@ def _section(section: DynamicSection, fit: _Fit, x: NDArray[np.float64]) -> Dyna
     offsets = {f"actuator.{name}": float(c) for name, c in zip(fit.names, x[len(fit.keys) :], strict=True) if c}
     effects = []
     for effect in section.effects:
-        value, error = effect.value, effect.standard_error
+        coefficient, error = effect.coefficient, effect.standard_error
         if effect.kind in FRICTION_PARTS:
             scale = float(scales.get((effect.coordinate, FRICTION_PARTS[effect.kind]), 1.0))
-            value, error = scale * value, scale * error
+            coefficient, error = scale * coefficient, scale * error
         elif effect.kind == "offset":
-            value += offsets.pop(effect.coordinate, 0.0)
-        effects.append(replace(effect, value=value, standard_error=error))
-    effects += [ActuatorEffectEstimate(coordinate, "offset", 0.0, c, 0.0) for coordinate, c in offsets.items()]
+            coefficient += offsets.pop(effect.coordinate, 0.0)
+        effects.append(replace(effect, coefficient=coefficient, standard_error=error))
+    effects += [DriveEffect(coordinate, "offset", 0.0, c) for coordinate, c in offsets.items()]
     return replace(section, effects=effects)
 
 

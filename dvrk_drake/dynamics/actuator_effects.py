@@ -20,6 +20,7 @@ import sympy
 from numpy.typing import NDArray
 
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import DriveEffect
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,11 @@ class ActuatorEffect:
     coordinate: str
     kind: str
     scale: float = 0.0
+
+    @classmethod
+    def of(cls, effect: DriveEffect) -> ActuatorEffect:
+        """Returns what the coefficient of `effect` belongs to."""
+        return cls(effect.coordinate, effect.kind, effect.scale)
 
     def __str__(self) -> str:
         return f"{self.coordinate} {self.kind}" + (f" {self.scale:.3g}" if self.scale else "")

@@ -81,8 +81,8 @@ class DynamicModel:
         phi = [x for link in section.links for x in link.parameters] + [rotor.value for rotor in section.rotors]
         # Columns that couple two rotors belong to no motor, see `rotor_inertias`.
         self.parameters = np.concatenate([phi, np.zeros(len(self.regressor.values) - len(phi))])
-        self.effects = tuple(e.effect for e in section.effects)
-        self.coefficients = np.array([e.value for e in section.effects])
+        self.effects = tuple(map(ActuatorEffect.of, section.effects))
+        self.coefficients = np.array([e.coefficient for e in section.effects])
 
     @cached_property
     def links(self) -> tuple[LinkInertia, ...]:
@@ -160,9 +160,9 @@ def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
 
 
 def _check_effects(arm: Arm, section: DynamicSection) -> None:
-    for i, estimate in enumerate(section.effects):
-        where = f"dynamics.effects[{i}]"
-        if fault := effect_fault(arm, estimate.effect):
+    for i, effect in enumerate(section.effects):
+        where, law = f"dynamics.effects[{i}]", ActuatorEffect.of(effect)
+        if fault := effect_fault(arm, law):
             raise ModelError(f"{where}: {fault}")
-        if estimate.effect.dissipative and estimate.value < 0:
-            raise ModelError(f"{where}: value is {estimate.value:g}; of friction 0 or more")
+        if law.dissipative and effect.coefficient < 0:
+            raise ModelError(f"{where}: coefficient is {effect.coefficient:g}; of friction 0 or more")

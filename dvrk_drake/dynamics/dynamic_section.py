@@ -3,14 +3,13 @@
 # No postponed annotations here: yaml_load_typed reads the types at run time.
 from dataclasses import dataclass, field
 
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.models.arm_schema import GRAVITIES
+from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.schema_fault import within
 
 #: What a fit finds: beyond the largest arm by orders of magnitude, as parameters that a recording does not tell are
 #: found anywhere, and their standard errors are larger still.
 ESTIMATES = within(-1e5, 1e5, "kg, kg m or kg m^2")
-COEFFICIENTS = within(-1e6, 1e6, "N m, N m s/rad or N m/rad")
 STANDARD_ERRORS = within(0.0, 1e9)
 RMS_EFFORTS = within(0.0, 1e6, "N m or N")
 #: Of numbers that rounding may put beyond 0 or 1.
@@ -69,27 +68,6 @@ class RotorEstimate:
 
 
 @dataclass
-class ActuatorEffectEstimate:
-    """An effect in the drive, see `ActuatorEffect`, with its coefficient in the unit of its kind."""
-
-    coordinate: str = ""
-    kind: str = ""
-    scale: float = field(default=0.0, metadata=within(1e-9, 1e4, also=(0.0,)))
-    value: float = field(default=0.0, metadata=COEFFICIENTS)
-    standard_error: float = field(default=0.0, metadata=STANDARD_ERRORS)
-
-    @property
-    def effect(self) -> ActuatorEffect:
-        """What it is the coefficient of."""
-        return ActuatorEffect(self.coordinate, self.kind, self.scale)
-
-    @property
-    def distinguishable(self) -> bool:
-        """Whether its size exceeds two standard errors."""
-        return abs(self.value) > 2 * self.standard_error
-
-
-@dataclass
 class ActuatorStatistics:
     """How the effort of one actuator was fitted, behind the low-pass: RMS in N m (N of one that slides).
 
@@ -127,7 +105,7 @@ class DynamicSection:
     gravity: list[float] = field(default_factory=list, metadata=GRAVITIES)
     links: list[LinkEstimate] = field(default_factory=list)
     rotors: list[RotorEstimate] = field(default_factory=list)
-    effects: list[ActuatorEffectEstimate] = field(default_factory=list)
+    effects: list[DriveEffect] = field(default_factory=list)
     actuators: list[ActuatorStatistics] = field(default_factory=list)
     signals: SignalSettings = field(default_factory=SignalSettings)
     gravity_expected: list[float] = field(default_factory=list, metadata=GRAVITIES)

@@ -79,9 +79,7 @@ class Friction:
         effects = [effect for effect in arm.effects.friction if not effect.fall_speed]
         if not effects:
             raise ControllerError(f"friction: the files of {arm.name} state none")
-        return cls.of(
-            arm, [ActuatorEffect(e.coordinate, e.kind, e.scale) for e in effects], [e.coefficient for e in effects]
-        )
+        return cls.of(arm, list(map(ActuatorEffect.of, effects)), [e.coefficient for e in effects])
 
     @classmethod
     def of_model(cls, model: IdentifiedModel) -> Friction:
@@ -95,7 +93,7 @@ class Friction:
                 "friction: the model was identified from poses, which tell nothing of friction; give a motion's"
             )
         effects = model.dynamics.effects
-        return cls.of(model.arm, [e.effect for e in effects], [e.value for e in effects])
+        return cls.of(model.arm, list(map(ActuatorEffect.of, effects)), [e.coefficient for e in effects])
 
     @property
     def rows(self) -> NDArray[np.float64]:

@@ -6,20 +6,19 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.common.yaml import yaml_dump_typed
 
-from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, effect_fault
+from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect, effect_fault
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import (
     ESTIMATES,
     RMS_EFFORTS,
     STANDARD_ERRORS,
-    ActuatorEffectEstimate,
     DynamicSection,
     LinkEstimate,
     RotorEstimate,
@@ -40,8 +39,8 @@ from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 
 #: Of the files that `IdentifiedModel.save` writes.
 FORMAT = "dvrk_drake identified model 3"
-#: Of older files that can be read: in 2, `arm` is a name or an absolute path.
-_READABLE_FORMATS = ("dvrk_drake identified model 2",)
+#: Of older files that can be read: there `arm` is a name or an absolute path, and effects have a `value`.
+_FORMAT_2 = "dvrk_drake identified model 2"
 #: Measured positions, which may be beyond the limits of a joint.
 _POSITIONS = within(-50.0, 50.0, "rad or m")
 
@@ -116,7 +115,7 @@ class _Identified:
     """What a model states of its arm, in its file and in Python."""
 
     base_parameters: list[BaseParameterEstimate] = field(default_factory=list)
-    effects: list[ActuatorEffectEstimate] = field(default_factory=list)
+    effects: list[DriveEffect] = field(default_factory=list)
     joints: list[JointStatistics] = field(default_factory=list)
     provenance: Provenance = field(default_factory=Provenance)
     dynamics: DynamicSection | None = None
@@ -189,7 +188,7 @@ class IdentifiedModel(_Identified):
                 BaseParameterEstimate(name, float(value), 0.0, True)
                 for name, value in zip(gravity.base.names, gravity.base_values, strict=True)
             ],
-            effects=[ActuatorEffectEstimate(e.coordinate, e.kind, e.scale, e.coefficient, 0.0) for e in effects],
+            effects=[replace(effect) for effect in effects],
             joints=[JointStatistics(name=name) for name in arm.joint_names],
             provenance=Provenance(recording=" ".join(arm.sdf), method="nominal"),
             dynamics=_nominal_dynamics(arm) if dynamics else None,
@@ -209,8 +208,10 @@ class IdentifiedModel(_Identified):
         content = load_yaml(path, ModelError)
         # Another version has other keys, which are not worth naming.
         version = content.get("format") if isinstance(content, dict) else None
-        if version and version not in (FORMAT, *_READABLE_FORMATS):
+        if version and version not in (FORMAT, _FORMAT_2):
             raise ModelError(f'{path}: format is "{version}", this version reads "{FORMAT}"; identify anew')
+        if version == _FORMAT_2:
+            _rename_values(content)
         file = typed_content(ModelFile, content, str(path), ModelError, "a model file")
         # A number that is missing would be 0 without a word.
         if key := missing_key(ModelFile, content):
@@ -249,7 +250,7 @@ class IdentifiedModel(_Identified):
         if tuple(joint.name for joint in self.joints) != self.arm.joint_names:
             raise ModelError(f"joints must be, in this order: {', '.join(self.arm.joint_names)}")
         for i, effect in enumerate(self.effects):
-            if fault := effect_fault(self.arm, effect.effect, POSITION_KINDS):
+            if fault := effect_fault(self.arm, ActuatorEffect.of(effect), POSITION_KINDS):
                 raise ModelError(f"effects[{i}]: {fault}")
         if self.validation is not None and set(self.validation.verdicts) != set(self.arm.joint_names):
             raise ModelError(f"validation.verdicts must name these joints: {', '.join(self.arm.joint_names)}")
@@ -262,7 +263,7 @@ class IdentifiedModel(_Identified):
                 raise ModelError("a model with dynamics has effects only there, and the gravity that stands there")
 
     @property
-    def holding_effects(self) -> list[ActuatorEffectEstimate]:
+    def holding_effects(self) -> list[DriveEffect]:
         """The effects that act at rest as they do in motion (`DynamicModel.holding_effects`)."""
         if self.dynamics is None:
             return self.effects
@@ -271,7 +272,7 @@ class IdentifiedModel(_Identified):
     @property
     def theta(self) -> NDArray[np.float64]:
         """(b + e,) base parameters, then coefficients of `holding_effects`, as `StaticModel` wants them."""
-        return np.array([p.value for p in self.base_parameters] + [e.value for e in self.holding_effects])
+        return np.array([p.value for p in self.base_parameters] + [e.coefficient for e in self.holding_effects])
 
     @property
     def trust(self) -> NDArray[np.float64]:
@@ -281,7 +282,7 @@ class IdentifiedModel(_Identified):
     @cached_property
     def static_model(self) -> StaticModel:
         """The compiled structure that `theta` belongs to."""
-        return compile_static_model(self.arm, tuple(e.effect for e in self.holding_effects))
+        return compile_static_model(self.arm, tuple(map(ActuatorEffect.of, self.holding_effects)))
 
     @cached_property
     def dynamic_model(self) -> DynamicModel:
@@ -339,6 +340,14 @@ class ControlModel:
         return self._regressor.mass_matrix(q[None], self._parameters)[0]
 
 
+def _rename_values(content: dict[str, Any]) -> None:
+    """Makes the effects of a file of version 2 those of version 3; what does not fit is refused later."""
+    for part in (content, content.get("dynamics")):
+        for effect in part.get("effects") or () if isinstance(part, dict) else ():
+            if isinstance(effect, dict) and "value" in effect:
+                effect["coefficient"] = effect.pop("value")
+
+
 def _name_for(path: str | Path, arm: Arm) -> str:
     """Returns what the model file at `path` names its arm: a URL, or a path relative to the model file."""
     if not os.path.isabs(arm.source):
@@ -363,7 +372,7 @@ def _nominal_dynamics(arm: Arm) -> DynamicSection:
         gravity=gravity,
         links=[LinkEstimate(link.link, link.parameters.tolist()) for link in regressor.links],
         rotors=[RotorEstimate(name, rotor.value) for name, rotor in zip(arm.joint_names, rotors, strict=True)],
-        effects=[ActuatorEffectEstimate(e.coordinate, e.kind, e.scale, e.coefficient) for e in drive],
+        effects=[DriveEffect(e.coordinate, e.kind, e.scale, e.coefficient) for e in drive],
         signals=SignalSettings(
             acceleration_cut_off=list(arm.identification.acceleration_cut_off),
             effort_cut_off=arm.identification.effort_cut_off,

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import (
@@ -187,7 +188,7 @@ def model_bodies(model: IdentifiedModel) -> ModelBodies:
 
 def _static_effects(model: IdentifiedModel) -> list[str]:
     remarks = []
-    if effects := [f"{e.effect} {e.value:+.4g}" for e in model.effects]:
+    if effects := [f"{ActuatorEffect.of(e)} {e.coefficient:+.4g}" for e in model.effects]:
         remarks.append(f"effects [N m; N if prismatic]: {', '.join(effects)}")
     if doubted := [f"{j.name} {j.trust:g}" for j in model.joints if j.trust != 1.0]:
         remarks.append(f"trust below 1: {', '.join(doubted)}")

@@ -27,7 +27,7 @@ from dvrk_drake.experiments.study.study import await_results
 from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.coupled_limits import beside
-from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
+from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.models.plant import set_joint_damping
@@ -154,7 +154,7 @@ def paper_arm(recording: Recording, folder: Path) -> GroundTruth:
     lasting = [e for e in model.effects if not (e.kind == "offset" and _at_actuator(e.coordinate) in one_sided)]
     statistics = [dataclasses.replace(joint, trust=1.0) for joint in model.joints]
     model = dataclasses.replace(model, joints=statistics, effects=lasting)
-    laws = [DriveEffect(e.coordinate, e.kind, e.scale, e.value) for e in model.effects]
+    laws = model.effects
     effects = dataclasses.replace(arm.effects, cables=laws, springs=[])
     true_arm = with_links(arm, model_bodies(model).links, folder / "true_mtm.sdf", "the paper's recording")
     origin = (

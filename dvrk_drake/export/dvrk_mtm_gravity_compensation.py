@@ -174,7 +174,7 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
     friction = np.zeros(arm.num_joints)
     for effect in model.dynamics.effects:
         if effect.kind in DRY_KINDS:
-            friction += effect.value * np.abs(rows[effect.coordinate] @ arm.transmission.matrix)
+            friction += effect.coefficient * np.abs(rows[effect.coordinate] @ arm.transmission.matrix)
     return tuple(float(f) for f in friction)
 
 
@@ -213,7 +213,7 @@ def _effect_parameters(model: IdentifiedModel, arm: Arm) -> NDArray[np.float64]:
         row = joint_row(arm, estimate.coordinate)
         # The file has nothing for the last joint, nor for what moves with two: _refuse_errors measures what that costs.
         for joint in map(int, np.flatnonzero(row[:-1])):
-            value = float(model.trust[joint] * estimate.value * row[joint])
+            value = float(model.trust[joint] * estimate.coefficient * row[joint])
             if estimate.kind == "offset":
                 parameters[polynomial_columns(joint).start] += value
             elif np.count_nonzero(row) > 1:
@@ -221,7 +221,9 @@ def _effect_parameters(model: IdentifiedModel, arm: Arm) -> NDArray[np.float64]:
             elif joint == 1 and estimate.scale == 1.0 and estimate.kind in _FIRST:
                 parameters[_FIRST.index(estimate.kind)] += value / CONTROLLER_GRAVITY
             else:
-                parameters[polynomial_columns(joint)] += value * _best_polynomial(estimate.effect, arm, joint)
+                parameters[polynomial_columns(joint)] += value * _best_polynomial(
+                    ActuatorEffect.of(estimate), arm, joint
+                )
     return parameters
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.plant import MultibodyPlant
 
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.dynamics.model_links import model_bodies
@@ -138,7 +139,7 @@ def _left_out(model: IdentifiedModel, q: NDArray[np.float64]) -> str:
     """The model's effects on yaw, pitch and insertion at rest, with the largest torque of each at poses q (m, n)."""
     gravity = len(model.base_parameters)
     tau = np.abs(model.static_model.regressor(q)[:, :3, gravity:] * model.theta[gravity:]).max(axis=(0, 1))
-    said = [f"{e.effect} {t:.2g}" for e, t in zip(model.holding_effects, tau, strict=True) if t > 0]
+    said = [f"{ActuatorEffect.of(e)} {t:.2g}" for e, t in zip(model.holding_effects, tau, strict=True) if t > 0]
     return ", ".join(said) or "no effects"
 
 

@@ -20,19 +20,26 @@ _EFFORT_STEPS = within(1e-9, 100.0, "N m or N")
 
 @dataclass
 class DriveEffect:
-    """One effect along a coordinate of the drive, as an identification finds it.
+    """One effect along a coordinate of the drive: what an arm's file states, and what an identification finds.
 
     Attributes:
         coordinate: "actuator.<name>", "joint.<name>", or one of the arm's `friction_coordinates`.
         kind: see `dvrk_drake.dynamics.actuator_effects.EFFECT_KINDS`.
         scale: of the kind: width of the smoothed sign [rad/s, m/s], travel until it slips [rad, m], periods in a turn.
         coefficient: [N m; N m s/rad, ...; N and m of a coordinate that slides].
+        standard_error: of the coefficient, in its unit; 0 where it was not identified.
     """
 
     coordinate: str = ""
     kind: str = ""
     scale: float = field(default=0.0, metadata=within(1e-6, 1000.0, also=(0.0,)))
-    coefficient: float = field(default=0.0, metadata=within(-1e4, 1e4, "N m, N m s/rad or N m/rad"))
+    coefficient: float = field(default=0.0, metadata=within(-1e6, 1e6, "N m, N m s/rad or N m/rad"))
+    standard_error: float = field(default=0.0, metadata=within(0.0, 1e9))
+
+    @property
+    def distinguishable(self) -> bool:
+        """Whether the size of the coefficient exceeds two standard errors."""
+        return abs(self.coefficient) > 2 * self.standard_error
 
 
 @dataclass

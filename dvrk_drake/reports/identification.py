@@ -19,13 +19,13 @@ from dvrk_drake.analysis.static.static_identification import StaticIdentificatio
 from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS
 from dvrk_drake.dynamics.dynamic_section import (
-    ActuatorEffectEstimate,
     ActuatorStatistics,
     CorrelatedEstimates,
     DynamicSection,
 )
 from dvrk_drake.dynamics.physical_consistency import total_mass_reached
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.reports.figures import (
     MEASURED_COLOUR,
     MODEL_COLOUR,
@@ -229,11 +229,11 @@ def _print_drive(console: Console, section: DynamicSection, dry: dict[str, tuple
         cells = [f"{dry[name][0]:.3g}", f"{dry[name][1]:.1g}"] if name in dry else ["", ""]
         for kind in ("viscous", "offset"):
             found = next((e for e in section.effects if e.coordinate == name and e.kind == kind), None)
-            cells += ["", ""] if found is None else [f"{found.value:.3g}", f"{found.standard_error:.1g}"]
+            cells += ["", ""] if found is None else [f"{found.coefficient:.3g}", f"{found.standard_error:.1g}"]
         table.add_row(name, *cells)
     console.print(table)
     if others:
-        strongest = sorted(others, key=lambda e: -abs(e.value) / (e.standard_error or 1.0))[:SHOWN_EFFECTS]
+        strongest = sorted(others, key=lambda e: -abs(e.coefficient) / (e.standard_error or 1.0))[:SHOWN_EFFECTS]
         table = make_table("Springs, cables, friction by direction", *_EFFECT_COLUMNS)
         for e in strongest:
             table.add_row(*_effect_cells(e))
@@ -253,9 +253,9 @@ def _print_effects(console: Console, section: DynamicSection) -> None:
     console.print(table)
 
 
-def _effect_cells(e: ActuatorEffectEstimate) -> tuple[str, ...]:
+def _effect_cells(e: DriveEffect) -> tuple[str, ...]:
     scale = f"{e.scale:g}" if e.scale else ""
-    return e.coordinate, e.kind, scale, f"{e.value:+.3g}", f"{e.standard_error:.1g}", EFFECT_KINDS[e.kind].unit
+    return e.coordinate, e.kind, scale, f"{e.coefficient:+.3g}", f"{e.standard_error:.1g}", EFFECT_KINDS[e.kind].unit
 
 
 def _percent(part: float, whole: float) -> str:

@@ -18,6 +18,7 @@ from rich.text import Text
 from dvrk_drake.analysis.static.doubts import Doubt
 from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.analysis.verdict import rule_text, worst
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.gravity_regressor import SymbolicGravity, derive_gravity
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.experiments.demo.demo import NO_DRY_FRICTION, DemoResult
@@ -96,8 +97,8 @@ def print_model(console: Console, model: IdentifiedModel) -> None:
     if model.effects:
         table = make_table("Effects [N m; N if prismatic]", "", "value", "standard error", "|value| < 2 se")
         for e in model.effects:
-            numbers = (f"{e.value:+.5f}", f"{e.standard_error:.5f}", "" if e.distinguishable else "zero?")
-            table.add_row(str(e.effect), *numbers)
+            numbers = (f"{e.coefficient:+.5f}", f"{e.standard_error:.5f}", "" if e.distinguishable else "zero?")
+            table.add_row(str(ActuatorEffect.of(e)), *numbers)
         console.print(table)
     rows = [
         (

@@ -85,8 +85,7 @@ class ArmConfig:
         except ArmError as error:
             return f"simulated arm: {error}"
         for i, effect in enumerate(self.effects):
-            law = ActuatorEffect(effect.coordinate, effect.kind, effect.scale)
-            if fault := effect_fault(arm, law, POSITION_KINDS):
+            if fault := effect_fault(arm, ActuatorEffect.of(effect), POSITION_KINDS):
                 return f"effects[{i}].{fault}"
         return ""
 

@@ -54,8 +54,8 @@ def test_friction_and_offsets_of_the_second_day_are_found(name):
     assert np.mean(before) > 2 * np.mean(after)
     assert np.all(after < 2 * NOISE)
     assert all(a.kept for a in result.actuators)
-    true = {(e.coordinate, e.kind): e.value for e in truth.section.effects if e.kind == "viscous"}
-    old = {(e.coordinate, e.kind): e.value for e in model.dynamics.effects if e.kind == "viscous"}
+    true = {(e.coordinate, e.kind): e.coefficient for e in truth.section.effects if e.kind == "viscous"}
+    old = {(e.coordinate, e.kind): e.coefficient for e in model.dynamics.effects if e.kind == "viscous"}
     found = np.array([a.viscous for a in result.actuators])
     expected = np.array(
         [true[f"actuator.{a.name}", "viscous"] / old[f"actuator.{a.name}", "viscous"] for a in result.actuators]

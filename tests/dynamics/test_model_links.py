@@ -8,7 +8,6 @@ import pytest
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import (
-    ActuatorEffectEstimate,
     DynamicSection,
     LinkEstimate,
     RotorEstimate,
@@ -19,6 +18,7 @@ from dvrk_drake.dynamics.inertial_parameters import parameters_from_pseudo_inert
 from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.export.sdf import write_sdf
 from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.models.effects_schema import DriveEffect
 
 
 def dynamic_model(arm: Arm, rotors: dict[str, float]) -> IdentifiedModel:
@@ -35,7 +35,7 @@ def dynamic_model(arm: Arm, rotors: dict[str, float]) -> IdentifiedModel:
         gravity=[float(x) for x in arm.gravity],
         links=links,
         rotors=[RotorEstimate(name, rotors.get(name, 0.0)) for name in arm.joint_names],
-        effects=[ActuatorEffectEstimate(f"actuator.{arm.joint_names[0]}", "viscous", 0.0, 0.02)],
+        effects=[DriveEffect(f"actuator.{arm.joint_names[0]}", "viscous", 0.0, 0.02)],
         signals=SignalSettings(50.0, [10.0] * n, 10.0, [0.0] * n),
     )
     return model

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
+from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
@@ -23,6 +23,7 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.reports.export import plot_compensation
 
 pytestmark = pytest.mark.slow
@@ -109,11 +110,11 @@ def balanced(name="mtml"):
 def test_the_controller_computes_the_models_torque_from_the_file(name, tmp_path):
     model = balanced(name)
     model.effects = [
-        ActuatorEffectEstimate("joint.outer_yaw", "offset", 0.0, 0.03),
-        ActuatorEffectEstimate("joint.shoulder_pitch", "cable sine", 1.0, -0.1),
-        ActuatorEffectEstimate("joint.shoulder_pitch", "cable cosine", 1.0, 0.04),
-        ActuatorEffectEstimate("actuator.wrist_platform", "offset", 0.0, -0.01),
-        ActuatorEffectEstimate("joint.wrist_pitch", "spring", 4.0, 0.02),
+        DriveEffect("joint.outer_yaw", "offset", 0.0, 0.03),
+        DriveEffect("joint.shoulder_pitch", "cable sine", 1.0, -0.1),
+        DriveEffect("joint.shoulder_pitch", "cable cosine", 1.0, 0.04),
+        DriveEffect("actuator.wrist_platform", "offset", 0.0, -0.01),
+        DriveEffect("joint.wrist_pitch", "spring", 4.0, 0.02),
     ]
     arm = model.arm
     path = tmp_path / "gc.json"
@@ -163,10 +164,10 @@ def test_friction_of_a_models_dynamics_is_what_a_joint_feels_that_moves_alone():
         dry_friction(model)
     model.dynamics = DynamicSection(
         effects=[
-            ActuatorEffectEstimate("actuator.outer_yaw", "coulomb", 0.1, 0.05),
-            ActuatorEffectEstimate("actuator.outer_yaw", "presliding", 0.01, 0.02),
-            ActuatorEffectEstimate("actuator.outer_yaw", "viscous", 0.0, 9.0),
-            ActuatorEffectEstimate("actuator.wrist_platform", "coulomb", 0.1, 0.01),  # turned by joints 3 and 4
+            DriveEffect("actuator.outer_yaw", "coulomb", 0.1, 0.05),
+            DriveEffect("actuator.outer_yaw", "presliding", 0.01, 0.02),
+            DriveEffect("actuator.outer_yaw", "viscous", 0.0, 9.0),
+            DriveEffect("actuator.wrist_platform", "coulomb", 0.1, 0.01),  # turned by joints 3 and 4
         ]
     )
     np.testing.assert_allclose(dry_friction(model), [0.07, 0, 0.006697, 0.01, 0, 0, 0], rtol=0, atol=1e-12)
@@ -197,7 +198,7 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
     # The line names a tolerance that is enough.
     compensation_from_model(eccentric, CompensationOptions(tolerance=0.0025))
     spring = balanced()
-    spring.effects = [ActuatorEffectEstimate("joint.wrist_pitch", "cable sine", 1.0, 0.05)]
+    spring.effects = [DriveEffect("joint.wrist_pitch", "cable sine", 1.0, 0.05)]
     with pytest.raises(ModelError, match=r"up to wrist_pitch 0\.0\d+ N m\. Of that: effects 0\.0\d+ \(it knows"):
         compensation_from_model(spring)
     # A quartic over +-2.44 rad misses 0.05 sin(q) by a few hundredths of it, not more.

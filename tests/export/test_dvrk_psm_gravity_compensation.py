@@ -8,11 +8,11 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
 from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.effects_schema import DriveEffect
 
 pytestmark = pytest.mark.slow
 
@@ -89,7 +89,7 @@ def test_the_chain_is_the_arm(tmp_path):
 
 def test_what_the_file_cannot_hold_is_refused():
     model = other_psm()
-    model.effects = [ActuatorEffectEstimate("joint.pitch", "offset", 0.0, 0.1)]
+    model.effects = [DriveEffect("joint.pitch", "offset", 0.0, 0.1)]
     with pytest.raises(
         ModelError, match=r"off by up to pitch 0\.1 .*: joint.pitch offset 0\.1\. .*--gc-tolerance 0\.1"
     ):
@@ -114,7 +114,7 @@ def test_command_line(tmp_path, capsys):
 def test_an_export_that_is_refused_leaves_no_other_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     model = other_psm()
-    model.effects = [ActuatorEffectEstimate("joint.pitch", "offset", 0.0, 0.1)]
+    model.effects = [DriveEffect("joint.pitch", "offset", 0.0, 0.1)]
     model.save("model.yaml")
     arguments = ["export", "model.yaml", "--sdf", "model.sdf", "--dvrk-kinematic-gc", "gc.json"]
     assert main([*arguments, "--gc-tolerance", "1e-9"]) == 2

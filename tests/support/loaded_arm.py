@@ -9,8 +9,9 @@ from motions import fourier_motion, recorded, true_dynamics
 
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate, DynamicSection
+from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import Recording
 
 RATE = 1000.0
@@ -22,7 +23,7 @@ FRICTION, FRICTION_CHANGE = 0.15, 0.2
 DRIVE_CHANGE = 0.03
 
 
-def friction(model: DynamicModel, q, v, vd) -> list[ActuatorEffectEstimate]:
+def friction(model: DynamicModel, q, v, vd) -> list[DriveEffect]:
     """Viscous, Coulomb and presliding friction at every actuator."""
     arm = model.arm
     effort = np.sqrt(np.mean(model.effort(q, v, vd) ** 2, axis=0))
@@ -31,9 +32,9 @@ def friction(model: DynamicModel, q, v, vd) -> list[ActuatorEffectEstimate]:
     for i, joint in enumerate(arm.joint_names):
         at, size = f"actuator.{joint}", float(FRICTION * effort[i])
         effects += [
-            ActuatorEffectEstimate(at, "viscous", 0.0, size / float(speed[i])),
-            ActuatorEffectEstimate(at, "coulomb", float(f"{0.05 * speed[i]:.3g}"), size / 2),
-            ActuatorEffectEstimate(at, "presliding", float(f"{0.05 * travel[i]:.3g}"), size / 2),
+            DriveEffect(at, "viscous", 0.0, size / float(speed[i])),
+            DriveEffect(at, "coulomb", float(f"{0.05 * speed[i]:.3g}"), size / 2),
+            DriveEffect(at, "presliding", float(f"{0.05 * travel[i]:.3g}"), size / 2),
         ]
     return effects
 
@@ -47,20 +48,16 @@ def other_day(model: DynamicModel, q, v, vd, generator: np.random.Generator) -> 
         for effect in model.section.effects:
             if effect.coordinate == f"actuator.{joint}":
                 part = "viscous" if effect.kind == "viscous" else "dry"
-                effects.append(dataclasses.replace(effect, value=effect.value * scale[part]))
+                effects.append(dataclasses.replace(effect, coefficient=effect.coefficient * scale[part]))
     a = model.arm.transmission.position(q)
     for i, joint in enumerate(model.arm.joint_names):
         offset, spring = DRIVE_CHANGE * effort[i] * generator.normal(size=2)
         spring /= np.std(a[:, i])
-        effects.append(
-            ActuatorEffectEstimate(f"actuator.{joint}", "spring", float(2 * np.max(np.abs(a[:, i]))), float(spring))
-        )
-        effects.append(
-            ActuatorEffectEstimate(f"actuator.{joint}", "offset", 0.0, float(offset - spring * np.mean(a[:, i])))
-        )
+        effects.append(DriveEffect(f"actuator.{joint}", "spring", float(2 * np.max(np.abs(a[:, i]))), float(spring)))
+        effects.append(DriveEffect(f"actuator.{joint}", "offset", 0.0, float(offset - spring * np.mean(a[:, i]))))
         if not model.arm.prismatic[i]:
             cable = DRIVE_CHANGE * effort[i] * generator.normal()
-            effects.append(ActuatorEffectEstimate(f"actuator.{joint}", "cable sine", 2.0, float(cable)))
+            effects.append(DriveEffect(f"actuator.{joint}", "cable sine", 2.0, float(cable)))
     return dataclasses.replace(model.section, effects=effects)
 
 

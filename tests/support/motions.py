@@ -7,7 +7,6 @@ import numpy as np
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import (
-    ActuatorEffectEstimate,
     DynamicSection,
     LinkEstimate,
     RotorEstimate,
@@ -16,6 +15,7 @@ from dvrk_drake.dynamics.dynamic_section import (
 from dvrk_drake.dynamics.inertial_parameters import parameters_from_pseudo_inertia, rotor_links
 from dvrk_drake.dynamics.physical_consistency import LinkScale, bounding_boxes, reached_bounds
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import Recording
 
 
@@ -38,7 +38,7 @@ def fourier_motion(arm: Arm, generator: np.random.Generator, period: float, seco
 
 
 def true_dynamics(
-    arm: Arm, generator: np.random.Generator, effects: list[ActuatorEffectEstimate], spread: float = 0.05
+    arm: Arm, generator: np.random.Generator, effects: list[DriveEffect], spread: float = 0.05
 ) -> DynamicModel:
     """An arm like the SDF's with other links: each is sheared and shifted by this share of its own size, or as fits."""
     regressor, boxes = DynamicRegressor(arm), bounding_boxes(arm)
@@ -78,7 +78,7 @@ def recorded(
     return Recording(q=q[every], qd=v[every], tau=J.pull_back_effort(tau)[every], t=t[every], source="simulated")
 
 
-def friction_everywhere(arm: Arm, motion, share: float = 0.2) -> list[ActuatorEffectEstimate]:
+def friction_everywhere(arm: Arm, motion, share: float = 0.2) -> list[DriveEffect]:
     """Viscous, Coulomb and presliding friction at every actuator, each a share of the RMS effort of the SDF's arm."""
     _, q, v, vd = motion
     without = true_dynamics(arm, np.random.default_rng(0), [])
@@ -88,8 +88,8 @@ def friction_everywhere(arm: Arm, motion, share: float = 0.2) -> list[ActuatorEf
     for i, joint in enumerate(arm.joint_names):
         at, size = f"actuator.{joint}", float(share * effort[i])
         effects += [
-            ActuatorEffectEstimate(at, "viscous", 0.0, float(size / speed[i])),
-            ActuatorEffectEstimate(at, "coulomb", float(f"{0.1 * speed[i]:.3g}"), size),
-            ActuatorEffectEstimate(at, "presliding", float(f"{0.08 * travel[i]:.3g}"), size),
+            DriveEffect(at, "viscous", 0.0, float(size / speed[i])),
+            DriveEffect(at, "coulomb", float(f"{0.1 * speed[i]:.3g}"), size),
+            DriveEffect(at, "presliding", float(f"{0.08 * travel[i]:.3g}"), size),
         ]
     return effects

@@ -275,7 +275,7 @@ def _drive_effects(arm: Arm, q: NDArray[np.float64], v: NDArray[np.float64], mov
         if moves:
             others.append(ActuatorEffect(f"actuator.{name}", "viscous"))
             others.append(ActuatorEffect(f"actuator.{name}", "coulomb", DIRECTION_WIDTH * float(speed) or 1.0))
-    effects = [*(ActuatorEffect(e.coordinate, e.kind, e.scale) for e in stated), *others]
+    effects = [*map(ActuatorEffect.of, stated), *others]
     mean = np.array([e.coefficient for e in stated] + [0.0] * len(others))
     share = [POSITION_DEVIATION if e.kind in POSITION_KINDS else FRICTION_DEVIATION for e in effects]
     return _DriveEffects(effects, mean, EFFECT_DEVIATION * np.abs(mean), np.array(share))

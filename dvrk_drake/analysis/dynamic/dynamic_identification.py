@@ -19,7 +19,6 @@ from dvrk_drake.analysis.signals.repetition import period_of, phase_folds, repea
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.dynamic_section import (
-    ActuatorEffectEstimate,
     ActuatorStatistics,
     DynamicSection,
     RotorEstimate,
@@ -27,6 +26,7 @@ from dvrk_drake.dynamics.dynamic_section import (
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics, Provenance
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: An effect whose effort is below this share of the actuators' is left out of the model.
@@ -169,9 +169,7 @@ def _section(
     for k, effect in enumerate(problem.columns.effects[c] for c in chosen):
         value = float(fit.x[p + k])
         if value**2 * problem.effect_precision[chosen[k]] > LEAST_EFFECT**2:
-            effects.append(
-                ActuatorEffectEstimate(effect.coordinate, effect.kind, effect.scale, value, float(sd[p + k]))
-            )
+            effects.append(DriveEffect(effect.coordinate, effect.kind, effect.scale, value, float(sd[p + k])))
     rows = problem.num_rows
     size = np.sqrt(problem.efforts / rows)
     floor = np.zeros(arm.num_joints)

@@ -15,7 +15,6 @@ from dvrk_drake.analysis.static.doubts import Doubt, check_effort_unit, find_dou
 from dvrk_drake.analysis.static.effect_selection import StaticProblem, select_effects
 from dvrk_drake.analysis.static.linear_fit import LinearFit, rms, weighted_fit
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import (
     BaseParameterEstimate,
     IdentifiedModel,
@@ -25,6 +24,7 @@ from dvrk_drake.dynamics.identified_model import (
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, SAME_POSE, Recording
 
 Method = Literal["robust", "paper"]
@@ -130,7 +130,7 @@ def identify_static(
             for name, value, error in zip(gravity_model.gravity.base.names, fit.theta, sd, strict=False)
         ],
         effects=[
-            ActuatorEffectEstimate(effect.coordinate, effect.kind, effect.scale, float(value), float(error))
+            DriveEffect(effect.coordinate, effect.kind, effect.scale, float(value), float(error))
             for effect, value, error in zip(effects, fit.theta[Y.shape[2] :], sd[Y.shape[2] :], strict=True)
         ],
         joints=_statistics(recording, arm, fit, validated, measured, usable, trust),

@@ -138,7 +138,7 @@ class DriveForce(LeafSystem):
         """
         super().__init__()
         laws = [*effects.cables, *effects.springs]
-        kinds = tuple(ActuatorEffect(law.coordinate, law.kind, law.scale) for law in laws)
+        kinds = tuple(map(ActuatorEffect.of, laws))
         for kind in kinds:
             if fault := effect_fault(arm, kind, POSITION_KINDS):
                 raise StationError(f"{arm.name}: effects: cables, springs: {fault}")

@@ -82,7 +82,7 @@ def add_friction(
     """
     followed = []
     for i, effect in enumerate(friction):
-        law = ActuatorEffect(effect.coordinate, effect.kind, effect.scale)
+        law = ActuatorEffect.of(effect)
         if fault := effect_fault(arm, law, FRICTION_KINDS):
             raise StationError(f"{arm.name}: effects.friction[{i}]: {fault}")
         if effect.coefficient == 0:

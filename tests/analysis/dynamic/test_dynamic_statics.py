@@ -18,11 +18,11 @@ from dvrk_drake.dynamics.actuator_effects import (
     slides,
 )
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.effects_schema import DriveEffect
 
 SCALES = {"offset": 0.0, "spring": 0.4, "cable sine": 2.0, "cable cosine": 1.5}
 
@@ -38,10 +38,8 @@ def model_of_all_effects(name, tilt):
     generator = np.random.default_rng(3)
     arm = load_arm(name)
     arm = arm.with_gravity([float(g) for g in arm.gravity + tilt])
-    estimates = [
-        ActuatorEffectEstimate(e.coordinate, e.kind, e.scale, float(generator.normal()), 0.1) for e in all_effects(arm)
-    ]
-    friction = ActuatorEffectEstimate(f"actuator.{arm.joint_names[0]}", "coulomb", 0.1, 0.3)
+    estimates = [DriveEffect(e.coordinate, e.kind, e.scale, float(generator.normal()), 0.1) for e in all_effects(arm)]
+    friction = DriveEffect(f"actuator.{arm.joint_names[0]}", "coulomb", 0.1, 0.3)
     dynamics = true_dynamics(arm, generator, [friction, *estimates])
     section = dataclasses.replace(dynamics.section, gravity_expected=dynamics.section.gravity)
     covariance = np.eye(10 * len(section.links)) * 1e-6
@@ -88,7 +86,7 @@ def test_of_a_loaded_file_too_and_what_contradicts_itself_is_refused(case, tmp_p
     q = arm.sample_poses(20, np.random.default_rng(1))
     loaded = IdentifiedModel.load(tmp_path / "model.yaml")
     np.testing.assert_allclose(loaded.holding_torque(q), model.holding_torque(q), atol=1e-12)
-    assert all(e.value != 0 and e.standard_error > 0 for e in model.holding_effects)
+    assert all(e.coefficient != 0 and e.standard_error > 0 for e in model.holding_effects)
     with pytest.raises(ModelError, match="has effects only there"):
         dataclasses.replace(model, effects=model.holding_effects[:1]).check()
     with pytest.raises(ModelError, match="the gravity that stands there"):

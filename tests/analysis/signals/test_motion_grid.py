@@ -112,7 +112,7 @@ def test_parts_of_the_efforts_add_up_to_the_models(grid):
     np.testing.assert_allclose((efforts.other + parts) / size, whole / size, atol=1e-6)
     # Viscous friction is proportional to the actuators' speeds.
     speed = grid.behind_filter(grid.efforts_at_rows(ARM.transmission.velocity(grid.v)))
-    viscous = [effect.value for effect in effects if effect.kind == "viscous"]
+    viscous = [effect.coefficient for effect in effects if effect.kind == "viscous"]
     np.testing.assert_allclose(efforts.friction_part("viscous") / size, speed * viscous / size, atol=1e-6)
     assert set(efforts.friction) == {(effect.coordinate, part) for effect in effects for part in ("dry", "viscous")}
     assert np.all(efforts.friction_part("dry").std(axis=0) > 0.1 * size)

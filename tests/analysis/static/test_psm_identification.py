@@ -7,7 +7,7 @@ import pytest
 
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.dynamic_section import ActuatorEffectEstimate
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
 from dvrk_drake.experiments.ground_truth import collect_static_poses, damped_station, perturbed_links, with_links
@@ -65,7 +65,7 @@ def test_the_true_torque_is_found_through_the_closed_linkage(arm, true_arm, reco
     truth = true_torque(arm, true_arm, fresh)
     error = np.sqrt(np.mean((model.holding_torque(fresh) - truth) ** 2, axis=0))
     assert np.all(error < np.maximum(0.03 * np.sqrt(np.mean(truth**2, axis=0)), 1e-3 * arm.effort_limits))
-    found = {str(e.effect) for e in model.effects}
+    found = {str(ActuatorEffect.of(e)) for e in model.effects}
     assert found >= {"joint.yaw offset", "joint.roll cable sine 1"}
     # At a yaw joint a spring and lifted weight are the same torque; only one of them may be asked for.
     assert "joint.yaw cable sine 1" not in found
@@ -120,6 +120,6 @@ def test_an_instrument_that_does_not_exist_is_refused_in_one_line(tmp_path, caps
 
 def test_a_joint_that_slides_has_no_spring_in_an_angle(arm):
     model = IdentifiedModel.from_arm(arm)
-    model.effects = [ActuatorEffectEstimate("joint.insertion", "cable sine", 1.0, 1.0)]
+    model.effects = [DriveEffect("joint.insertion", "cable sine", 1.0, 1.0)]
     with pytest.raises(ModelError, match=r"effects\[0\]: kind cable sine is of an angle, and joint.insertion slides"):
         model.check()

@@ -16,6 +16,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import IdentificationError, ModelError, RecordingError
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.recordings.recording import Recording, read_recording
 
@@ -53,7 +54,7 @@ def test_robust_method_recovers_parameters_and_finds_the_effects(arm):
     effects = tuple(ActuatorEffect(f"joint.wrist_{which}", "cable sine", 1.0) for which in ("platform", "pitch"))
     recording, _ = simulated(arm, noise=0.005, effects=effects, coefficients=(0.05, -0.05), seed=4)
     model = identify_static(recording, arm).model
-    found = {e.effect: e.value for e in model.effects}
+    found = {ActuatorEffect.of(e): e.coefficient for e in model.effects}
     assert found[effects[0]] == pytest.approx(0.05, abs=0.004)
     assert found[effects[1]] == pytest.approx(-0.05, abs=0.002)
     fresh, _ = simulated(arm, poses=200, seed=9, effects=effects, coefficients=(0.05, -0.05))
@@ -265,10 +266,15 @@ def test_a_model_file_finds_its_arm_after_both_have_moved_and_one_of_version_2_i
     shutil.move(tmp_path / "model.yaml", tmp_path / "elsewhere")
     arm = IdentifiedModel.load(tmp_path / "elsewhere" / "model.yaml").arm
     assert arm is load_arm(f"{moved}/own.yaml")
+    effects = [DriveEffect("joint.wrist_pitch", "cable sine", 1.0, 0.05, 0.01)]
+    model = IdentifiedModel.from_arm(load_arm("mtmr"), effects)
+    model.save(tmp_path / "new.yaml")
+    new = (tmp_path / "new.yaml").read_text()
     for name in ("mtmr", f"{moved}/own.yaml"):
-        old = text.replace("model 3", "model 2").replace("arm: arms/own.yaml", f"arm: {name}")
-        (tmp_path / "old.yaml").write_text(old)
-        assert IdentifiedModel.load(tmp_path / "old.yaml").arm is load_arm(name)
+        old = new.replace("model 3", "model 2").replace("package://dvrk_drake/arms/mtmr.yaml", name)
+        (tmp_path / "old.yaml").write_text(old.replace("coefficient:", "value:"))
+        read = IdentifiedModel.load(tmp_path / "old.yaml")
+        assert (read.arm, read.effects) == (load_arm(name), effects)
     with pytest.raises(ModelError, match=r"old\.yaml: is of MTMR, not of PSM"):
         IdentifiedModel.load(tmp_path / "old.yaml", load_arm("psm"))
 

@@ -52,7 +52,7 @@ def test_demo_writes_everything(result):
     }
     assert "<html" in (folder / "arm.html").read_text()[:200].lower()
     assert len(read_recording(folder / "poses.csv")) == 20
-    assert IdentifiedModel.load(folder / "model.yaml").arm == "mtml"
+    assert IdentifiedModel.load(folder / "model.yaml").arm.name == "MTML"
     assert all(0.0 <= share <= 1.0 for _, share in stages)
     assert len({what for what, _ in stages}) == 4
 
@@ -66,7 +66,7 @@ def test_demo_beats_zero_torque_and_the_paper_on_fresh_poses(result):
 
 def test_demo_finds_the_springs_that_it_put_in(result):
     _, outcome, _ = result
-    found = {(e.coordinate, e.kind): e.value for e in outcome.identification.model.effects}
+    found = {(e.coordinate, e.kind): e.coefficient for e in outcome.identification.model.effects}
     assert found["joint.wrist_platform", "cable sine"] == pytest.approx(0.05, abs=0.01)
     assert found["joint.wrist_pitch", "cable sine"] == pytest.approx(-0.03, abs=0.003)
 
