@@ -104,6 +104,9 @@ class Arm:
     def __post_init__(self) -> None:
         self.check()
 
+    def __repr__(self) -> str:
+        return f"<Arm {self.name}: {self.source}>"
+
     def check(self) -> None:
         """Checks all numbers: finite, in the range of their field, in order, one per joint.
 
