@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem, residuals
-from dvrk_drake.analysis.dynamic.effect_choice import TOGETHER, choose_effects
+from dvrk_drake.analysis.dynamic.effect_selection import TOGETHER, choose_effects
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import FOLDS, period_of
 from dvrk_drake.models.arm import load_arm

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import drive_effects, dynamic_columns, optional_effects
-from dvrk_drake.analysis.dynamic.effect_choice import choose_effects, left_out_errors
+from dvrk_drake.analysis.dynamic.effect_selection import choose_effects, left_out_errors
 from dvrk_drake.analysis.dynamic.estimates import DynamicEstimates, base_parameter_estimates, parameter_covariance
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.results import Identification

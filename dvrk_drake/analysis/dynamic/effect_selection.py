@@ -1,4 +1,4 @@
-"""Which effects the drives of an arm have: chosen one by one, by how well folds of the motion predict each other."""
+"""Effects in the drives and the direction of gravity, as a motion shows them; how well phases predict each other."""
 
 from __future__ import annotations
 
@@ -8,131 +8,108 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, solve, squared_errors
+from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, squared_errors
+from dvrk_drake.analysis.dynamic.problem import ConsistentProgram, DynamicProblem
+from dvrk_drake.analysis.dynamic.stepwise_selection import EffectSelection
 
-#: An effect must lower the cross-validated error, relative and averaged over the actuators, by this much. What gains
-#: less is chosen by chance: on the public motions other phases choose others, which predict the left-out phases worse.
-LEAST_GAIN = 0.005
-#: So many of the effects that promise most are tried at every step.
-TRIALS = 8
-#: An actuator's error is not taken for less than this share of its effort.
-LEAST_ERROR = 0.02
+#: Times that a lean base and the parameters of the links are found in turn; a third changes no error by 0.01 %.
+TURNS = 2
+#: Folds that are left out together where a model is judged: what a motion does for longer is more like another motion.
+TOGETHER = 2
 
 
-@dataclass
-class EffectSelection:
-    """The choice of effects on one motion, in unknowns that are 0 before the recording.
+@dataclass(frozen=True, eq=False)
+class EffectChoice:
+    """What was chosen on a motion.
 
     Attributes:
-        equations: columns: the rigid body's unknowns, then the effects; the last is what remains of the effort.
-        efforts: (folds, n) sum of squares of the measured efforts.
-        rows: (folds,) their number.
-        num_rigid: of the rigid body's.
-        precision: (k,) of all unknowns.
-        non_negative: (k,).
-        independent: share of the rows that are independent measurements of an actuator's effort.
+        problem: with gravity as found.
+        selection: that chose; its unknowns end with the tilt, if the base may tilt.
+        start: (s,) its unknowns that need no choice, as it counts them: from the first effect on.
+        found: (f,) those and what was chosen.
+        x: (k,) all its unknowns.
     """
 
-    equations: NormalEquations
-    efforts: NDArray[np.float64]
-    rows: NDArray[np.int_]
-    num_rigid: int
-    precision: NDArray[np.float64]
-    non_negative: NDArray[np.bool_]
-    independent: float
+    problem: DynamicProblem
+    selection: EffectSelection
+    start: NDArray[np.int_]
+    found: NDArray[np.int_]
+    x: NDArray[np.float64]
 
-    def __post_init__(self) -> None:
-        equations = self.equations
-        self._total = equations.total()
-        self._learnt = [equations.without_fold(fold) for fold in range(equations.folds)]
-        self._predicted = [equations.of_fold(fold) for fold in range(equations.folds)]
-        self._efforts = np.sum(self.efforts, axis=0)
-        self.weights = self._weights(np.full(len(self._efforts), 0.1**2))
+    @property
+    def chosen(self) -> NDArray[np.int_]:
+        """(e,) indices of the effects."""
+        return self.found[self.found < self.problem.num_effects]
 
-    def without(self, first: int, count: int) -> EffectSelection:
-        """The choice that knows nothing of some folds: `count` from `first` on."""
-        kept = self.equations.others(first, count)
-        return replace(
-            self, equations=self.equations.without(first, count), efforts=self.efforts[kept], rows=self.rows[kept]
-        )
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """(n,) one over the variance that each actuator's effort keeps."""
+        return self.selection.weights
 
-    def fit(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:
-        """(k,) all unknowns, 0 where an effect is not chosen; weighs every actuator by the error that is left."""
-        for _ in range(3):
-            x = self._solve(self._total, effects)
-            self.weights = self._weights(squared_errors(self._total, x) / self._efforts)
-        return x
 
-    def relative_error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n,) |tau - X x| / |tau|."""
-        return np.asarray(np.sqrt(squared_errors(self._total, x) / self._efforts))
+def choose_effects(problem: DynamicProblem, progress: Callable[[float], object] = lambda _: None) -> EffectChoice:
+    """Finds the direction of gravity with what every drive has; adds effects that the motion asks for."""
+    tilts = len(problem.columns.tilts)
+    start = np.append(np.arange(problem.num_always), problem.num_effects + np.arange(tilts))
+    phi = problem.prior
+    # The tilt times the links' parameters is no linear unknown.
+    for turn in range(TURNS if tilts else 0):
+        progress(0.5 * turn / TURNS)
+        x = problem.selection(phi).fit(start)
+        phi = problem.rigid_parameters(x)
+        problem = replace(problem, tilt=x[-tilts:])
+    selection = problem.selection(phi)
+    found = selection.choose(start, problem.candidates, lambda share: progress(0.5 + 0.5 * share))
+    x = selection.fit(found)
+    return EffectChoice(replace(problem, tilt=x[-tilts:]) if tilts else problem, selection, start, found, x)
 
-    def cross_validated(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:
-        """(n,) relative error of folds that are predicted from the others, with the current weights."""
-        errors = [
-            squared_errors(predicted, self._solve(learnt, effects))
-            for learnt, predicted in zip(self._learnt, self._predicted, strict=True)
-        ]
-        return np.asarray(np.sqrt(np.sum(errors, axis=0) / self._efforts))
 
-    def choose(
-        self, start: NDArray[np.int_], candidates: NDArray[np.int_], report: Callable[[float], object] = lambda _: None
-    ) -> NDArray[np.int_]:
-        """Adds candidates to `start` while `LEAST_GAIN` is had, and drops those that are no longer of use.
+def left_out_errors(
+    choice: EffectChoice, phi: NDArray[np.float64], progress: Callable[[float], object] = lambda _: None
+) -> NDArray[np.float64]:
+    """(n,) sum of squares that models leave of phases of which they know nothing.
 
-        Args:
-            start, candidates: indices of effects, from 0.
-            report: told the share of the work that is done, a guess.
-        """
-        chosen = start
-        self.fit(chosen)
-        best = float(np.mean(self.cross_validated(chosen)))
-        for step in range(len(candidates)):
-            report(1 - 0.85**step)
-            open_ = np.setdiff1d(candidates, chosen)
-            tries = [np.union1d(chosen, [k]) for k in self._promising(chosen, open_)]
-            errors = [float(np.mean(self.cross_validated(t))) for t in tries]
-            if not errors or min(errors) > best - LEAST_GAIN:
-                break
-            chosen = tries[int(np.argmin(errors))]
-            self.fit(chosen)
-            best = float(np.mean(self.cross_validated(chosen)))
-        for k in np.intersect1d(candidates, chosen):
-            without = np.setdiff1d(chosen, [k])
-            error = float(np.mean(self.cross_validated(without)))
-            if error < best + LEAST_GAIN / 2:
-                chosen, best = without, error
-        return chosen
+    Every `TOGETHER` folds are predicted by the effects, the direction of gravity and the consistent parameters that the
+    others give.
 
-    def _promising(self, chosen: NDArray[np.int_], open_: NDArray[np.int_]) -> NDArray[np.int_]:
-        """The open effects that would lower the sum of squares most, were all signs free."""
-        if not len(open_):
-            return open_
-        used, new = self._index(chosen), self.num_rigid + open_
-        sums = np.tensordot(self.weights, self._total, axes=(0, 0))
-        x = self._solve(self._total, chosen)
-        residual = (sums[:-1, -1] - sums[:-1, :-1] @ x)[new]
-        H = sums[np.ix_(used, used)] + np.diag(self.precision[used])
-        explained = np.einsum("ij,ij->j", sums[np.ix_(used, new)], np.linalg.solve(H, sums[np.ix_(used, new)]))
-        gain = residual**2 / (np.diag(sums)[new] + self.precision[new] - explained)
-        return open_[np.argsort(-gain)[:TRIALS]]
+    Args:
+        choice: on all phases.
+        phi: (p,) parameters of the rigid body, about which the tilt of a part is linearised.
+        progress: called with the finished share, 0..1.
 
-    def _index(self, effects: NDArray[np.int_]) -> NDArray[np.int_]:
-        return np.concatenate([np.arange(self.num_rigid), self.num_rigid + np.sort(effects)])
+    Raises:
+        IdentificationError: the solver did not converge.
+    """
+    problem, tilts = choice.problem, len(choice.problem.columns.tilts)
+    firsts = range(0, choice.selection.equations.folds, TOGETHER)
+    parts = []
+    for first in firsts:
+        parts.append(_part(choice, first))
+        progress(0.3 * len(parts) / len(firsts))
+    used = np.unique(np.concatenate([chosen for chosen, _, _ in parts]))
+    leaning = ((problem.columns.tilts[:, :, i] @ phi).T for i in range(len(problem.efforts)))
+    stacked = (np.hstack([problem.chosen_columns(i, used), X]) for i, X in enumerate(leaning))
+    equations = NormalEquations.of(stacked, problem.columns.tau, problem.fold, problem.edge)
+    errors = np.zeros(len(problem.efforts))
+    for first, (chosen, weights, tilt) in zip(firsts, parts, strict=True):
+        progress(0.4 + 0.6 * first / equations.folds)
+        kept = np.append(np.arange(problem.num_rigid), problem.num_rigid + np.searchsorted(used, chosen))
+        # What gravity does that leans as these phases say, is taken from the efforts.
+        change = tilt - problem.tilt[:tilts]
+        T = np.zeros((equations.products.shape[-1], len(kept) + 1))
+        T[kept, np.arange(len(kept))] = 1.0
+        T[-1 - tilts :, -1] = np.append(-change, 1.0)
+        learnt = T.T @ equations.without_fold(first, TOGETHER) @ T
+        predicted = T.T @ equations.of_fold(first, TOGETHER) @ T
+        y = ConsistentProgram(problem, chosen).solve(learnt, weights)
+        errors += squared_errors(predicted, y)
+    return errors
 
-    def _solve(self, products: NDArray[np.float64], effects: NDArray[np.int_]) -> NDArray[np.float64]:
-        index = self._index(effects)
-        with_effort = np.append(index, products.shape[-1] - 1)
-        x = np.zeros(len(self.precision))
-        x[index] = solve(
-            products[:, with_effort[:, None], with_effort],
-            self.weights,
-            self.precision[index],
-            self.non_negative[index],
-        )
-        return x
 
-    def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
-        """One over the variance of an independent measurement, from the squared relative errors."""
-        variance = np.maximum(squared, LEAST_ERROR**2) * self._efforts / np.sum(self.rows)
-        return np.asarray(self.independent / variance)
+def _part(choice: EffectChoice, first: int) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+    """Indices of the effects, weights of the actuators and tilt that the phases without a part say."""
+    problem = choice.problem
+    selection = choice.selection.without(first, TOGETHER)
+    found = selection.choose(choice.start, problem.candidates)
+    x = selection.fit(found)
+    return found[found < problem.num_effects], selection.weights, x[len(x) - len(problem.columns.tilts) :]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DynamicColumns
-from dvrk_drake.analysis.dynamic.effect_selection import EffectSelection
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, squared_errors
+from dvrk_drake.analysis.dynamic.stepwise_selection import EffectSelection
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import rotor_links

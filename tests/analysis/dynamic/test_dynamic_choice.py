@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.dynamic.columns import drive_effects, optional_effects
-from dvrk_drake.analysis.dynamic.effect_selection import EffectSelection
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
+from dvrk_drake.analysis.dynamic.stepwise_selection import EffectSelection
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import load_arm
 
