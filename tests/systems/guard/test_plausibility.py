@@ -1,5 +1,7 @@
 """Each plausibility check: what it finds after which time, and what it must not find."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from guard_bench import ARM, LIMIT, Bench, Heavy, N, Q, Weightless
@@ -72,6 +74,24 @@ def test_a_position_jumps_beyond_its_tolerance_only(joint, side):
         np.testing.assert_array_equal(sensors.checks.invalid, unit(joint).astype(bool) & found)
         if found:
             np.testing.assert_array_equal(sensors.checks.last_valid, before * unit(joint))
+
+
+@pytest.mark.parametrize("ticks", [5, 100, 107, 125, 133])
+def test_the_last_valid_pose_is_of_before_the_fault_began(ticks):
+    """From one to two detection times before the fault is found, or the first pose."""
+    sensors, v = Sensors(), unit(0, 0.5)
+    first = sensors.q.copy()
+    sensors.v = v
+    sensors.checks.forget()
+    sensors.measure()
+    sensors.move(v, ticks=ticks)
+    last = sensors.q.copy()
+    sensors.q = sensors.q + unit(0, 0.3)
+    assert "jumps" in sensors.measure()
+    valid, time = sensors.checks.last_valid[0], SETTINGS.detection_time + 2 * MS
+    assert (
+        max(first[0], last[0] - 2 * 0.5 * time) - 1e-9 <= valid <= max(first[0], last[0] - 0.5 * (time - 4 * MS)) + 1e-9
+    )
 
 
 def test_a_jump_is_found_however_fast_the_joint_seems_to_be():
@@ -229,6 +249,35 @@ def test_a_commanded_effort_that_does_not_show_is_a_fault_of_the_effort(joint, m
         assert not sensors.checks.invalid.any()  # its position is valid
         if found:
             assert MS * ticks == pytest.approx(SETTINGS.silent_time, abs=1.5 * MS)
+
+
+def test_an_effort_that_is_not_commanded_need_not_show():
+    """In HOLD nothing is commanded by the guard; the time begins anew after it."""
+    sensors = Sensors()
+    for _ in range(10):
+        sensors.commanded = unit(0, 0.9 * LIMIT[0])
+        assert sensors.move(np.zeros(N), ticks=round(0.7 * SETTINGS.silent_time / MS))[0] == ""
+        sensors.commanded = None
+        assert sensors.move(np.zeros(N), ticks=1)[0] == ""
+
+
+def test_gravity_that_the_motors_bear_is_no_unexplained_effort():
+    model = Weightless()
+    model.gravity_effort = lambda q: 3 * LIMIT * np.sin(10 * q)
+    for sign, found in ((1.0, False), (-1.0, True)):
+        sensors, fault = Sensors(model=model), ""
+        for _ in range(300):
+            sensors.effort = sign * model.gravity_effort(sensors.q + MS)
+            fault = fault or sensors.move(np.ones(N), ticks=1)[0]
+        assert ("does not follow" in fault) == found
+
+
+def test_an_arm_without_encoder_counts_has_the_tolerance_alone():
+    exact = dataclasses.replace(ARM, effects=ARM.effects.without("encoder"))
+    for factor, found in ((0.99, False), (1.01, True)):
+        sensors = Sensors(exact)
+        sensors.q = sensors.q + unit(6, factor * SETTINGS.position_tolerance)
+        assert ("jumps" in sensors.measure()) == found
 
 
 def test_an_effort_that_follows_late_is_shown():
