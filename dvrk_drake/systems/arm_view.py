@@ -140,6 +140,7 @@ class ArmView:
         self._context = self._diagram.CreateDefaultContext()
         self._q = np.clip(np.zeros(arm.num_joints), arm.position_lower, arm.position_upper)
         self._slider_names: list[str] = []
+        self._stopped_by = ""
         self.show(self._q)
 
     def show(self, q: ArrayLike) -> None:
@@ -156,25 +157,38 @@ class ArmView:
             self.meshcat.AddSlider(name, lower, upper, (upper - lower) / 1000, self._q[i])
 
     def follow_sliders(self) -> NDArray[np.float64]:
-        """Draws the sliders' pose if it changed, and returns it. A coupled limit holds back the slider that moved."""
+        """Draws the sliders' pose if it changed, and returns it.
+
+        A coupled limit stops the sliders of its joints, and a button without function names it.
+        """
         wanted = np.array([self.meshcat.GetSliderValue(name) for name in self._slider_names])
         if np.array_equal(wanted, self._q):
             return self._q
-        q = self._inside_coupled_limits(wanted)
+        q, stopped_by = self._inside_coupled_limits(wanted)
         for name, value, target in zip(self._slider_names, wanted, q, strict=True):
             if value != target:
                 self.meshcat.SetSliderValue(name, target)
+        if stopped_by != self._stopped_by:
+            if self._stopped_by:
+                self.meshcat.DeleteButton(self._stopped_by)
+            if stopped_by:
+                self.meshcat.AddButton(stopped_by)
+            self._stopped_by = stopped_by
         self.show([self.meshcat.GetSliderValue(name) for name in self._slider_names])
         return self._q
 
-    def _inside_coupled_limits(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The farthest pose on the way from the shown pose to the wanted one that meets the coupled limits."""
+    def _inside_coupled_limits(self, wanted: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
+        """The wanted pose with the joints of each coupled limit stopped there, and the limits that stopped them.
+
+        A slider moves in steps, so the shown pose may be slightly beyond a limit: then it goes no further.
+        """
         A, lower, upper = self.arm.limit_matrix()
-        share = 1.0
-        for row in range(self.arm.num_joints, len(A)):
-            start, end = A[row] @ self._q, A[row] @ wanted
-            if end > upper[row]:
-                share = min(share, max(0.0, (upper[row] - start) / (end - start)))
-            elif end < lower[row]:
-                share = min(share, max(0.0, (lower[row] - start) / (end - start)))
-        return self._q + share * (wanted - self._q)
+        n, q, stops = self.arm.num_joints, wanted.copy(), []
+        for a, least, most, limit in zip(A[n:], lower[n:], upper[n:], self.arm.coupled_limits, strict=True):
+            start, end = a @ self._q, a @ q
+            allowed = np.clip(end, min(least, start), max(most, start))
+            if end != allowed:
+                stopped = a != 0
+                q[stopped] = (self._q + (allowed - start) / (end - start) * (q - self._q))[stopped]
+                stops.append(f"stopped by the limit {limit.name}: {least:.4g} to {most:.4g}")
+        return q, "; ".join(stops)

@@ -49,6 +49,29 @@ def test_sliders_cover_each_joint_and_stop_at_the_coupled_limit(view):
     assert view.meshcat.GetSliderValue("q3 elbow_pitch") == pytest.approx(q[2])
 
 
+def test_at_the_coupled_limit_all_other_sliders_move_on(view):
+    """As found: at the stop of the parallelogram every slider snapped back, with a division by zero."""
+    q = np.zeros(7)
+    q[1:3] = 0.4, 0.28033  # a step of a slider beyond the limit
+    view.show(q)
+    for name, value in zip(view._slider_names, q, strict=True):
+        view.meshcat.SetSliderValue(name, value)
+    view.follow_sliders()
+    with np.errstate(all="raise"):
+        for wanted in (0.2, 0.4):
+            view.meshcat.SetSliderValue("q1 outer_yaw", wanted)
+            view.meshcat.SetSliderValue("q3 elbow_pitch", 0.6)
+            q = view.follow_sliders()
+            assert q[0] == pytest.approx(wanted, abs=2e-3)
+            assert 0.67 < q[1] + q[2] < 0.685
+    stop = "stopped by the limit parallelogram: -0.33 to 0.68"
+    assert view.meshcat.GetButtonClicks(stop) == 0
+    view.meshcat.SetSliderValue("q3 elbow_pitch", 0.1)
+    assert view.follow_sliders()[2] == pytest.approx(0.1, abs=2e-3)
+    with pytest.raises(RuntimeError):
+        view.meshcat.GetButtonClicks(stop)
+
+
 def test_sliders_of_the_psm_move_seven_joints_and_the_linkage_follows():
     view = ArmView(load_arm("psm"), start_meshcat())
     view.add_sliders()
