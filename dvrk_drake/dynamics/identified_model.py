@@ -343,7 +343,8 @@ class ControlModel:
 def _rename_values(content: dict[str, Any]) -> None:
     """Makes the effects of a file of version 2 those of version 3; what does not fit is refused later."""
     for part in (content, content.get("dynamics")):
-        for effect in part.get("effects") or () if isinstance(part, dict) else ():
+        effects = part.get("effects") if isinstance(part, dict) else None
+        for effect in effects if isinstance(effects, list) else ():
             if isinstance(effect, dict) and "value" in effect:
                 effect["coefficient"] = effect.pop("value")
 
