@@ -106,13 +106,8 @@ def _compare(options: argparse.Namespace) -> None:
         raise ModelError(f"{options.file}: {error}") from error
     console = make_console()
     print_comparison(console, options.file, options.model, comparison)
-    if comparison.other_side:
-        print(
-            f"dvrk-drake: warning: {options.file}: the mirror image of the model fits better: the file is probably one "
-            f"of the other side's arm, not of {model.arm.name}. Check ARM_NAME and the serial number",
-            file=sys.stderr,
-            flush=True,
-        )
+    for warning in comparison.warnings:
+        print(f"dvrk-drake: warning: {options.file}: {warning}", file=sys.stderr, flush=True)
     if options.plot is not None:
         plot_compensation(options.plot, comparison, f"{options.file} and {options.model} over the joint box, at rest")
         console.print(f"plot: {options.plot}", soft_wrap=True)

@@ -93,6 +93,16 @@ class CompensationComparison:
     in_sweep: NDArray[np.bool_]
     other_side: bool
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What must be known before the file is used, a line each."""
+        if not self.other_side:
+            return ()
+        return (
+            "the mirror image of the model fits better: the file is probably one of the other side's arm, not of "
+            f"{self.model.arm.name}. Check ARM_NAME and the serial number",
+        )
+
     def as_dict(self) -> dict:
         """For JSON; NaN becomes None."""
         joints = [{k: None if v != v else v for k, v in asdict(j).items()} for j in self.joints]
