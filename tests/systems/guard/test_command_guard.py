@@ -4,7 +4,7 @@ import copy
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, MS, WITH_OFF, Bench, N, Q, Weightless, modes
+from guard_bench import ARM, LIMIT, MS, WITH_OFF, Bench, Heavy, N, Q, Weightless, modes
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -342,6 +342,11 @@ def test_a_jump_of_the_senders_clock_does_not_disturb_a_hold():
     bench.guard.report_fault("x")
     assert bench.send(Command.HOLD, utime=bench.utime) == Status.REFUSAL_CLOCK_JUMP
     assert bench.guard.state == Status.STATE_FAULT
+
+
+def test_the_guard_knows_the_gravity_effort_of_the_pose():
+    bench = Bench(model=Heavy()).at_rest()
+    np.testing.assert_allclose(bench.guard.gravity_effort, Heavy().gravity_effort(Q), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])

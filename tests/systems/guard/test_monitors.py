@@ -67,6 +67,23 @@ def test_a_guard_that_was_not_stepped_for_49_ms_holds():
     assert bench.guard.hold_reason == "the guard was not stepped for 49 ms; allowed are 40"
 
 
+def test_the_period_is_that_of_the_wall_clock_if_there_is_one():
+    """A simulated arm's own clock counts its ticks, however late they are."""
+    wall = [10**9]
+    bench = Bench(checks=True, wall_clock=lambda: wall[0])
+    for _ in range(260):
+        wall[0] += MS
+        bench.run(Command.EFFORT, 1)
+    assert bench.guard.state == Status.STATE_EFFORT
+    for late, state in ((39 * MS, Status.STATE_EFFORT), (49 * MS, Status.STATE_HOLD)):
+        wall[0] += late
+        bench.tick()
+        assert bench.guard.state == state
+        wall[0] += MS
+        assert bench.send(Command.EFFORT) in (Status.REFUSAL_NONE, Status.REFUSAL_RESUME)
+    assert bench.guard.hold_reason == "the guard was not stepped for 50 ms; allowed are 40"
+
+
 def reversals(monitor, wave, seconds=6.0):
     """Time at which the monitor finds an oscillation of the effort wave(t) (n,), and the joint; or (None, None)."""
     for k in range(round(1e3 * seconds)):
@@ -108,6 +125,15 @@ def test_reversals_fade_and_a_restart_forgets_them(half_period, restart, found):
             monitor.restart()
         joints += [monitor.add((-1.0) ** k * LIMIT, 1e-3) for _ in range(round(1e3 * half_period))]
     assert any(joint is not None for joint in joints) == found
+
+
+def test_a_guard_lets_efforts_change_their_sign_slowly():
+    bench = Bench().started()
+    for k in range(5000):
+        effort = (-1.0) ** (k // 600) * LIMIT * np.eye(N)[2]
+        bench.send(Command.EFFORT, effort=list(effort))
+        bench.tick(5)
+    assert bench.guard.state == Status.STATE_EFFORT
 
 
 def test_a_guard_holds_an_arm_whose_effort_commands_oscillate():
