@@ -27,7 +27,7 @@ from dvrk_drake.models.arm_schema import (
     Mechanism,
 )
 from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_limit_fault, limits_fault
-from dvrk_drake.models.effects_schema import ArmEffects
+from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, within
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, local_path, read_sdf_facts
@@ -177,6 +177,11 @@ class Arm:
         rows = {f"actuator.{name}": unit for name, unit in zip(self.joint_names, np.eye(self.num_joints), strict=True)}
         rows |= {f"joint.{name}": row for name, row in zip(self.joint_names, J_inverse, strict=True)}
         return rows | {name: row @ J_inverse for name, row in self.friction_coordinates.items()}
+
+    def encoder_counts(self) -> NDArray[np.float64]:
+        """(n,) the most that one encoder count is at each joint [rad, m]; 0 where the arm's effects state none."""
+        resolution = self.effects.encoder.resolution if self.effects.encoder is not None else {}
+        return np.abs(self.transmission.inverse.matrix) @ per_actuator(resolution, self.joint_names, 0.0)
 
     def dry_friction(self) -> NDArray[np.float64]:
         """(n,) largest dry friction on each joint that the arm's effects state [N m, N]; 0 where they state none."""

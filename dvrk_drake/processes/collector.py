@@ -22,7 +22,8 @@ from dvrk_drake.recordings.pose_file import CollectionFile
 _LONGEST_STEP = 0.01
 #: How long the arm may take to let efforts act [s].
 _START = 10.0
-#: The arm rests within this [rad], [m] for so long [s]; a pose at which it does not within `_SETTLE` [s] is left out.
+#: The arm rests within this [rad], [m] and 1.5 encoder counts for so long [s]; a pose at which it does not within
+#: `_SETTLE` [s] is left out.
 _REST, _REST_TIME, _SETTLE = (2e-3, 2e-4), 0.5, 10.0
 #: Measurements are averaged for so long [s].
 _MEASURE = 0.25
@@ -218,7 +219,8 @@ class Collector:
 
     def _settle(self) -> Generator[None, None, bool]:
         """Whether the arm came to rest in time."""
-        detector = RestDetector(self._arm.per_joint(*_REST), _REST_TIME)
+        tolerance = self._arm.per_joint(*_REST) + 1.5 * self._arm.encoder_counts()
+        detector = RestDetector(tolerance, _REST_TIME)
         end = self._time + _SETTLE
         while not detector.rests(self._time, self._q):
             if self._time > end:

@@ -122,6 +122,25 @@ def test_a_pose_without_rest_is_left_out_and_named(tmp_path):
     assert collector.done.tolist() == [True, False, True]
 
 
+def test_an_encoder_that_alternates_between_two_counts_rests(tmp_path):
+    """A count of an MTM's wrist is 3 to 6 mrad; while no joint moves, a reading may alternate."""
+    collector, controller, sticky = make_quick(tmp_path)
+    counts = load_arm("mtml").encoder_counts()
+    assert counts.max() > 5e-3
+    status = sticky.status
+
+    def alternating():
+        said = status()
+        said.position = list(sticky.q + (sticky.ticks // 7 % 2) * counts)
+        return said
+
+    sticky.status = alternating
+    lead(collector, controller, sticky, 40.0)
+    collector.close()
+    assert collector.finished and collector.problem is None and not collector.unsettled
+    assert collector.done.all()
+
+
 def test_a_file_that_cannot_be_written_ends_it(tmp_path):
     collector, controller, sticky = make_quick(tmp_path)
     (tmp_path / "o.csv").mkdir()

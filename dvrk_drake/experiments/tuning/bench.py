@@ -33,16 +33,9 @@ def step_size(arm: Arm) -> NDArray[np.float64]:
     return arm.per_joint(STEP_REVOLUTE, STEP_PRISMATIC)
 
 
-def counts(arm: Arm) -> NDArray[np.float64]:
-    """(n,) what a joint's position is known to [rad, m]: a count of each of the encoders that it is computed from."""
-    encoder = arm.effects.encoder
-    table = per_actuator(encoder.resolution if encoder else {}, arm.joint_names, 0.0)
-    return np.abs(arm.transmission.inverse.matrix) @ table
-
-
 def band(arm: Arm) -> NDArray[np.float64]:
     """(n,) a joint has settled if it stays this near [rad, m]: 2 % of the step, or a count if that is more."""
-    return np.maximum(0.02 * step_size(arm), counts(arm))
+    return np.maximum(0.02 * step_size(arm), arm.encoder_counts())
 
 
 def effort_limits(arm: Arm) -> NDArray[np.float64]:
@@ -237,7 +230,7 @@ class JointOnBench:
         arm = bench.arm
         self._bench, self._joint = bench, joint
         self._q_desired = middle_pose(arm)
-        self.step, self.count = float(step_size(arm)[joint]), float(counts(arm)[joint])
+        self.step, self.count = float(step_size(arm)[joint]), float(arm.encoder_counts()[joint])
         self.band, self.effort_limit = float(band(arm)[joint]), float(effort_limits(arm)[joint])
 
     def respond(self, kp: float, kd: float, ki: float, duration: float) -> tuple[NDArray, NDArray]:

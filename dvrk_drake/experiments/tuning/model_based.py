@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.errors import ControllerError
-from dvrk_drake.experiments.tuning.bench import band, counts, effort_limits, rounded_gains
+from dvrk_drake.experiments.tuning.bench import band, effort_limits, rounded_gains
 from dvrk_drake.experiments.tuning.sampled_loop import Margins, SampledLoop, Sampling, place
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains
@@ -190,7 +190,15 @@ def joint_facts(arm: Arm, masses: NDArray[np.float64]) -> tuple[JointFacts, ...]
     """Of each joint; `masses` (m, n, n) are of poses all over the joint box."""
     least = 1.0 / np.max(np.diagonal(np.linalg.inv(masses), axis1=1, axis2=2), axis=0)
     largest = np.max(np.diagonal(masses, axis1=1, axis2=2), axis=0)
-    columns = (least, largest, *friction(arm), largest_gravity(arm), counts(arm), band(arm), effort_limits(arm))
+    columns = (
+        least,
+        largest,
+        *friction(arm),
+        largest_gravity(arm),
+        arm.encoder_counts(),
+        band(arm),
+        effort_limits(arm),
+    )
     rows = zip(*columns, strict=True)
     return tuple(JointFacts((float(row[0]), float(row[1])), *map(float, row[2:])) for row in rows)
 

@@ -242,8 +242,7 @@ class Plausibility:
             speed_limit: (n,) that the guard keeps [rad/s, m/s].
         """
         self.model, self._names = model, arm.joint_names
-        resolution = arm.effects.encoder.resolution if arm.effects.encoder is not None else {}
-        counts = np.abs(arm.transmission.inverse.matrix) @ [resolution.get(name, 0.0) for name in arm.joint_names]
+        counts = arm.encoder_counts()
         tolerance = arm.per_joint(settings.position_tolerance, 0.1 * settings.position_tolerance) + _COUNTS * counts
         self._detection_time = settings.detection_time
         self._checks: tuple[Check, ...] = (
