@@ -166,6 +166,36 @@ def test_a_pose_that_is_not_measured_now_is_not_where_a_reset_holds():
     np.testing.assert_array_equal(output.position, good)
 
 
+def test_after_a_joint_without_a_valid_position_a_reset_holds_the_measured_pose():
+    """Also where it is so near that a hold would go on; until then the others are braked as well as held."""
+    bench = Bench(checks=True, model=Heavy()).at_rest()
+    bench.tick(100)
+    bench.q = Q + 0.015 * np.eye(N)[0]
+    bench.tick()
+    assert bench.guard.fault_text == "outer_yaw: the position jumps"
+    bench.v = 0.02 * LIMIT / bench.guard.limits.kd * np.eye(N)[1]
+    bench.q = bench.q + 1e-3 * bench.v
+    output = bench.tick()
+    expected = Heavy().gravity_effort(Q)[1] - 0.02 * LIMIT[1]
+    assert output.effort[1] == pytest.approx(expected, abs=0.005 * LIMIT[1])
+    bench.v = np.zeros(N)
+    bench.tick()
+    healthy = {"position": list(bench.q), "effort": [0.0] * N}
+    bench.run(Command.HOLD, 1, **healthy)
+    output = bench.run(Command.HOLD, 1, reset_fault=True, **healthy)
+    assert output.control_mode == Command.HOLD
+    np.testing.assert_array_equal(output.position, bench.q)
+
+
+def test_a_reset_without_a_fault_says_nothing():
+    bench = Bench()
+    bench.q = Q * np.nan
+    for reset in (False, True):
+        bench.send(Command.HOLD, position=list(Q), effort=[0.0] * N, reset_fault=reset)
+        bench.tick()
+    assert (bench.guard.state, bench.guard.fault_text) == (Status.STATE_HOLD, "")
+
+
 def test_bad_measurements_before_any_good_one_leave_the_motors_without_power():
     guard = CommandGuard(ARM, SESSION, Weightless())
     output = guard.step(0, 0, Q * np.nan, 0 * Q, 0 * Q)
