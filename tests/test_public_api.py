@@ -13,6 +13,8 @@ from pydrake.systems.framework import LeafSystem
 from repository import ROOT
 
 import dvrk_drake as dvrk
+from dvrk_drake.errors import DvrkDrakeError, RecordingError
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
 
 #: Packages that take long to import.
 SLOW = {"pydrake", "numba", "numpy", "scipy", "sympy", "matplotlib", "rich", "yaml"}
@@ -201,3 +203,80 @@ def test_the_readme_example_runs(tmp_path, monkeypatch, capsys):
     exec(compile(readme_example(), "README.md", "exec"), {})
     assert (tmp_path / "model.yaml").is_file()
     assert "verdict" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def exact():
+    arm = dvrk.load_arm("mtmr")
+    q = arm.sample_poses(40, np.random.default_rng(0))
+    return arm, dvrk.Recording(q=q, tau=dvrk.IdentifiedModel.from_arm(arm).holding_torque(q), source="poses.csv")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"tau": np.zeros((39, 7))}, r"poses.csv: tau has shape \(39, 7\), but q has \(40, 7\)"),
+        ({"t": [0.0, 1.0]}, r"poses.csv: t has shape \(2,\), but q has \(40, 7\)"),
+        ({"q": np.zeros(7)}, r"poses.csv: q has shape \(7,\); allowed: \(rows, joints\)"),
+        ({"coordinates": "Joint"}, 'poses.csv: coordinates is "Joint"; allowed: joint, actuator'),
+    ],
+)
+def test_a_recording_is_checked_when_it_is_made(exact, change, message):
+    with pytest.raises(RecordingError, match=message):
+        dataclasses.replace(exact[1], **change)
+
+
+@pytest.mark.parametrize("name", ["q", "tau"])
+def test_a_number_that_is_none_is_refused_with_its_row(exact, name):
+    arm, recording = exact
+    values = getattr(recording, name).copy()
+    values[3, 1] = np.nan
+    with pytest.raises(RecordingError, match=rf"poses.csv: row 4: {name}2 = nan is no reading of an arm"):
+        dvrk.identify(dataclasses.replace(recording, **{name: values}), arm)
+
+
+def test_an_unknown_method_is_refused(exact):
+    with pytest.raises(DvrkDrakeError, match='method is "pape"; allowed: robust, paper'):
+        dvrk.identify(exact[1], exact[0], method="pape")
+
+
+def test_what_cannot_be_simulated_is_refused():
+    arm = dvrk.load_arm("mtml")
+    for controller, message in (
+        ("m.yaml", "controller is a str; allowed: an IdentifiedModel"),
+        (dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtmr")), "controller is a model of MTMR, not of MTML"),
+    ):
+        with pytest.raises(DvrkDrakeError, match=message):
+            dvrk.simulate(arm, controller=controller)
+    with pytest.raises(DvrkDrakeError, match="what is a str; allowed: an Arm"):
+        dvrk.simulate("mtml")
+    with pytest.raises(DvrkDrakeError, match="unknown effect frictions"):
+        dvrk.simulate(arm, effects="frictions")
+
+
+def test_an_arm_file_that_changed_is_read_again(tmp_path):
+    path = tmp_path / "own.yaml"
+    text = (MODELS_FOLDER / "arms" / "mtmr.yaml").read_text()
+    path.write_text(text)
+    first = dvrk.load_arm(path)
+    assert dvrk.load_arm(str(path)) is first
+    path.write_text(text.replace("MTMR", "OTHER"))
+    assert (first.name, dvrk.load_arm(path).name) == ("MTMR", "OTHER")
+
+
+def test_verdicts_replace_no_other_file(exact, tmp_path):
+    arm, recording = exact
+    result = dvrk.identify(recording, arm)
+    own, other = tmp_path / "own.yaml", tmp_path / "other.csv"
+    result.save(own)
+    other.write_text("mine")
+    q = arm.sample_poses(40, np.random.default_rng(1))
+    tau = dvrk.IdentifiedModel.from_arm(arm).holding_torque(q)
+    validation = dvrk.validate(result.model, dvrk.Recording(q=q, tau=tau, source="others.csv"))
+    with pytest.raises(DvrkDrakeError, match="exists already"):
+        validation.save(other)
+    assert other.read_text() == "mine"
+    validation.save(own)
+    assert dvrk.IdentifiedModel.load(own).validation.recording == "others.csv"
+    assert repr(result).startswith("<StaticIdentification of MTMR: ")
+    assert "poses.csv: 40 rows, 7 joints, joint coordinates" in repr(recording)

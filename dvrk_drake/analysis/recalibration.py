@@ -62,7 +62,7 @@ class RecalibratedActuator:
     offset: float
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Recalibration(ModelResult):
     """A model with new friction.
 

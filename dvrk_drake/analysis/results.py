@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.verdict import Requirement, unfit, worst
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary, Verdict
-from dvrk_drake.errors import ModelError
+from dvrk_drake.errors import DvrkDrakeError, ModelError
 from dvrk_drake.models.files import refuse_existing
 from dvrk_drake.recordings.recording import Recording
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class ModelResult:
     """A model and the warnings about it.
 
@@ -28,6 +28,9 @@ class ModelResult:
 
     model: IdentifiedModel
     warnings: tuple[Finding, ...] = ()
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.model.arm.name}: {len(self.warnings)} warnings>"
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Writes the model file, at once or not at all.
@@ -43,7 +46,7 @@ class ModelResult:
         self.model.save(path)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Identification(ModelResult):
     """Result of `identify`: a `StaticIdentification` or a `DynamicIdentification`.
 
@@ -58,7 +61,7 @@ class Identification(ModelResult):
     num_rows: int = 0
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Validation(ABC):
     """Result of `validate`: a `StaticValidation` or a `DynamicValidation`.
 
@@ -89,6 +92,10 @@ class Validation(ABC):
         """The least favourable of the verdicts."""
         return worst(self.verdicts)[0]
 
+    def __repr__(self) -> str:
+        verdicts = ", ".join(f"{name}: {verdict}" for name, verdict in self.verdicts.items())
+        return f"<{type(self).__name__} of {self.model.arm.name}: {verdicts}; {len(self.warnings)} warnings>"
+
     @abstractmethod
     def as_dict(self) -> dict:
         """Returns what `validate --json` writes."""
@@ -106,11 +113,12 @@ class Validation(ABC):
         """Writes the model with these verdicts; `dvrk-drake run` warns of a model without them.
 
         Args:
-            path: the model file; an existing one is replaced.
-            overwrite: replace verdicts that the model has from another recording.
+            path: the model's own file, or a new one.
+            overwrite: replace verdicts that the model has from another recording, or another file.
 
         Raises:
             ModelError: the model was identified from this recording, or has verdicts already.
+            DvrkDrakeError: the file exists and is not of this model.
         """
         source = self.recording.source or "recording"
         if self.of_same_recording:
@@ -118,8 +126,17 @@ class Validation(ABC):
         if self.model.validation is not None and not overwrite:
             saved = self.model.validation.recording
             raise ModelError(f"{path}: has verdicts from {saved} already; replace them with overwrite=True")
+        if not self._is_own_file(path):
+            refuse_existing(path, overwrite)
         summary = ValidationSummary(self.recording.source, self.recording.sha256, dict(self.verdicts))
         replace(self.model, validation=summary).save(path)
+
+    def _is_own_file(self, path: str | Path) -> bool:
+        try:
+            other = IdentifiedModel.load(path)
+        except DvrkDrakeError:
+            return False
+        return other.arm.name == self.model.arm.name and other.provenance == self.model.provenance
 
 
 @dataclass(frozen=True, eq=False)

@@ -200,7 +200,7 @@ class IdentifiedModel(_Identified):
 
         Args:
             path: the model file.
-            arm: refuse a model of another arm.
+            arm: refuse a model of an arm with another name; the model keeps the arm that its file names.
 
         Raises:
             ModelError: no such file, not a model, or one that does not fit its arm or is not of `arm`.
@@ -209,7 +209,7 @@ class IdentifiedModel(_Identified):
         # Another version has other keys, which are not worth naming.
         version = content.get("format") if isinstance(content, dict) else None
         if version and version not in (FORMAT, _FORMAT_2):
-            raise ModelError(f'{path}: format is "{version}", this version reads "{FORMAT}"; identify anew')
+            raise ModelError(f'{path}: format is "{version}", this version reads "{FORMAT}" and 2; identify anew')
         if version == _FORMAT_2:
             _rename_values(content)
         file = typed_content(ModelFile, content, str(path), ModelError, "a model file")
@@ -222,12 +222,14 @@ class IdentifiedModel(_Identified):
                 raise ModelError(f"is of {own_arm.name}, not of {arm.name}")
             model = cls(arm=own_arm, **{part.name: getattr(file, part.name) for part in fields(_Identified)})
             model.check()
-        except (ModelError, ArmError) as error:
+        except ArmError as error:
+            raise ModelError(f'{path}: its arm "{file.arm}" cannot be loaded: {error}') from error
+        except ModelError as error:
             raise ModelError(f"{path}: {error}") from error
         return model
 
     def save(self, path: str | Path) -> None:
-        """Writes the model file at once or not at all.
+        """Writes the model file at once or not at all; an existing file is replaced.
 
         Raises:
             ModelError: the model does not fit its arm, or holds numbers that are none.

@@ -101,6 +101,13 @@ def simulate(
         >>> run.recording.q.shape, bool(abs(run.recording.q).max() < 1e-3)  # holds its home pose
         ((51, 7), True)
     """
+    if not isinstance(what, Arm | Scenario):
+        raise ScenarioError(f'what is a {type(what).__name__}; allowed: an Arm, e.g. load_arm("mtml"), or a Scenario')
+    if not isinstance(controller, IdentifiedModel | System | None):
+        kind = type(controller).__name__
+        raise ScenarioError(
+            f"controller is a {kind}; allowed: an IdentifiedModel (the `model` of a result) or a System"
+        )
     given: dict[str, Any] = {"duration": duration, "sample_period": sample_period, "seed": seed}
     if isinstance(what, Arm):
         scenario = scenario_of_arm(what, True if effects is None else effects, start, targets or ())
@@ -109,6 +116,8 @@ def simulate(
                 setattr(scenario, name, value)
         scenario.mounted_arm = what
         if isinstance(controller, IdentifiedModel):
+            if controller.arm.name != what.name:
+                raise ScenarioError(f"controller is a model of {controller.arm.name}, not of {what.name}")
             scenario.model = controller
     else:
         given |= {"controller": controller, "effects": effects, "start": start, "targets": targets}
@@ -206,13 +215,14 @@ def scenario_of_arm(
     arm: Arm, effects: bool | Sequence[str], start: ArrayLike | None, targets: Sequence[tuple[float, ArrayLike]]
 ) -> Scenario:
     """Returns the scenario of `simulate` for an arm; arguments as there."""
-    parts = ["all"] if effects is True else [] if effects is False else list(effects)
+    if isinstance(effects, bool):
+        effects = ["all"] if effects else []
     return Scenario(
         arm=arm.source,
         gravity=arm.gravity.tolist(),
         start=None if start is None else np.asarray(start, float).tolist(),
         targets=[Target(float(time), np.asarray(pose, float).tolist()) for time, pose in targets],
-        real_arm=parts,
+        real_arm=[effects] if isinstance(effects, str) else list(effects),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -264,8 +265,8 @@ def known_arms() -> list[str]:
     return sorted(path.stem for path in _ARMS.glob("*.yaml"))
 
 
-def load_arm(name: str) -> Arm:
-    """Loads an arm.
+def load_arm(name: str | Path) -> Arm:
+    """Loads an arm; the same file gives the same Arm object until it is changed.
 
     Args:
         name: of an arm of this package, e.g. "mtml" (case does not matter), or the path or package URL of an arm's YAML
@@ -281,17 +282,24 @@ def load_arm(name: str) -> Arm:
         >>> int(arm.prismatic.argmax()), arm.joint_names[2]
         (2, 'insertion')
     """
+    name = os.fspath(name)
     if "\0" in name:
         raise ArmError(f"{name!r}: is not the name of a file")
     if not name.endswith((".yaml", ".yml")):
         return _load_arm(name.lower())
     path = Path(os.path.realpath(local_path(name)))
     # One Arm object an arm, whatever it is loaded by.
-    return _load_arm(path.stem if path.parent == _ARMS.resolve() else str(path))
+    if path.parent == _ARMS.resolve():
+        return _load_arm(path.stem)
+    with suppress(OSError):  # of a file that does not exist `_load_arm` says so
+        status = path.stat()
+        return _load_arm(str(path), (status.st_mtime_ns, status.st_size))
+    return _load_arm(str(path))
 
 
 @cache
-def _load_arm(name: str) -> Arm:
+def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
+    """Loads an arm by name or absolute path; `state` is that of its file."""
     path = Path(name)
     if not path.is_absolute():
         if name not in known_arms():

@@ -17,7 +17,21 @@ Schema = TypeVar("Schema")
 #: Deepest nesting and most values, aliases expanded, of a file; a PSM's files have 6 and 6000.
 DEEPEST, MOST_VALUES = 50, 1_000_000
 # libyaml's parser is ten times as fast as the one in Python, and does not slow down where values are nested.
-_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_FastLoader):
+    """Refuses a key that stands twice in one table, of which YAML takes the last one."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        keys: set[str] = set()
+        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
+                if key.value in keys:
+                    what = f'key "{key.value}" is there twice'
+                    raise yaml.constructor.ConstructorError(None, None, what, key.start_mark)
+                keys.add(key.value)
+        return super().construct_mapping(node, deep)
 
 
 def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrakeError], what: str) -> Schema:

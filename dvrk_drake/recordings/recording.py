@@ -73,6 +73,24 @@ class Recording:
     # The same recording in the other coordinates, by transmission.
     _converted: dict[LinearMap, Recording] = field(default_factory=dict, init=False, repr=False)
 
+    def __post_init__(self) -> None:
+        where = self.source or "recording"
+        if self.coordinates not in get_args(Coordinates):
+            raise RecordingError(f'{where}: coordinates is "{self.coordinates}"; allowed: joint, actuator')
+        for name in ("q", "qd", "tau", "t"):
+            if (values := getattr(self, name)) is not None:
+                object.__setattr__(self, name, np.asarray(values, float))
+        if self.q.ndim != 2:
+            raise RecordingError(f"{where}: q has shape {self.q.shape}; allowed: (rows, joints)")
+        for name, shape in (("qd", self.q.shape), ("tau", self.q.shape), ("t", self.q.shape[:1])):
+            values = getattr(self, name)
+            if values is not None and values.shape != shape:
+                raise RecordingError(f"{where}: {name} has shape {values.shape}, but q has {self.q.shape}")
+
+    def __repr__(self) -> str:
+        rows = f"{len(self)} rows, {self.q.shape[1]} joints, {self.coordinates} coordinates"
+        return f"<Recording {self.source or 'without a file'}: {rows}>"
+
     def __len__(self) -> int:
         return len(self.q)
 
@@ -201,12 +219,13 @@ class Recording:
 
     def _check_sizes(self) -> None:
         for name, values in (("q", self.q), ("qd", self.qd), ("tau", self.tau)):
-            if values is not None and np.any(np.abs(values) > IMPLAUSIBLE):
-                row, joint = np.argwhere(np.abs(values) > IMPLAUSIBLE)[0]
-                raise RecordingError(
-                    f"{self.where(int(row))}: {name}{joint + 1} = {values[row, joint]:g} is no reading of an arm; "
-                    f"at most {IMPLAUSIBLE:g}"
-                )
+            if values is None or np.all(plausible := np.abs(values) <= IMPLAUSIBLE):
+                continue
+            row, joint = np.argwhere(~plausible)[0]
+            raise RecordingError(
+                f"{self.where(int(row))}: {name}{joint + 1} = {values[row, joint]:g} is no reading of an arm; "
+                f"at most {IMPLAUSIBLE:g}"
+            )
 
     def _check_joint_count(self, arm: Arm) -> None:
         if self.q.shape[1] != arm.num_joints:

@@ -118,6 +118,13 @@ def test_what_drake_takes_letter_by_letter_is_refused():
     assert schema_fault(Outer, {"sizes": "12"}, "a test") == 'sizes is "12"; allowed: a list of numbers, e.g. [12]'
 
 
+def test_a_key_that_stands_twice_is_refused():
+    for text, line in (("a: 1\nb: 2\na: 3\n", 3), ("b:\n  c: {d: 1, d: 2}\n", 2)):
+        with pytest.raises(ArmError, match=rf'own.yaml: not YAML: line {line}: key "[ad]" is there twice'):
+            parse_yaml(text, "own.yaml", ArmError)
+    assert parse_yaml("a: &x {c: 1}\nb: {<<: *x, c: 2}\n", "own.yaml", ArmError)["b"] == {"c": 2}
+
+
 def test_files_that_are_no_text_or_not_there_are_refused(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_bytes(b"name: \xff")

@@ -33,7 +33,7 @@ from dvrk_drake.recordings.recording import REST_SPEED, Recording
 LEAST_EFFECT = 1e-4
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class DynamicIdentification(Identification):
     """A model identified from a motion; it has `dynamics`, and its base parameters are those of the links there.
 

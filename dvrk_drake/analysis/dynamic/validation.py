@@ -44,7 +44,7 @@ class ActuatorError:
     verdict: Verdict
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class DynamicValidation(Validation):
     """Errors of a model on one motion.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ LEAST_GAIN_RATIO = 0.98
 FOLDS = 10
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class StaticIdentification(Identification):
     """A model identified from poses.
 
@@ -86,6 +86,8 @@ def identify_static(
         RecordingError: the recording does not fit the arm or has no efforts.
         IdentificationError: too few poses, a motion instead of poses, or (method "paper") a rank too low.
     """
+    if method not in get_args(Method):
+        raise IdentificationError(f'method is "{method}"; allowed: {", ".join(get_args(Method))}')
     recording = usable_poses(recording, arm, averaged=method == "robust" and measured is None)
     tau = recording.measured_effort()
     gravity_model = compile_static_model(arm)

@@ -37,7 +37,7 @@ class JointError:
     verdict: Verdict
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class StaticValidation(Validation):
     """Errors of a model on poses.
 
