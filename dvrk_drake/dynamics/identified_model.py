@@ -238,6 +238,10 @@ class IdentifiedModel(_Identified):
         with atomic_write(path) as stream:
             stream.write(yaml_dump_typed(self._file(_name_for(path, self.arm))))
 
+    def to_yaml(self) -> str:
+        """Returns what a model file says, with the arm as `Arm.source`."""
+        return yaml_dump_typed(self._file(self.arm.source))
+
     def _file(self, arm: str) -> ModelFile:
         parts = {part.name: getattr(self, part.name) for part in fields(_Identified)}
         return ModelFile(format=FORMAT, arm=arm, gravity=self.arm.gravity.tolist(), **parts)

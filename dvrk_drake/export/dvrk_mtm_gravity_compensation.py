@@ -270,7 +270,7 @@ def _refuse_errors(
     raise ModelError(
         "the controller's file cannot hold this model: over the joint box it would be off by up to "
         f"{off} N m. Of that: {', '.join(reason for reason, size in reasons.items() if size > least)}. "
-        f"{_estimates_note(model)}To accept it, repeat it with the tolerance (--gc-tolerance {round_up(error.max()):g})"
+        f"{_estimates_note(model)}To accept it, repeat the command with --gc-tolerance {round_up(error.max()):g}"
     )
 
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from xml.etree.ElementTree import tostring
 
 import numpy as np
-from pydrake.common.yaml import yaml_dump_typed
 
 from dvrk_drake.errors import DvrkDrakeError, StudyError
 from dvrk_drake.experiments.scenario import Scenario, check_pose, load_scenario
@@ -111,7 +110,7 @@ class Study:
         content = {
             "versions": versions(),
             "scenarios": {name: dataclasses.asdict(scenario) for name, scenario in self.scenarios.items()},
-            "models": [yaml_dump_typed(scenario.model) for scenario in self.scenarios.values()],
+            "models": [scenario.model.to_yaml() for scenario in self.scenarios.values()],
             "arms": [dataclasses.asdict(scenario.mounted_arm) for scenario in self.scenarios.values()],
             "sdf": [
                 tostring(compose_sdf(scenario.mounted_arm.sdf, scenario.mounted_arm.mirrored_links), "unicode")

@@ -243,7 +243,7 @@ def test_model_file_round_trip_and_refusals(arm, tmp_path):
         ),
         (
             text.replace("model 3", "model 1").replace("\neffects:", "\njoint_effects:"),
-            'model 1", this version reads "dvrk_drake identified model 3"; identify anew',
+            'model 1", this version reads "dvrk_drake identified model 3" and 2; identify anew',
         ),
         (text.replace("trust: 1.0", "trust: 2.0"), r"joints\[1\]\.trust is 2; allowed: 0\.\.1"),
         (text.replace("arm: ", "arms: ", 1), 'key "arms" is unknown; did you mean "arm"'),
