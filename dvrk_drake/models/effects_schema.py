@@ -34,7 +34,7 @@ class DriveEffect:
     kind: str = ""
     scale: float = field(default=0.0, metadata=within(1e-6, 1000.0, also=(0.0,)))
     coefficient: float = field(default=0.0, metadata=within(-1e6, 1e6, "N m, N m s/rad or N m/rad"))
-    standard_error: float = field(default=0.0, metadata=within(0.0, 1e9))
+    standard_error: float = field(default=0.0, kw_only=True, metadata=within(0.0, 1e9))
 
     @property
     def distinguishable(self) -> bool:

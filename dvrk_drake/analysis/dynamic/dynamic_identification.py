@@ -169,7 +169,9 @@ def _section(
     for k, effect in enumerate(problem.columns.effects[c] for c in chosen):
         value = float(fit.x[p + k])
         if value**2 * problem.effect_precision[chosen[k]] > LEAST_EFFECT**2:
-            effects.append(DriveEffect(effect.coordinate, effect.kind, effect.scale, value, float(sd[p + k])))
+            effects.append(
+                DriveEffect(effect.coordinate, effect.kind, effect.scale, value, standard_error=float(sd[p + k]))
+            )
     rows = problem.num_rows
     size = np.sqrt(problem.efforts / rows)
     floor = np.zeros(arm.num_joints)

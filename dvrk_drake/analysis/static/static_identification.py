@@ -132,7 +132,7 @@ def identify_static(
             for name, value, error in zip(gravity_model.gravity.base.names, fit.theta, sd, strict=False)
         ],
         effects=[
-            DriveEffect(effect.coordinate, effect.kind, effect.scale, float(value), float(error))
+            DriveEffect(effect.coordinate, effect.kind, effect.scale, float(value), standard_error=float(error))
             for effect, value, error in zip(effects, fit.theta[Y.shape[2] :], sd[Y.shape[2] :], strict=True)
         ],
         joints=_statistics(recording, arm, fit, validated, measured, usable, trust),

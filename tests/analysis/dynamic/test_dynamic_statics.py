@@ -38,7 +38,10 @@ def model_of_all_effects(name, tilt):
     generator = np.random.default_rng(3)
     arm = load_arm(name)
     arm = arm.with_gravity([float(g) for g in arm.gravity + tilt])
-    estimates = [DriveEffect(e.coordinate, e.kind, e.scale, float(generator.normal()), 0.1) for e in all_effects(arm)]
+    estimates = [
+        DriveEffect(e.coordinate, e.kind, e.scale, float(generator.normal()), standard_error=0.1)
+        for e in all_effects(arm)
+    ]
     friction = DriveEffect(f"actuator.{arm.joint_names[0]}", "coulomb", 0.1, 0.3)
     dynamics = true_dynamics(arm, generator, [friction, *estimates])
     section = dataclasses.replace(dynamics.section, gravity_expected=dynamics.section.gravity)

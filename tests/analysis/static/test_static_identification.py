@@ -266,7 +266,7 @@ def test_a_model_file_finds_its_arm_after_both_have_moved_and_one_of_version_2_i
     shutil.move(tmp_path / "model.yaml", tmp_path / "elsewhere")
     arm = IdentifiedModel.load(tmp_path / "elsewhere" / "model.yaml").arm
     assert arm is load_arm(f"{moved}/own.yaml")
-    effects = [DriveEffect("joint.wrist_pitch", "cable sine", 1.0, 0.05, 0.01)]
+    effects = [DriveEffect("joint.wrist_pitch", "cable sine", 1.0, 0.05, standard_error=0.01)]
     model = IdentifiedModel.from_arm(load_arm("mtmr"), effects)
     model.save(tmp_path / "new.yaml")
     new = (tmp_path / "new.yaml").read_text()
