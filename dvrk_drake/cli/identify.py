@@ -121,15 +121,21 @@ def _identify(options: argparse.Namespace) -> None:
         console.print(f"plots: {options.plots}")
 
 
+def _model_and_recording(options: argparse.Namespace) -> tuple[dvrk.IdentifiedModel, dvrk.Recording]:
+    """Reads a model and a recording of its arm, and prints the notes on the recording."""
+    model = dvrk.IdentifiedModel.load(options.model)
+    recording = dvrk.read_recording(options.recording, model.arm, options.coordinates)
+    print_notes(options.recording, recording.notes)
+    return model, recording
+
+
 def _validate(options: argparse.Namespace) -> None:
     from dvrk_drake.reports.identification import plot_validation, print_validation
     from dvrk_drake.reports.terminal_tables import make_console
 
     if options.json is not None:
         check_output(options.json, options.recording, options.model, overwrite=options.overwrite)
-    model = dvrk.IdentifiedModel.load(options.model)
-    recording = dvrk.read_recording(options.recording, model.arm, options.coordinates)
-    print_notes(options.recording, recording.notes)
+    model, recording = _model_and_recording(options)
     plots = None if options.plots is None else made_folder(options.plots)
     if options.save:
         check_output(options.model, options.recording, overwrite=True)
@@ -167,9 +173,7 @@ def _predict(options: argparse.Namespace) -> None:
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(options.output, options.recording, options.model, overwrite=options.overwrite)
-    model = dvrk.IdentifiedModel.load(options.model)
-    recording = dvrk.read_recording(options.recording, model.arm, options.coordinates)
-    print_notes(options.recording, recording.notes)
+    model, recording = _model_and_recording(options)
     with ProgressBar("predicting") as bar:
         prediction = dvrk.predict(model, recording, progress=bar)
     print_warnings(make_console(), prediction.warnings)
@@ -182,9 +186,7 @@ def _recalibrate(options: argparse.Namespace) -> None:
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(options.output, options.recording, options.model, overwrite=options.overwrite)
-    model = dvrk.IdentifiedModel.load(options.model)
-    recording = dvrk.read_recording(options.recording, model.arm, options.coordinates)
-    print_notes(options.recording, recording.notes)
+    model, recording = _model_and_recording(options)
     with ProgressBar("recalibrating") as bar:
         result = dvrk.recalibrate(model, recording, progress=bar)
     console = make_console()

@@ -18,7 +18,7 @@ from dvrk_drake.errors import RecordingError
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verb and its options."""
+    """Adds the verbs and their options."""
     verb = verbs.add_parser(
         "check",
         help="say what is wrong with a recording before anything is identified from it; exit code 2: unusable",

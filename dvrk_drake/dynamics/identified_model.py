@@ -112,7 +112,7 @@ class ValidationSummary:
 
 @dataclass(kw_only=True)
 class _Identified:
-    """What a model states of its arm, in its file and in Python."""
+    """Fields that a model file and an `IdentifiedModel` have in common."""
 
     base_parameters: list[BaseParameterEstimate] = field(default_factory=list)
     effects: list[DriveEffect] = field(default_factory=list)
@@ -144,7 +144,9 @@ class ModelFile(_Identified, _Head):
 
 @dataclass(kw_only=True)
 class IdentifiedModel(_Identified):
-    """Parameters that hold an arm: tau = trust o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
+    """Identified parameters of an arm.
+
+    They give its holding torque tau = trust o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
 
     Attributes:
         arm: the arm, mounted as it was when its base parameters were identified.
@@ -239,7 +241,7 @@ class IdentifiedModel(_Identified):
             stream.write(yaml_dump_typed(self._file(_name_for(path, self.arm))))
 
     def to_yaml(self) -> str:
-        """Returns what a model file says, with the arm as `Arm.source`."""
+        """Returns the text of a model file that names the arm by `Arm.source`."""
         return yaml_dump_typed(self._file(self.arm.source))
 
     def _file(self, arm: str) -> ModelFile:
@@ -356,14 +358,14 @@ def _rename_values(content: dict[str, Any]) -> None:
 
 
 def _name_for(path: str | Path, arm: Arm) -> str:
-    """Returns what the model file at `path` names its arm: a URL, or a path relative to the model file."""
+    """Returns the name of the arm in the model file at `path`: a URL, or a path relative to that file."""
     if not os.path.isabs(arm.source):
         return f"{PACKAGE_URL}arms/{arm.source}.yaml"
     return os.path.relpath(arm.source, os.path.dirname(os.path.realpath(path)))
 
 
 def _named_from(path: str | Path, name: str) -> str:
-    """Returns what `load_arm` loads the arm by that the model file at `path` calls `name`."""
+    """Returns the argument of `load_arm` for the arm that the model file at `path` calls `name`."""
     if not name.endswith((".yaml", ".yml")) or name.startswith(PACKAGE_URL):
         return name
     return os.path.join(os.path.dirname(os.path.realpath(path)), name)

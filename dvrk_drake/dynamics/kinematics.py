@@ -30,7 +30,7 @@ def handle_frame(arm: Arm) -> str:
 class ArmFrame:
     """A frame F of an arm with base frame B; poses q are (n,), in the arm's order [rad; m on a prismatic joint].
 
-    It owns a plant and its context, so it is not to be shared between threads.
+    It owns a context of the arm's plant, so threads must not share it.
     """
 
     def __init__(self, arm: Arm, frame_name: str) -> None:

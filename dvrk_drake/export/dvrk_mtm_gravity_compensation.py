@@ -170,11 +170,10 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
     if model.dynamics is None:
         raise ModelError("the model has no dynamics, so it knows no friction; give it with --coulomb")
     arm = model.arm
-    rows = arm.effect_coordinates
     friction = np.zeros(arm.num_joints)
     for effect in model.dynamics.effects:
         if effect.kind in DRY_KINDS:
-            friction += effect.coefficient * np.abs(rows[effect.coordinate] @ arm.transmission.matrix)
+            friction += effect.coefficient * np.abs(joint_row(arm, effect.coordinate))
     return tuple(float(f) for f in friction)
 
 

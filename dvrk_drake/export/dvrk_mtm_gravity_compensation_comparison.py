@@ -95,7 +95,7 @@ class CompensationComparison:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What must be known before the file is used, a line each."""
+        """Warnings about the file, one line each."""
         if not self.other_side:
             return ()
         return (

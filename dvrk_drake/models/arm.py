@@ -68,7 +68,7 @@ class Arm:
         gravity: (3,) gravity vector in the base frame [m/s^2].
         gains: default gains of the controller.
         friction_coordinates: name -> (n,) coefficients of the joints: where parts rub beside joints and actuators.
-        identification: how recordings of the arm are treated, and what its links can be.
+        identification: settings for recordings of the arm, and bounds of its links.
         effects: what the real arm has beside all that; only a simulation that asks for them has them.
 
     Example:
@@ -180,7 +180,7 @@ class Arm:
         return rows | {name: row @ J_inverse for name, row in self.friction_coordinates.items()}
 
     def encoder_counts(self) -> NDArray[np.float64]:
-        """(n,) the most that one encoder count is at each joint [rad, m]; 0 where the arm's effects state none."""
+        """(n,) size of one encoder count at each joint [rad, m]; 0 if the arm's effects state no encoder."""
         resolution = self.effects.encoder.resolution if self.effects.encoder is not None else {}
         return np.abs(self.transmission.inverse.matrix) @ per_actuator(resolution, self.joint_names, 0.0)
 
@@ -266,7 +266,9 @@ def known_arms() -> list[str]:
 
 
 def load_arm(name: str | Path) -> Arm:
-    """Loads an arm; the same file gives the same Arm object until it is changed.
+    """Loads an arm. The same file gives the same Arm object until that file changes.
+
+    A change of the files that it names (mechanism, instrument, SDF) needs a new process.
 
     Args:
         name: of an arm of this package, e.g. "mtml" (case does not matter), or the path or package URL of an arm's YAML

@@ -103,7 +103,7 @@ class BoundingShapes:
 
 @dataclass(kw_only=True)
 class IdentificationSettings(MotionSettings):
-    """How recordings of an arm are treated, and what its links can be.
+    """Settings for recordings of an arm, and bounds of its links.
 
     Attributes:
         effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].

@@ -42,6 +42,8 @@ SAME_POSE = 0.01, 0.001
 class Recording:
     """Positions of an arm with efforts, one row per sample or pose [rad, rad/s, N m, s; m, m/s, N if prismatic].
 
+    Do not change the arrays in place, since conversions are kept: make a new one with `dataclasses.replace`.
+
     Attributes:
         q: (m, n) positions.
         tau: (m, n) efforts that the motors apply, or None.

@@ -20,7 +20,7 @@ TOGETHER = 2
 
 @dataclass(frozen=True, eq=False)
 class EffectChoice:
-    """What was chosen on a motion.
+    """Effects and direction of gravity that fit a motion best.
 
     Attributes:
         problem: with gravity as found.

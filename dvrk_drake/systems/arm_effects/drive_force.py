@@ -1,6 +1,5 @@
-"""All efforts on the plant of a real arm that no solver needs to know: motors, cables, springs, a hand.
-
-And what is measured of the motors.
+"""All efforts on the plant of a real arm that no solver needs to know: motors, cables, springs, a hand;
+and the sensor of the motors' efforts.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 
 
 class Motors:
-    """What the motors make of the efforts that are commanded of the joints.
+    """Conversion of commanded joint efforts to the efforts of the motors.
 
     On the actuators [N m, N]: the command, clamped to the joints' limits, as efforts of the actuators J^-T tau, in
     whole steps of `effort.command_resolution`, and no more than `saturation`.
@@ -33,7 +32,7 @@ class Motors:
     """
 
     def __init__(self, arm: Arm, effects: ArmEffects, effort_limits: NDArray[np.float64]) -> None:
-        """Of `arm`; `effort_limits` (n,) are those of the joints."""
+        """Motors of `arm`, whose joints have `effort_limits` (n,) [N m, N]."""
         names = arm.joint_names
         steps = per_actuator(effects.effort.command_resolution if effects.effort else {}, names, 0.0)
         self.constants = np.array([effort_limits, steps, per_actuator(effects.saturation, names, np.inf)])
@@ -86,7 +85,7 @@ class EffortSensor(LeafSystem):
     """
 
     def __init__(self, arm: Arm, motors: Motors, effort: EffortEffect | None, time_step: float, seed: int) -> None:
-        """Of `arm`, with new noise every `time_step` [s]; `seed` >= 0. Without an `effort` it is exact."""
+        """Sensor of `arm` with new noise every `time_step` [s]; `seed` >= 0. Without an `effort` it is exact."""
         super().__init__()
         effort = effort or EffortEffect()
         names, n = arm.joint_names, arm.num_joints

@@ -153,7 +153,7 @@ class GuardLimits:
         return effort, (clamped != command) * _CLAMPED | (effort != clamped) * _RATE_LIMITED
 
     def wall_effort(self, q: Vector, v: Vector) -> tuple[Vector, Flags]:
-        """What the walls add at q, v, all (n,); joint flags."""
+        """Effort (n,) that the walls add at q, v (n,) [N m, N], and the joint flags."""
         flags = np.zeros(len(q), np.int8)
         c = self.A.dot(q) + self._wall_look_ahead * self.A.dot(v)
         if not is_any(np.abs(c - self._middle) > self._free):
