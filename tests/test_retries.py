@@ -1,4 +1,4 @@
-"""Tests over UDP that fail: watchdogs run again and are counted, all others do not."""
+"""Tests over UDP that fail: watchdogs, and all while the computer stands still, run again and are counted."""
 
 import os
 import re
@@ -17,6 +17,7 @@ import own_network
 from own_network import inside, outside, run_inside, watchdog
 
 own_network.unshare, own_network.NETWORK = lambda: ["env"], "true"
+own_network.STANDSTILL = {standstill}
 
 
 @outside
@@ -45,16 +46,21 @@ def test_watchdog():
 
 
 @pytest.mark.parametrize(
-    ("steady", "late", "passes", "retries", "runs"),
+    ("steady", "late", "standstill", "passes", "retries", "runs"),
     [
-        (0, 1, True, "1 retry", (1, 2)),
-        (0, 100, False, f"{MOST_RETRIES} retries", (1, 1 + MOST_RETRIES)),
-        (1, 1, False, "0 retries", (1, 1)),
+        (0, 1, 1e9, True, "1 retry", (1, 2)),
+        (0, 100, 1e9, False, f"{MOST_RETRIES} retries", (1, 1 + MOST_RETRIES)),
+        (1, 1, 1e9, False, "0 retries", (1, 1)),
+        (1, 1, 0.0, True, "2 retries", (2, 2)),
+        (100, 0, 0.0, False, f"{MOST_RETRIES} retries", (1 + MOST_RETRIES, 1)),
     ],
 )
-def test_only_watchdogs_run_again_and_are_counted(tmp_path, steady, late, passes, retries, runs):
+def test_what_runs_again_and_is_counted(tmp_path, steady, late, standstill, passes, retries, runs):
     path = tmp_path / "test_some_udp.py"
-    path.write_text(FILE.replace("{steady}", str(steady)).replace("{late}", str(late)))
+    text = FILE
+    for name, value in (("steady", steady), ("late", late), ("standstill", standstill)):
+        text = text.replace("{" + name + "}", str(value))
+    path.write_text(text)
     command = [sys.executable, "-m", "pytest", "-c", ROOT / "pyproject.toml", "-p", "own_network"]
     environment = {name: value for name, value in os.environ.items() if name != INSIDE}
     environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # half of the time that pytest takes to start

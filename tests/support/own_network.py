@@ -9,10 +9,14 @@ A test file starts itself again inside a network namespace; the tests of that ru
     @inside
     def test_...
 
-Tests wait for conditions, and pass on a busy computer. The exception is a test of a watchdog by the wall clock: where
-the computer does something else for 10 ms, the watchdog acts late, and the test fails without a defect. Such a test is
-marked `@watchdog`. When it fails, it runs again in a new process. The last line of a run states the number of retries.
-A run with more than `MOST_RETRIES` fails.
+Tests wait for conditions, and pass on a busy computer. There are two exceptions, which run again in a new process:
+
+- A test of a watchdog by the wall clock, marked `@watchdog`: where the computer does something else for 10 ms, the
+  watchdog acts late, and the test fails without a defect.
+- Any test that failed while the computer stood still: a thread that sleeps 10 ms at a time was `STANDSTILL` late. The
+  time limits of the processes under test (no status for 1 s, for example) expire then.
+
+The last line of a run states the number of retries. A run with more than `MOST_RETRIES` fails.
 """
 
 import os
@@ -21,6 +25,8 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -28,7 +34,9 @@ import pytest
 INSIDE = "DVRK_DRAKE_OWN_NETWORK"
 NETWORK = "ip link set lo up && ip link set lo multicast on && ip route add 239.255.0.0/16 dev lo"
 #: Retries in one run of pytest, of all files and tests together.
-MOST_RETRIES = 2
+MOST_RETRIES = 4
+#: A delay of a sleeping thread that only a computer that stands still explains [s].
+STANDSTILL = 0.4
 #: Ends a run inside that hangs [s].
 LONGEST_RUN = 1800
 
@@ -52,17 +60,42 @@ def unshare():
 
 
 def run_inside(request):
-    """Runs the test file of `request` in a network of its own; of what failed, watchdogs run again."""
+    """Runs the test file of `request` in a network of its own; of what failed, some run again (see above)."""
     marks = {name: getattr(test, "pytestmark", []) for name, test in vars(request.module).items()}
     watchdogs = {name for name, its in marks.items() if watchdog.mark in its}
     retries = request.config.stash.setdefault(_RETRIES, [])
     with tempfile.TemporaryDirectory() as memory:
-        while failed := _run(request.path, memory):
-            if {name.partition("[")[0] for name in failed} - watchdogs:
+        while True:
+            with _LongestDelay() as delay:
+                failed = _run(request.path, memory)
+            if not failed:
+                break
+            steady = {name.partition("[")[0] for name in failed} - watchdogs
+            if steady and delay.seconds < STANDSTILL:
                 raise AssertionError(f"failed: {', '.join(failed)}")
             if len(retries) + len(failed) > MOST_RETRIES:
                 raise AssertionError(f"failed: {', '.join(failed)}, after {len(retries)} retries")
             retries += failed
+
+
+class _LongestDelay:
+    """The longest time that a sleeping thread woke up too late during the block: `seconds`."""
+
+    def __enter__(self):
+        self.seconds, self._ended = 0.0, threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+        self._thread.start()
+        return self
+
+    def _watch(self):
+        before = time.monotonic()
+        while not self._ended.wait(0.01):
+            now = time.monotonic()
+            self.seconds, before = max(self.seconds, now - before - 0.01), now
+
+    def __exit__(self, *_):
+        self._ended.set()
+        self._thread.join()
 
 
 def pytest_terminal_summary(terminalreporter, config):
