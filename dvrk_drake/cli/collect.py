@@ -2,41 +2,40 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from dvrk_drake.cli.lcm import add_control, ready_controller
-from dvrk_drake.cli.support import add_key, check_output, interrupt_ends_process, load_key, print_notes, seconds, seed
+from cyclopts import Parameter
+
+from dvrk_drake.cli.app import HARDWARE, Arm, Key, LcmUrl, Seconds, Seed, app, one_of
+from dvrk_drake.cli.lcm import ControlledArm, ready_controller
+from dvrk_drake.cli.support import check_output, interrupt_ends_process, load_key, print_notes, print_written
 from dvrk_drake.errors import CollectionError
 
 if TYPE_CHECKING:
     from dvrk_drake.processes.live_status import LiveLine
 
-
-def add_verbs(verbs: argparse._SubParsersAction) -> None:
-    """Adds the commands and their options."""
-    _add_record(verbs)
-    _add_collect(verbs)
+_TASK = one_of("Task (give one)")
 
 
-def _add_record(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verb and its options."""
-    verb = verbs.add_parser(
-        "record", help="record an arm over LCM; whatever ends it, the file is whole up to its last row"
-    )
-    verb.add_argument("output", metavar="OUTPUT", help="a new file: .csv, or .log for an LCM log")
-    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
-    verb.add_argument(
-        "--duration", type=seconds, default=float("inf"), metavar="S", help="from the first status; default: to Ctrl-C"
-    )
-    verb.add_argument("--lcm-url", default="", metavar="URL", help="default: LCM_DEFAULT_URL, or LCM's own")
-    add_key(verb)
-    verb.set_defaults(run=_record)
+@app.command(group=HARDWARE)
+def record(
+    *,
+    arm: Arm,
+    output: Annotated[str, Parameter(metavar="FILE")],
+    duration: Annotated[Seconds | None, Parameter(metavar="S")] = None,
+    lcm_url: LcmUrl = "",
+    key: Key = None,
+) -> None:
+    """Record an arm over LCM.
 
+    Whatever ends it, the file is whole up to its last row.
 
-def _record(options: argparse.Namespace) -> None:
+    Args:
+        output: A new file: .csv, or .log for an LCM log.
+        duration: From the first status. Without it: to Ctrl-C.
+    """
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.live_status import LiveLine
@@ -44,74 +43,75 @@ def _record(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.recordings.recording_stream import check_stream_output
 
-    arm = load_arm(options.arm)
-    check_stream_output(options.output)
-    url = open_lcm(options.lcm_url).get_lcm_url()
-    recorder = Recorder(arm, options.output, url, load_key(options.key))
+    recorded = load_arm(arm)
+    check_stream_output(output)
+    url = open_lcm(lcm_url).get_lcm_url()
+    recorder = Recorder(recorded, output, url, load_key(key))
     line = LiveLine(sys.stderr)
     stopped = stop_on_signals()
-    print(f"recording {arm.name} on LCM {url}; end with Ctrl-C", flush=True)
+    print(f"recording {recorded.name} on LCM {url}; end with Ctrl-C", flush=True)
     try:
-        recorder.run(options.duration, stopped, line.show)
+        recorder.run(float("inf") if duration is None else duration, stopped, line.show)
     finally:
         line.clear()
-    print(f"{options.output}: {recorder.stream.num_taken} rows", flush=True)
-    print_notes(options.output, recorder.notes())
+    print_written(output, f"{recorder.stream.num_taken} rows")
+    print_notes(output, recorder.notes())
 
 
-def _add_collect(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verb and its options."""
-    verb = verbs.add_parser(
-        "collect", help="collect poses and holding torques of an arm over LCM; the same command again goes on"
-    )
-    add_control(verb)
-    verb.add_argument("--poses", required=True, metavar="POSES.yaml", help="file of the poses")
-    task = verb.add_mutually_exclusive_group(required=True)
-    task.add_argument("--output", metavar="POSES.csv", help="visit the poses, and add a row for each to this file")
-    task.add_argument("--teach", action="store_true", help="add poses to the file that you show by hand, with Enter")
-    task.add_argument("--random", type=int, metavar="N", help="add N random poses to the file")
-    verb.add_argument("--at-rest", action="store_true", help="with --teach: also take where the arm rests for a second")
-    verb.add_argument("--seed", type=seed, default=0, help="of --random; default: 0")
-    verb.add_argument(
-        "--both-sides",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="measure each pose approached from below and from above, and average: cancels dry friction; the default",
-    )
-    verb.add_argument(
-        "--traverse-time", type=seconds, default=5.0, metavar="S", help="to cross a joint's range; default: 5"
-    )
-    verb.set_defaults(run=_collect)
+@app.command(group=HARDWARE)
+def collect(
+    *,
+    controlled: ControlledArm,
+    poses: Annotated[str, Parameter(metavar="POSES.yaml")],
+    output: Annotated[str | None, Parameter(metavar="POSES.csv", group=_TASK)] = None,
+    teach: Annotated[bool, Parameter(show_default=False, group=_TASK)] = False,
+    random: Annotated[int | None, Parameter(metavar="N", group=_TASK)] = None,
+    at_rest: Annotated[bool, Parameter(show_default=False)] = False,
+    seed: Seed = 0,
+    both_sides: Annotated[bool, Parameter(negative="--no-both-sides")] = True,
+    traverse_time: Seconds = 5.0,
+) -> None:
+    """Collect poses and holding torques over LCM.
 
+    After an interruption the same command continues.
 
-def _collect(options: argparse.Namespace) -> None:
-    check_output(options.poses, overwrite=True)
-    if options.random is not None:
-        _add_random_poses(options)
-    elif options.teach:
-        _teach(options)
+    Args:
+        poses: File of the poses.
+        output: Visit the poses, and add a row for each to this file.
+        teach: Add poses to the file that you show by hand, with Enter.
+        random: Add N random poses to the file.
+        at_rest: With --teach: also take poses at which the arm rests for a second.
+        both_sides: Measure each pose approached from below and from above, and average: this cancels dry friction.
+        traverse_time: Time to cross a joint's range [s].
+    """
+    check_output(poses, overwrite=True)
+    if random is not None:
+        _add_random_poses(controlled.arm, poses, random, seed)
+    elif teach:
+        _teach(controlled, poses, at_rest)
     else:
-        _visit(options)
+        assert output is not None
+        _visit(controlled, poses, output, both_sides, traverse_time)
 
 
-def _add_random_poses(options: argparse.Namespace) -> None:
+def _add_random_poses(name: str, path: str, count: int, seed: int) -> None:
     import numpy as np
 
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.recordings.pose_file import load_poses_if_any, save_poses
 
-    if options.random < 1:
-        raise CollectionError(f"--random must be 1 pose or more; got {options.random}")
-    arm = load_arm(options.arm)
-    poses = load_poses_if_any(options.poses, arm)
+    if count < 1:
+        raise CollectionError(f"--random must be 1 pose or more; got {count}")
+    arm = load_arm(name)
+    poses = load_poses_if_any(path, arm)
     # Near its limits an arm's guard pushes back, and there is no room to come from both sides.
-    added = arm.sample_poses(options.random, np.random.default_rng(options.seed), margin=0.1)
+    added = arm.sample_poses(count, np.random.default_rng(seed), margin=0.1)
     poses = np.vstack([poses, added])
-    save_poses(poses, arm, options.poses)
-    print(f"{options.poses}: {len(poses)} poses of {arm.name}")
+    save_poses(poses, arm, path)
+    print_written(path, f"{len(poses)} poses of {arm.name}")
 
 
-def _teach(options: argparse.Namespace) -> None:
+def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine
@@ -119,15 +119,13 @@ def _teach(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.teacher import EnterKey, Teacher
     from dvrk_drake.recordings.pose_file import load_poses_if_any
 
-    load_poses_if_any(options.poses, load_arm(options.arm))  # refused before the arm is asked
+    load_poses_if_any(poses, load_arm(controlled.arm))  # refused before the arm is asked
     with interrupt_ends_process():
-        controller, link, _ = ready_controller(options, "gravity")
+        controller, link, _ = ready_controller(controlled, "gravity")
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
-    teacher = Teacher(
-        controller, options.poses, at_rest=options.at_rest, told=EnterKey(sys.stdin), report=_reporter(line)
-    )
-    when = "Enter, or a second's rest, takes" if options.at_rest else "Enter takes"
+    teacher = Teacher(controller, poses, at_rest=at_rest, told=EnterKey(sys.stdin), report=_reporter(line))
+    when = "Enter, or a second's rest, takes" if at_rest else "Enter takes"
     print(f"the weight of {controller.arm.name} is carried: move it by hand; {when} a pose, Ctrl-C ends", flush=True)
     try:
         control(
@@ -140,10 +138,12 @@ def _teach(options: argparse.Namespace) -> None:
     finally:
         teacher.close()
         line.clear()
-    print(f"{options.poses}: {len(teacher.poses)} poses; {controller.arm.name} holds by itself", flush=True)
+    print_written(poses, f"{len(teacher.poses)} poses; {controller.arm.name} holds by itself")
 
 
-def _visit(options: argparse.Namespace) -> None:
+def _visit(
+    controlled: ControlledArm, poses_file: str, output_file: str, both_sides: bool, traverse_time: float
+) -> None:
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.collector import CollectionSettings, Collector
     from dvrk_drake.processes.control import control
@@ -151,17 +151,17 @@ def _visit(options: argparse.Namespace) -> None:
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
 
-    settings = CollectionSettings(options.traverse_time, options.both_sides)
-    arm = load_arm(options.arm)
-    poses = load_poses(options.poses, arm)
-    check_output(options.output, options.poses, options.model or "", overwrite=True)
-    output = CollectionFile(options.output, arm, options.both_sides)
+    settings = CollectionSettings(traverse_time, both_sides)
+    arm = load_arm(controlled.arm)
+    poses = load_poses(poses_file, arm)
+    check_output(output_file, poses_file, controlled.model or "", overwrite=True)
+    output = CollectionFile(output_file, arm, both_sides)
     num_done = output.finished(poses).sum()
     if num_done == len(poses):
-        print(f"{options.output}: has all {len(poses)} poses already")
+        print(f"{output_file}: has all {len(poses)} poses already")
         return
     with interrupt_ends_process():
-        controller, link, _ = ready_controller(options, "hold")
+        controller, link, _ = ready_controller(controlled, "hold")
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
     collector = Collector(poses, controller, output, settings, stopped=stopped, report=_reporter(line))
@@ -177,7 +177,7 @@ def _visit(options: argparse.Namespace) -> None:
     finally:
         collector.close()
         line.clear()
-        print(f"{options.output}: {collector.done.sum()} of {len(poses)} poses", flush=True)
+        print(f"{output_file}: {collector.done.sum()} of {len(poses)} poses", flush=True)
     if collector.problem is not None:
         raise collector.problem
     if stopped():

@@ -1,77 +1,69 @@
-"""The verbs `demo`, `teleop` and `reproduce`: experiments on simulated arms."""
+"""The commands `demo`, `teleop` and `reproduce`: experiments on simulated arms."""
 
 from __future__ import annotations
 
-import argparse
+from typing import Annotated, Literal
 
-from dvrk_drake.cli.support import (
-    ProgressBar,
-    add_overwrite,
-    check_output,
-    made_folder,
-    quiet_drake,
-    seed,
-)
+from cyclopts import Parameter
 
-NAMES = ("table1", "fig4", "fig5", "fig6", "fig7", "psm", "transparency")
+from dvrk_drake.cli.app import PAPER, SIMULATE, Overwrite, Port, Seed, Verbose, app
+from dvrk_drake.cli.support import Steps, check_output, new_folder, print_written, quiet_drake
+from dvrk_drake.progress import step_progress
+
+Folder = Annotated[str, Parameter(metavar="FOLDER", help="Write into this folder, new or empty.")]
 
 
-def add_verbs(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verbs and their options."""
-    verb = verbs.add_parser("demo", help="simulate an arm, identify it, compensate it, hold it; writes a folder")
-    verb.add_argument("--output", default="demo_output", metavar="DIR", help="default: demo_output")
-    verb.add_argument("--arm", choices=("mtml", "mtmr", "psm"), default="mtml", help="default: mtml")
-    verb.add_argument("--seed", type=seed, default=0, help="of the simulated arm, its poses and noise; default: 0")
-    verb.set_defaults(run=_demo)
+@app.command(group=SIMULATE)
+def demo(
+    *,
+    arm: Literal["mtml", "mtmr", "psm"] = "mtml",
+    folder: Folder = "demo_output",
+    seed: Seed = 0,
+    overwrite: Overwrite = False,
+    verbose: Verbose = False,
+) -> None:
+    """Simulate an arm, identify it, compensate it and hold it.
 
-    verb = verbs.add_parser(
-        "teleop", help="simulate a master arm that leads a PSM, with your hand on sliders or a played one"
-    )
-    verb.add_argument(
-        "--html", metavar="FILE", help="play a hand, write the recording and say how well the PSM followed"
-    )
-    add_overwrite(verb)
-    verb.add_argument("--port", type=int, help="of the page; default: a free one")
-    verb.set_defaults(run=_teleop)
-
-    verb = verbs.add_parser(
-        "reproduce", help="redo the paper's figures and tables beside its published numbers; writes a folder"
-    )
-    verb.add_argument("what", nargs="?", choices=(*NAMES, "all"), default="all", help="default: all")
-    verb.add_argument("--output", default="reproduction", metavar="DIR", help="default: reproduction")
-    verb.add_argument(
-        "--data",
-        metavar="DIR",
-        help="folder with the paper's recording mtm_2015_good72.csv (docs/reproduction.md); default: "
-        "$DVRK_DRAKE_SHARED/data/mtm_static; without it Fig. 4 cannot be made and others have another arm",
-    )
-    verb.add_argument("--seed", type=seed, default=0, help="of simulated arms, poses and noise; default: 0")
-    verb.set_defaults(run=_reproduce)
-
-
-def _demo(options: argparse.Namespace) -> None:
+    Args:
+        arm: The arm to simulate.
+    """
     from dvrk_drake.experiments.demo.demo import run_demo
     from dvrk_drake.reports.figures import plot_demo
-    from dvrk_drake.reports.terminal_tables import make_console, print_demo
+    from dvrk_drake.reports.simulation import print_demo
+    from dvrk_drake.reports.terminal_tables import make_console
 
     quiet_drake()
-    output = made_folder(options.output)
-    with ProgressBar("") as bar:
-        result = run_demo(output, options.arm, options.seed, bar)
-        bar("drawing", 0.0)
+    output = new_folder(folder, overwrite=overwrite)
+    with Steps() as steps:
+        result = run_demo(output, arm, seed, steps)
+        steps("drawing", 0.0)
         plot_demo(output, result)
-        bar("drawing", 1.0)
-    print_demo(make_console(), result, output)
+    print_demo(make_console(), result, output, verbose=verbose)
 
 
-def _teleop(options: argparse.Namespace) -> None:
+@app.command(group=SIMULATE)
+def teleop(
+    *,
+    output: Annotated[str | None, Parameter(metavar="FILE.html")] = None,
+    overwrite: Overwrite = False,
+    port: Port = None,
+    verbose: Verbose = False,
+) -> None:
+    """Simulate a master arm that leads a PSM.
+
+    Your hand is on sliders in a browser, or a recorded hand is played.
+
+    Args:
+        output: Play a hand, write the scene as a page, and say how well the PSM followed.
+    """
     from dvrk_drake.experiments.demo.teleoperation import play_teleoperation, run_live_teleoperation, start_scene
     from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.reports.terminal_tables import make_console, print_teleoperation
+    from dvrk_drake.reports.simulation import print_teleoperation
+    from dvrk_drake.reports.terminal_tables import make_console
 
     quiet_drake()
-    if options.html is None:
-        meshcat = start_scene(options.port)
+    if output is None:
+        meshcat = start_scene(port)
         print(
             f"MTML leads PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale under Open Controls; the "
             "arms appear after some seconds; end with Stop, Escape or Ctrl-C",
@@ -79,25 +71,45 @@ def _teleop(options: argparse.Namespace) -> None:
         )
         run_live_teleoperation(meshcat)
         return
-    check_output(options.html, overwrite=options.overwrite)
-    meshcat = start_scene(options.port)
-    with ProgressBar("playing") as bar:
-        result = play_teleoperation(meshcat, progress=bar.share)
-    with atomic_write(options.html) as stream:
+    check_output(output, overwrite=overwrite)
+    meshcat = start_scene(port)
+    with Steps("playing") as steps:
+        result = play_teleoperation(meshcat, progress=step_progress(steps, "playing"))
+    with atomic_write(output) as stream:
         stream.write(meshcat.StaticHtml())
-    print_teleoperation(make_console(), result, options.html)
+    print_teleoperation(make_console(), result, output, verbose=verbose)
+    print_written(output)
 
 
-def _reproduce(options: argparse.Namespace) -> None:
+@app.command(group=PAPER)
+def reproduce(
+    what: Literal["table1", "fig4", "fig5", "fig6", "fig7", "psm", "transparency", "all"] = "all",
+    /,
+    *,
+    folder: Folder = "reproduction",
+    data: Annotated[str | None, Parameter(metavar="FOLDER")] = None,
+    seed: Seed = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Redo the figures and tables of the paper.
+
+    The page has the published numbers beside ours.
+
+    Args:
+        what: What to redo.
+        data: Folder with the paper's recording mtm_2015_good72.csv (docs/reproduction.md). Without it:
+            $DVRK_DRAKE_SHARED/data/mtm_static. Without that, Fig. 4 is left out, and the others have another arm.
+    """
     from dvrk_drake.experiments.reproduction.published import PaperRecordings
-    from dvrk_drake.reports.reproduction.run import reproduce
+    from dvrk_drake.reports.reproduction.run import NAMES
+    from dvrk_drake.reports.reproduction.run import reproduce as reproduce_paper
 
     quiet_drake()
-    recordings = PaperRecordings.find(options.data)
-    if options.what == "fig4":
+    recordings = PaperRecordings.find(data)
+    if what == "fig4":
         _ = recordings.poses  # refuses before a folder is made
-    output = made_folder(options.output)
-    names = NAMES if options.what == "all" else (options.what,)
-    with ProgressBar("") as bar:
-        page = reproduce(names, output, recordings, bar, seed=options.seed)
-    print(f"written: {page}")
+    output = new_folder(folder, overwrite=overwrite)
+    names = NAMES if what == "all" else (what,)
+    with Steps(*names) as steps:
+        page = reproduce_paper(names, output, recordings, steps, seed=seed)
+    print_written(page)

@@ -1,124 +1,145 @@
-"""The verbs that hand a model to other programs, and that judge what the dVRK's controller has installed."""
+"""The commands that hand a model to other programs, and judge what the dVRK's controller has installed."""
 
 from __future__ import annotations
 
-import argparse
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
-from dvrk_drake.cli.support import add_overwrite, check_output, load_model, write_json
+from cyclopts import Group, Parameter
+
+from dvrk_drake.cli.app import MODEL, Arm, Json, Model, Overwrite, Plots, Verbose, app, one_of
+from dvrk_drake.cli.support import check_output, load_model, plots_folder, print_written, write_json
 from dvrk_drake.errors import DvrkDrakeError, ModelError
 
 if TYPE_CHECKING:
     from dvrk_drake.export.model_export import Format
 
-
-def add_verbs(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verbs and their options."""
-    verb = verbs.add_parser(
-        "export", help="write a model for other programs: SDF, URDF, dVRK", description=_export_help
-    )
-    verb.add_argument("model", metavar="MODEL", help=_model_help)
-    verb.add_argument(
-        "--sdf", metavar="OUT.sdf", help="the arm with the model's inertias, meshes in a folder beside it"
-    )
-    verb.add_argument("--urdf", metavar="OUT.urdf", help="the same as URDF, the linkage as mimic joints")
-    verb.add_argument("--diff", action="store_true", help="print what differs from the arm's own SDF, line by line")
-    verb.add_argument("--dvrk-gc", metavar="OUT.json", help=_gc_help)
-    verb.add_argument("--dvrk-kinematic-gc", metavar="OUT.json", help="the controller's gravity compensation of a PSM")
-    add_overwrite(verb)
-    _add_gc_options(verb.add_argument_group("options of --dvrk-gc (the first also of --dvrk-kinematic-gc)"))
-    verb.set_defaults(run=_export)
-
-    verb = verbs.add_parser(
-        "compare-gc",
-        help="compare an installed gravity-compensation file of the dVRK with a model",
-        description="Compares a gc-*.json of the dVRK's controller with a model over the whole joint box, at rest.",
-    )
-    verb.add_argument("file", metavar="GC.json")
-    verb.add_argument("--model", required=True, metavar="MODEL", help=_model_help)
-    verb.add_argument("--plot", metavar="OUT.png", help="draw both over the joint box")
-    verb.add_argument("--json", metavar="FILE", help="write the table as JSON")
-    add_overwrite(verb)
-    verb.set_defaults(run=_compare)
+_SOURCE = one_of("Source (give one)")
+_GRAVITY_COMPENSATION = Group("Options of --dvrk-gc (--gc-tolerance also of --dvrk-kinematic-gc)")
+SourceArm = Annotated[Arm | None, Parameter(group=_SOURCE, help="What the SDF of this arm states.")]
+SourceModel = Annotated[Model | None, Parameter(group=_SOURCE)]
+OfEachJoint = Annotated[
+    tuple[float, float, float, float, float, float, float] | None,
+    Parameter(metavar="J1 .. J7", group=_GRAVITY_COMPENSATION),
+]
 
 
-def _add_gc_options(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--gc-tolerance", type=float, metavar="NM", help=_tolerance_help)
-    group.add_argument("--friction", action="store_true", help="compensate the dry friction of the model's dynamics")
-    for name, text in (
-        ("--coulomb", "dry friction of the joints [N m], instead of --friction; default: none"),
-        ("--friction-ratio", "share 0..1 of it to compensate; default: as in files in use"),
-        ("--dead-band", "speeds up to which it is not [rad/s]; default: likewise"),
-        ("--saturation", "speeds from which it is in full [rad/s]; default: likewise"),
-    ):
-        group.add_argument(name, nargs=7, type=float, metavar=tuple(f"J{i}" for i in range(1, 8)), help=text)
+@app.command(group=MODEL)
+def export(
+    *,
+    model: SourceModel = None,
+    arm: SourceArm = None,
+    sdf: Annotated[str | None, Parameter(metavar="FILE.sdf")] = None,
+    urdf: Annotated[str | None, Parameter(metavar="FILE.urdf")] = None,
+    dvrk_gc: Annotated[str | None, Parameter(metavar="FILE.json")] = None,
+    dvrk_kinematic_gc: Annotated[str | None, Parameter(metavar="FILE.json")] = None,
+    diff: Annotated[bool, Parameter(show_default=False)] = False,
+    overwrite: Overwrite = False,
+    verbose: Verbose = False,
+    gc_tolerance: Annotated[float | None, Parameter(metavar="NM", group=_GRAVITY_COMPENSATION)] = None,
+    friction: Annotated[bool, Parameter(show_default=False, group=_GRAVITY_COMPENSATION)] = False,
+    coulomb: OfEachJoint = None,
+    friction_ratio: OfEachJoint = None,
+    dead_band: OfEachJoint = None,
+    saturation: OfEachJoint = None,
+) -> None:
+    """Write a model as SDF, URDF or files of the dVRK.
 
+    Several files can be written at once.
 
-def _export(options: argparse.Namespace) -> None:
+    Args:
+        sdf: The arm with the model's inertias, meshes in a folder beside it.
+        urdf: The same as URDF, the linkage as mimic joints.
+        dvrk_gc: The controller's gravity compensation of an MTM. With --arm, whose masses are estimates, only with
+            --gc-tolerance: identify your arm first.
+        dvrk_kinematic_gc: The controller's gravity compensation of a PSM.
+        diff: Print what differs from the arm's own SDF, line by line.
+        gc_tolerance: Accepted error [N m] where the file cannot hold what the model says. Without it: 1e-6.
+        friction: Compensate the dry friction of the model's dynamics.
+        coulomb: Dry friction of the joints [N m], instead of --friction.
+        friction_ratio: Share 0..1 of the friction to compensate. Without it: as in files in use.
+        dead_band: Speeds [rad/s] up to which friction is not compensated. Without it: as in files in use.
+        saturation: Speeds [rad/s] from which friction is compensated in full. Without it: as in files in use.
+    """
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.export.model_export import prepare_export
     from dvrk_drake.export.sdf import sdf_difference
     from dvrk_drake.reports.export import print_export
     from dvrk_drake.reports.terminal_tables import make_console
 
-    formats: tuple[Format, ...] = ("sdf", "urdf", "dvrk-gc", "dvrk-kinematic-gc")
-    named = [(format, getattr(options, format.replace("-", "_"))) for format in formats]
-    outputs = [(format, path) for format, path in named if path is not None]
-    if not outputs and not options.diff:
-        raise DvrkDrakeError(f"nothing to write; name {' or '.join('--' + format for format in formats)}")
-    if options.friction and options.coulomb is not None:
+    named: dict[Format, str | None] = {
+        "sdf": sdf,
+        "urdf": urdf,
+        "dvrk-gc": dvrk_gc,
+        "dvrk-kinematic-gc": dvrk_kinematic_gc,
+    }
+    outputs = {format: path for format, path in named.items() if path is not None}
+    if not outputs and not diff:
+        raise DvrkDrakeError(f"nothing to write; give {' or '.join('--' + format for format in named)}")
+    if friction and coulomb is not None:
         raise DvrkDrakeError("--friction and --coulomb both say how large friction is; give one")
-    model = load_model(options.model)
-    for _, path in outputs:
-        check_output(path, options.model, overwrite=options.overwrite)
-    settings = {
-        "tolerance": options.gc_tolerance,
-        "friction": options.friction if options.coulomb is None else options.coulomb,
-        "friction_ratio": options.friction_ratio,
-        "dead_band": options.dead_band,
-        "saturation": options.saturation,
+    loaded = load_model(model, arm)
+    for path in outputs.values():
+        check_output(path, model or "", overwrite=overwrite)
+    settings: dict[str, Any] = {
+        "tolerance": gc_tolerance,
+        "friction": friction if coulomb is None else coulomb,
+        "friction_ratio": friction_ratio,
+        "dead_band": dead_band,
+        "saturation": saturation,
     }
     # All are computed before the first is written: one that is refused leaves no other behind.
-    exports = [prepare_export(model, format, origin=options.model, **settings) for format, _ in outputs]
-    for (_, path), export in zip(outputs, exports, strict=True):
-        export.write(path)
-        print_export(make_console(), path, export)
-    if options.diff:
-        bodies = model_bodies(model)
-        sys.stdout.write(sdf_difference(model.arm, bodies.links, bodies.rotors))
+    origin = model or arm or ""
+    exports = {format: prepare_export(loaded, format, origin=origin, **settings) for format in outputs}
+    for format, path in outputs.items():
+        exports[format].write(path)
+        print_export(make_console(), path, exports[format], verbose=verbose)
+    if diff:
+        bodies = model_bodies(loaded)
+        sys.stdout.write(sdf_difference(loaded.arm, bodies.links, bodies.rotors))
 
 
-def _compare(options: argparse.Namespace) -> None:
+@app.command(group=MODEL)
+def compare_gc(
+    file: str,
+    /,
+    *,
+    model: SourceModel = None,
+    arm: SourceArm = None,
+    json: Json = None,
+    plots: Plots = None,
+    overwrite: Overwrite = False,
+    verbose: Verbose = False,
+) -> None:
+    """Compare a gravity-compensation file of the dVRK with a model.
+
+    The comparison is at rest, over the whole joint box.
+
+    Args:
+        file: The gc-*.json of the dVRK's controller.
+    """
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-    from dvrk_drake.reports.export import plot_compensation, print_comparison
+    from dvrk_drake.reports.export import print_comparison
     from dvrk_drake.reports.terminal_tables import make_console
 
-    for path in (options.plot, options.json):
-        if path is not None:
-            check_output(path, options.file, options.model, overwrite=options.overwrite)
-    file = GravityCompensationFile.load(options.file)
-    model = load_model(options.model)
+    if json is not None:
+        check_output(json, file, model or "", overwrite=overwrite)
+    folder = plots_folder(plots, overwrite=overwrite)
+    installed = GravityCompensationFile.load(file)
+    loaded, origin = load_model(model, arm), model or arm or ""
     try:
-        comparison = compare_compensation(file, model)
+        comparison = compare_compensation(installed, loaded)
     except ModelError as error:
-        raise ModelError(f"{options.file}: {error}") from error
-    console = make_console()
-    print_comparison(console, options.file, options.model, comparison)
+        raise ModelError(f"{file}: {error}") from error
+    print_comparison(make_console(), file, origin, comparison, verbose=verbose)
     for warning in comparison.warnings:
-        print(f"dvrk-drake: warning: {options.file}: {warning}", file=sys.stderr, flush=True)
-    if options.plot is not None:
-        plot_compensation(options.plot, comparison, f"{options.file} and {options.model} over the joint box, at rest")
-        console.print(f"plot: {options.plot}", soft_wrap=True)
-    if options.json is not None:
-        write_json(options.json, comparison.as_dict())
+        print(f"dvrk-drake: warning: {file}: {warning}", file=sys.stderr, flush=True)
+    if folder is not None:
+        from dvrk_drake.reports.export import plot_compensation
 
-
-_export_help = "Writes a model for other programs; several files at once if several are named."
-_model_help = "MODEL.yaml, from identify; or mtml, mtmr, psm, an arm's YAML file: what the SDF of that arm states"
-_gc_help = (
-    "the controller's gravity compensation of an MTM; from mtml or mtmr, whose masses are estimates, only with "
-    "--gc-tolerance: identify your arm first"
-)
-_tolerance_help = "error [N m] to accept where the file cannot hold what the model says; default: 1e-6"
+        plot_compensation(folder / "compensation.png", comparison, f"{file} and {origin} over the joint box, at rest")
+        print_written(folder)
+    if json is not None:
+        write_json(json, comparison.as_dict())
+        print_written(json)

@@ -1,223 +1,263 @@
-"""The verbs that learn from recordings and put to the test what was learnt."""
+"""The commands that identify models from recordings and test them."""
 
 from __future__ import annotations
 
-import argparse
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
 
 import dvrk_drake as dvrk
+from dvrk_drake.cli.app import (
+    IDENTIFY,
+    Arm,
+    Coordinates,
+    Gravity,
+    Json,
+    Model,
+    Overwrite,
+    Plots,
+    Verbose,
+    app,
+    one_of,
+)
 from dvrk_drake.cli.support import (
-    ProgressBar,
-    add_gravity,
-    add_overwrite,
-    add_recording,
+    Steps,
     check_output,
-    made_folder,
     mounted,
+    plots_folder,
     print_notes,
     print_warnings,
+    print_written,
     write_json,
-    write_tables,
 )
 from dvrk_drake.errors import ModelError
 
-
-def add_verbs(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verbs and their options."""
-    verb = verbs.add_parser(
-        "identify",
-        help="identify a model: of a motion the full dynamics, of poses what holds the arm",
-    )
-    add_recording(verb)
-    verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, psm, or a YAML file")
-    verb.add_argument("--output", required=True, metavar="MODEL.yaml", help="the model file to write")
-    verb.add_argument("--method", choices=("robust", "paper"), default="robust", help="for poses; default: robust")
-    verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
-    verb.add_argument("--tables", metavar="FILE.txt", help="write all parameters with their standard errors as text")
-    add_overwrite(verb)
-    verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
-    add_gravity(verb)
-    verb.set_defaults(run=_identify)
-
-    verb = verbs.add_parser("validate", help="compare a model with a recording that it was not made from")
-    verb.add_argument("model", metavar="MODEL.yaml")
-    add_recording(verb)
-    verb.add_argument(
-        "--require",
-        choices=("good", "usable"),
-        help="exit code 2 unless every joint that the model commands has this verdict or a better one",
-    )
-    verb.add_argument("--save", action="store_true", help="store the verdicts in MODEL.yaml, where run looks for them")
-    verb.add_argument("--json", metavar="FILE", help="write verdicts and errors as JSON")
-    add_overwrite(verb)
-    verb.add_argument("--slow-parts", action="store_true", help=_slow_parts_help)
-    verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
-    verb.set_defaults(run=_validate)
-
-    verb = verbs.add_parser(
-        "predict",
-        help="write a model's efforts at a recording's rows: of a motion behind its low-pass, of poses what holds them",
-    )
-    verb.add_argument("model", metavar="MODEL.yaml")
-    add_recording(verb)
-    verb.add_argument("--output", required=True, metavar="FILE.csv", help="columns tau1.., one row a row")
-    add_overwrite(verb)
-    verb.set_defaults(run=_predict)
-
-    verb = verbs.add_parser(
-        "recalibrate",
-        help="refit a model's friction and offsets to a short motion of another day",
-        description="Refit a model's friction and offsets to a short motion of another day. The gain is for motions "
-        "like that one; at other positions and speeds it can be much smaller (docs/payload.md).",
-    )
-    verb.add_argument("model", metavar="MODEL.yaml", help="a model that was identified from a motion")
-    add_recording(verb)
-    verb.add_argument("--output", required=True, metavar="NEW.yaml", help="the model file to write")
-    add_overwrite(verb)
-    verb.set_defaults(run=_recalibrate)
-
-    verb = verbs.add_parser("payload", help="say what was added to an arm between two recordings of one motion")
-    verb.add_argument("reference", metavar="REFERENCE", help="recording of the motion without the payload")
-    verb.add_argument("loaded", metavar="LOADED", help="recording of the same motion with it")
-    source = verb.add_mutually_exclusive_group(required=True)
-    source.add_argument(
-        "--arm", help="the arm: mtml, mtmr, psm, or a YAML file; its model is identified from REFERENCE"
-    )
-    source.add_argument("--model", metavar="MODEL.yaml", help="its model, identified from a motion")
-    verb.add_argument("--link", help="link of the SDF that carries it, compared with all others; default: the best")
-    verb.add_argument(
-        "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
-    )
-    verb.add_argument("--json", metavar="FILE", help="write the estimates as JSON")
-    add_overwrite(verb)
-    add_gravity(verb)
-    verb.set_defaults(run=_payload)
+Recording = Annotated[str, Parameter(help="CSV with header q1..qn, tau1..taun (t, qd1..qdn optional), or an LCM log.")]
+NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="The model file to write.")]
+SlowParts = Annotated[
+    bool, Parameter(show_default=False, help="Of a motion without rests: take its low-speed segments as poses.")
+]
+_STEPS = "reading", "checking the recording"
+_SOURCE = one_of("Source of the model (give one)")
 
 
-def _identify(options: argparse.Namespace) -> None:
-    from dvrk_drake.reports.identification import plot_identification, print_identification
+@app.command(group=IDENTIFY)
+def identify(
+    recording: Recording,
+    /,
+    *,
+    arm: Arm,
+    output: NewModel,
+    coordinates: Coordinates = "joint",
+    method: Literal["robust", "paper"] = "robust",
+    slow_parts: SlowParts = False,
+    gravity: Gravity = None,
+    plots: Plots = None,
+    overwrite: Overwrite = False,
+    verbose: Verbose = False,
+) -> None:
+    """Identify a model from a recording.
+
+    A motion gives the full dynamics, static poses give the gravity torque.
+
+    Args:
+        method: For poses: robust, or the least squares of the paper.
+    """
+    from dvrk_drake.reports.identification import print_identification
     from dvrk_drake.reports.terminal_tables import make_console
 
-    check_output(options.output, options.recording, overwrite=options.overwrite)
-    if options.tables is not None:
-        check_output(options.tables, options.recording, options.output, overwrite=options.overwrite)
-    arm = mounted(dvrk.load_arm(options.arm), options.gravity)
-    recording = dvrk.read_recording(options.recording, arm, options.coordinates)
-    print_notes(options.recording, recording.notes)
-    plots = None if options.plots is None else made_folder(options.plots)
-    with ProgressBar("identifying") as bar:
-        result = dvrk.identify(recording, arm, method=options.method, slow_parts=options.slow_parts, progress=bar)
+    check_output(output, recording, overwrite=overwrite)
+    recorded_arm = mounted(dvrk.load_arm(arm), gravity)
+    folder = plots_folder(plots, overwrite=overwrite)
+    with Steps(*_STEPS, "identifying") as steps:
+        read = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
+        print_notes(recording, read.notes)
+        result = dvrk.identify(read, recorded_arm, method=method, slow_parts=slow_parts, progress=steps)
     console = make_console()
-    print_warnings(console, result.warnings)
+    print_identification(console, result, verbose=verbose)
     if result.note:
         console.print(result.note)
-    print_identification(console, result)
-    result.save(options.output, overwrite=True)
-    console.print(f"model: {options.output}")
-    if options.tables is not None:
-        write_tables(options.tables, lambda file: print_identification(file, result, full=True))
-        console.print(f"all parameters: {options.tables}")
-    if plots is not None:
-        plot_identification(plots, result)
-        console.print(f"plots: {options.plots}")
+    print_warnings(console, result.warnings)
+    result.save(output, overwrite=True)
+    print_written(output)
+    if folder is not None:
+        from dvrk_drake.reports.identification import plot_identification
+
+        plot_identification(folder, result)
+        print_written(folder)
 
 
-def _model_and_recording(options: argparse.Namespace) -> tuple[dvrk.IdentifiedModel, dvrk.Recording]:
+def _model_and_recording(
+    model: str, recording: str, coordinates: Literal["joint", "actuator"], steps: Steps
+) -> tuple[dvrk.IdentifiedModel, dvrk.Recording]:
     """Reads a model and a recording of its arm, and prints the notes on the recording."""
-    model = dvrk.IdentifiedModel.load(options.model)
-    recording = dvrk.read_recording(options.recording, model.arm, options.coordinates)
-    print_notes(options.recording, recording.notes)
-    return model, recording
+    loaded = dvrk.IdentifiedModel.load(model)
+    read = dvrk.read_recording(recording, loaded.arm, coordinates, progress=steps)
+    print_notes(recording, read.notes)
+    return loaded, read
 
 
-def _validate(options: argparse.Namespace) -> None:
-    from dvrk_drake.reports.identification import plot_validation, print_validation
+@app.command(group=IDENTIFY)
+def validate(
+    recording: Recording,
+    /,
+    *,
+    model: Model,
+    coordinates: Coordinates = "joint",
+    require: Literal["good", "usable"] | None = None,
+    save: Annotated[bool, Parameter(show_default=False)] = False,
+    slow_parts: SlowParts = False,
+    json: Json = None,
+    plots: Plots = None,
+    overwrite: Overwrite = False,
+    verbose: Verbose = False,
+) -> None:
+    """Compare a model with another recording.
+
+    Args:
+        require: Exit code 2 unless every joint that the model commands has this verdict or a better one.
+        save: Store the verdicts in the model file, where run looks for them.
+    """
+    from dvrk_drake.reports.identification import print_validation
     from dvrk_drake.reports.terminal_tables import make_console
 
-    if options.json is not None:
-        check_output(options.json, options.recording, options.model, overwrite=options.overwrite)
-    model, recording = _model_and_recording(options)
-    plots = None if options.plots is None else made_folder(options.plots)
-    if options.save:
-        check_output(options.model, options.recording, overwrite=True)
-        if recording.sha256 and recording.sha256 == model.provenance.sha256:
-            raise ModelError(f"{recording.source}: --save needs a recording that the model was not identified from")
-        if model.validation is not None and not options.overwrite:
-            saved = model.validation.recording
-            raise ModelError(f"{options.model}: has verdicts from {saved} already; replace them with --overwrite")
-    with ProgressBar("validating") as bar:
-        validation = dvrk.validate(model, recording, slow_parts=options.slow_parts, progress=bar)
+    if json is not None:
+        check_output(json, recording, model, overwrite=overwrite)
+    with Steps(*_STEPS, "validating") as steps:
+        loaded, read = _model_and_recording(model, recording, coordinates, steps)
+        folder = plots_folder(plots, overwrite=overwrite)
+        if save:
+            check_output(model, recording, overwrite=True)
+            if read.sha256 and read.sha256 == loaded.provenance.sha256:
+                raise ModelError(f"{read.source}: --save needs a recording that the model was not identified from")
+            if loaded.validation is not None and not overwrite:
+                saved = loaded.validation.recording
+                raise ModelError(f"{model}: has verdicts from {saved} already; replace them with --overwrite")
+        validation = dvrk.validate(loaded, read, slow_parts=slow_parts, progress=steps)
     # Before anything is printed: whoever reads the output may close it (head).
-    if options.save:
-        validation.save(options.model, overwrite=True)
-    if options.json is not None:
-        write_json(options.json, validation.as_dict())
+    if save:
+        validation.save(model, overwrite=True)
+    if json is not None:
+        write_json(json, validation.as_dict())
     console = make_console()
-    print_validation(console, validation)
-    if plots is not None:
-        plot_validation(plots, validation)
-        console.print(f"plots: {options.plots}")
+    print_validation(console, validation, verbose=verbose)
     if validation.note:
         console.print(validation.note)
     print_warnings(console, validation.warnings)
-    if options.save:
-        console.print(f"verdicts saved: {options.model}")
-    if options.require is not None and (failed := validation.unfit(options.require)):
+    if folder is not None:
+        from dvrk_drake.reports.identification import plot_validation
+
+        plot_validation(folder, validation)
+        print_written(folder)
+    if json is not None:
+        print_written(json)
+    if save:
+        print_written(model, "with the verdicts")
+    if require is not None and (failed := validation.unfit(require)):
         raise ModelError(
-            f"{options.model}: not {options.require} on {recording.source}: {', '.join(failed)}; identify from a "
-            "recording with more varied poses, or recalibrate"
+            f"{model}: not {require} on {read.source}: {', '.join(failed)}; identify from a recording with more varied "
+            "poses, or recalibrate"
         )
 
 
-def _predict(options: argparse.Namespace) -> None:
+@app.command(group=IDENTIFY)
+def predict(
+    recording: Recording,
+    /,
+    *,
+    model: Model,
+    output: Annotated[str, Parameter(metavar="FILE.csv")],
+    coordinates: Coordinates = "joint",
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a model's efforts for a recording.
+
+    Of a motion after the model's low-pass, of poses at rest.
+
+    Args:
+        output: The CSV to write: columns tau1..taun.
+    """
     from dvrk_drake.recordings.recording import write_csv
     from dvrk_drake.reports.terminal_tables import make_console
 
-    check_output(options.output, options.recording, options.model, overwrite=options.overwrite)
-    model, recording = _model_and_recording(options)
-    with ProgressBar("predicting") as bar:
-        prediction = dvrk.predict(model, recording, progress=bar)
+    check_output(output, recording, model, overwrite=overwrite)
+    with Steps(*_STEPS, "predicting") as steps:
+        prediction = dvrk.predict(*_model_and_recording(model, recording, coordinates, steps), progress=steps)
     print_warnings(make_console(), prediction.warnings)
     tau = prediction.tau
-    write_csv(options.output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
+    write_csv(output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
+    print_written(output, f"{len(tau)} rows")
 
 
-def _recalibrate(options: argparse.Namespace) -> None:
+@app.command(group=IDENTIFY)
+def recalibrate(
+    recording: Recording,
+    /,
+    *,
+    model: Model,
+    output: NewModel,
+    coordinates: Coordinates = "joint",
+    overwrite: Overwrite = False,
+    verbose: Verbose = False,
+) -> None:
+    """Refit friction and offsets to a short motion of another day.
+
+    The gain is for motions like that one; at other positions and speeds it can be much smaller (docs/payload.md).
+    """
     from dvrk_drake.reports.identification import print_recalibration
     from dvrk_drake.reports.terminal_tables import make_console
 
-    check_output(options.output, options.recording, options.model, overwrite=options.overwrite)
-    model, recording = _model_and_recording(options)
-    with ProgressBar("recalibrating") as bar:
-        result = dvrk.recalibrate(model, recording, progress=bar)
-    console = make_console()
-    print_recalibration(console, result)
-    result.save(options.output, overwrite=True)
-    console.print(f"model: {options.output}")
+    check_output(output, recording, model, overwrite=overwrite)
+    with Steps(*_STEPS, "refitting friction") as steps:
+        result = dvrk.recalibrate(*_model_and_recording(model, recording, coordinates, steps), progress=steps)
+    print_recalibration(make_console(), result, verbose=verbose)
+    result.save(output, overwrite=True)
+    print_written(output)
 
 
-def _payload(options: argparse.Namespace) -> None:
-    from dvrk_drake.reports.payload import print_links, print_payload
+@app.command(group=IDENTIFY)
+def payload(
+    reference: str,
+    loaded: str,
+    /,
+    *,
+    arm: Annotated[Arm | None, Parameter(group=_SOURCE, help="Its model is identified from REFERENCE.")] = None,
+    model: Annotated[Model | None, Parameter(group=_SOURCE, help="Identified from a motion.")] = None,
+    link: Annotated[str | None, Parameter(metavar="NAME")] = None,
+    coordinates: Coordinates = "joint",
+    gravity: Gravity = None,
+    json: Json = None,
+    overwrite: Overwrite = False,
+    verbose: Verbose = False,
+) -> None:
+    """Estimate the mass that an arm carries.
+
+    It was added between two recordings of one motion.
+
+    Args:
+        reference: Recording of the motion without the payload.
+        loaded: Recording of the same motion with it.
+        link: Link of the SDF that carries it, compared with all others. Without it: the one that fits best.
+    """
+    from dvrk_drake.reports.payload import print_payload
     from dvrk_drake.reports.terminal_tables import make_console
 
-    model = None if options.model is None else dvrk.IdentifiedModel.load(options.model)
-    if model is not None and options.gravity is not None:
-        raise ModelError(f"{options.model}: states its gravity; --gravity is for --arm")
-    arm = mounted(dvrk.load_arm(options.arm), options.gravity) if model is None else model.arm
-    if options.json is not None:
-        check_output(options.json, options.reference, options.loaded, overwrite=options.overwrite)
-    reference, loaded = (dvrk.read_recording(p, arm, options.coordinates) for p in (options.reference, options.loaded))
-    for recording in (reference, loaded):
-        print_notes(recording.source, recording.notes)
-    with ProgressBar("estimating") as bar:
-        result = dvrk.payload(reference, loaded, model or arm, options.link, progress=bar)
+    if model is not None and gravity is not None:
+        raise ModelError(f"{model}: states its gravity; --gravity is for --arm")
+    if json is not None:
+        check_output(json, reference, loaded, overwrite=overwrite)
+    known = None if model is None else dvrk.IdentifiedModel.load(model)
+    recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity) if known is None else known.arm
+    with Steps(*_STEPS, *(["identifying"] if known is None else []), "estimating") as steps:
+        without, with_it = (
+            dvrk.read_recording(p, recorded_arm, coordinates, progress=steps) for p in (reference, loaded)
+        )
+        for recording in (without, with_it):
+            print_notes(recording.source, recording.notes)
+        result = dvrk.payload(without, with_it, known or recorded_arm, link, progress=steps)
     console = make_console()
-    other_link = [warning for warning in result.warnings if warning.kind == "other link"]
-    if options.link is None or other_link:
-        print_links(console, result.estimates)
-    print_warnings(console, other_link)
-    print_payload(console, result.payload, result.estimates)
-    if options.json is not None:
-        write_json(options.json, result.as_dicts())
-
-
-_slow_parts_help = "of a motion without rests, take where a joint is slow as poses"
+    print_payload(console, result, verbose=verbose)
+    print_warnings(console, [warning for warning in result.warnings if warning.kind == "other link"])
+    if json is not None:
+        write_json(json, result.as_dicts())
+        print_written(json)

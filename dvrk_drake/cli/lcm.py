@@ -1,13 +1,16 @@
-"""The verbs of the command line that talk LCM."""
+"""The commands that talk LCM."""
 
 from __future__ import annotations
 
-import argparse
 import sys
 from contextlib import closing, nullcontext
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from dvrk_drake.cli.support import add_gravity, add_key, interrupt_ends_process, load_key, mounted, quiet_drake
+from cyclopts import Parameter
+
+from dvrk_drake.cli.app import HARDWARE, Arm, Gravity, Key, LcmUrl, Model, Realtime, app
+from dvrk_drake.cli.support import interrupt_ends_process, load_key, mounted, print_written, quiet_drake
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,27 +23,46 @@ if TYPE_CHECKING:
     from dvrk_drake.systems.gravity_pid_controller import Mode
 
 
-def add_verbs(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verbs and their options."""
-    _add_arm(verbs)
-    _add_run(verbs)
-    _add_key(verbs)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ControlledArm:
+    """The options of a command that controls an arm over LCM."""
+
+    arm: Arm
+    model: Annotated[
+        Model | None, Parameter(help="An identified model, from identify. Without it: what the arm's SDF states.")
+    ] = None
+    lcm_url: LcmUrl = ""
+    key: Key = None
+    realtime: Realtime = False
+    reset: Annotated[
+        bool,
+        Parameter(
+            show_default=False,
+            help="Print why the arm has a fault or its guard took over, and clear that before it is controlled.",
+        ),
+    ] = False
 
 
-def _add_arm(verbs: argparse._SubParsersAction) -> None:
-    verb = verbs.add_parser("arm", help="play an arm behind LCM: a simulated one with a hardware driver's safeguards")
-    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
-    verb.add_argument("--driver", metavar="FILE.yaml", help="configuration of its driver, fields as in DvrkDriver")
-    verb.add_argument("--lcm-url", metavar="URL", help="default: the driver's, or LCM_DEFAULT_URL, or LCM's own")
-    verb.add_argument("--pose", nargs="+", type=float, metavar="Q", help="where it starts [rad, m]; default: near zero")
-    verb.add_argument("--meshcat", action="store_true", help="draw it in a browser")
-    verb.add_argument("--realtime", action="store_true", help="real-time scheduling, or a warning where not permitted")
-    add_key(verb)
-    add_gravity(verb)
-    verb.set_defaults(run=_arm)
+@app.command(group=HARDWARE)
+def arm(
+    *,
+    arm: Arm,
+    driver: Annotated[str | None, Parameter(metavar="FILE.yaml")] = None,
+    lcm_url: LcmUrl = "",
+    key: Key = None,
+    pose: Annotated[list[float] | None, Parameter(metavar="Q ..", consume_multiple=True)] = None,
+    gravity: Gravity = None,
+    meshcat: Annotated[bool, Parameter(show_default=False)] = False,
+    realtime: Realtime = False,
+) -> None:
+    """Run a simulated arm on LCM, with the safeguards of a driver.
 
-
-def _arm(options: argparse.Namespace) -> None:
+    Args:
+        driver: Configuration of the driver, fields as in DvrkDriver.
+        pose: Joint positions [rad, m] at the start. Without it: near zero.
+        meshcat: Show it in a browser.
+    """
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
     from dvrk_drake.processes.live_view import live_view
@@ -49,125 +71,116 @@ def _arm(options: argparse.Namespace) -> None:
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
     quiet_drake()
-    arm = mounted(load_arm(options.arm), options.gravity)
-    driver = DvrkDriver() if options.driver is None else load_driver(options.driver)
-    driver.key_file = options.key or driver.key_file
-    pose = start_pose(arm, options.pose)
-    url = open_lcm(options.lcm_url or driver.lcm_url).get_lcm_url()
+    played = mounted(load_arm(arm), gravity)
+    configuration = DvrkDriver() if driver is None else load_driver(driver)
+    configuration.key_file = key or configuration.key_file
+    start = start_pose(played, pose)
+    url = open_lcm(lcm_url or configuration.lcm_url).get_lcm_url()
     with interrupt_ends_process():
-        simulated = SimulatedArm(arm, driver, url, pose)
+        simulated = SimulatedArm(played, configuration, url, start)
         stopped = stop_on_signals()
-    with live_view(options.arm, url) if options.meshcat else nullcontext():
-        if options.realtime:
+    with live_view(arm, url) if meshcat else nullcontext():
+        if realtime:
             for warning in make_realtime():
                 _warn(warning)
         settle_memory()
-        print(f"simulated {arm.name} on LCM {url}; end with Ctrl-C", flush=True)
+        print(f"simulated {played.name} on LCM {url}; end with Ctrl-C", flush=True)
         pace = simulated.run(stopped, lambda line: print(line, flush=True))
     print(f"ended; {pace.late} ticks began more than a period late", flush=True)
 
 
-def _add_run(verbs: argparse._SubParsersAction) -> None:
-    verb = verbs.add_parser("run", help="compensate or hold an arm over LCM")
-    add_control(verb)
-    verb.add_argument("--mode", choices=("gravity", "damped", "hold"), default="gravity", help="default: gravity")
-    verb.add_argument(
-        "--gains", metavar="GAINS.yaml", help="from tune, for modes hold and damped; default: the arm's own"
-    )
-    verb.add_argument(
-        "--friction-ratio",
-        type=float,
-        default=0.0,
-        metavar="R",
-        help="in mode gravity, the share of the friction to take off the hand; less where the arm could creep",
-    )
-    verb.add_argument(
-        "--hysteresis-ratio",
-        type=float,
-        default=0.0,
-        metavar="R",
-        help="in mode gravity, the share of wide hysteresis to compensate: the arm stays where it was led",
-    )
-    verb.add_argument(
-        "--friction", metavar="MODEL.yaml", help="from identify of a motion: whose friction; default: that of --model"
-    )
-    verb.set_defaults(run=_run)
+@app.command(group=HARDWARE)
+def key(*, output: Annotated[str, Parameter(metavar="FILE")]) -> None:
+    """Make a key that signs LCM messages.
 
-
-def _add_key(verbs: argparse._SubParsersAction) -> None:
-    verb = verbs.add_parser("key", help="make a key file, with which both sides authenticate their LCM messages")
-    verb.add_argument("file", metavar="FILE", help="a new file, which only its owner may read")
-    verb.set_defaults(run=_key)
-
-
-def _key(options: argparse.Namespace) -> None:
+    Args:
+        output: A new file, which only its owner may read.
+    """
     from dvrk_drake.models.lcm_messages import create_key_file
 
-    create_key_file(options.file)
-    print(f"{options.file}: copy it to the other side, e.g. with scp -p, and name it there and here with --key")
+    create_key_file(output)
+    print_written(output, "copy it to the other side, e.g. with scp -p, and name it on both with --key")
 
 
-def _run(options: argparse.Namespace) -> None:
+@app.command(group=HARDWARE)
+def run(
+    *,
+    controlled: ControlledArm,
+    mode: Literal["gravity", "damped", "hold"] = "gravity",
+    gains: Annotated[str | None, Parameter(metavar="GAINS.yaml")] = None,
+    friction_ratio: Annotated[float, Parameter(metavar="R")] = 0.0,
+    hysteresis_ratio: Annotated[float, Parameter(metavar="R")] = 0.0,
+    friction_model: Annotated[str | None, Parameter(metavar="MODEL.yaml")] = None,
+) -> None:
+    """Compensate the gravity of an arm over LCM, or hold it.
+
+    Args:
+        mode: gravity: an operator moves the arm freely; damped: the same with damping; hold: at its pose.
+        gains: From tune, for modes hold and damped. Without it: the arm's own.
+        friction_ratio: In mode gravity, the share of the friction to compensate; less where the arm could creep.
+        hysteresis_ratio: In mode gravity, the share of wide hysteresis to compensate: the arm stays where it was led.
+        friction_model: Model of a motion whose friction is compensated. Without it: that of --model.
+    """
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine, LiveStatus
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
     with interrupt_ends_process():
-        compensator, gains = _friction_compensator(options), _gains(options)
-        controller, link, period = ready_controller(options, options.mode, compensator, gains)
+        compensator = _friction_compensator(controlled, mode, friction_ratio, hysteresis_ratio, friction_model)
+        checked_gains = None if gains is None else _gains(gains, mode, controlled.arm)
+        controller, link, period = ready_controller(controlled, mode, compensator, checked_gains)
         stopped = stop_on_signals()
-    arm = controller.arm
+    name = controller.arm.name
     print(
-        f"{options.mode} of {arm.name} at {1 / period:.0f} Hz as sender {controller.sender_id}; "
-        "Ctrl-C leaves it to its own hold",
+        f"{mode} of {name} at {1 / period:.0f} Hz as sender {controller.sender_id}; Ctrl-C leaves it to its own hold",
         flush=True,
     )
-    line, told = LiveLine(sys.stderr), [("", "")]
+    line, printed = LiveLine(sys.stderr), [("", "")]
 
-    def tell(status: LiveStatus) -> None:
-        if (news := (status.state, status.problem)) == told[0]:
+    def show(status: LiveStatus) -> None:
+        if (news := (status.state, status.problem)) == printed[0]:
             line.show(lambda: str(status))
             return
-        told[0] = news
+        printed[0] = news
         line.clear()
         print(status, flush=True)
 
     try:
         # A link of its own: what was said while the controller was compiled is past.
-        control(link(), controller, stopped, tell)
+        control(link(), controller, stopped, show)
     finally:
         line.clear()
-    print(f"{arm.name} holds by itself", flush=True)
+    print(f"{name} holds by itself", flush=True)
 
 
-def _gains(options: argparse.Namespace) -> Gains | None:
-    """What --gains names.
+def _gains(path: str, mode: Mode, arm: str) -> Gains:
+    """Loads the file of --gains.
 
     Raises:
         ControllerError: it is no file of gains, they are not for the arm, or the arm is not to be held.
     """
-    if options.gains is None:
-        return None
     from dvrk_drake.errors import ControllerError
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.arm_schema import load_gains
 
-    if options.mode == "gravity":
+    if mode == "gravity":
         raise ControllerError("--gains is for --mode hold or damped: in mode gravity the arm is not regulated")
-    gains = load_gains(options.gains)
-    if fault := load_arm(options.arm).gains_fault(gains):
-        raise ControllerError(f"{options.gains}: {fault}")
+    gains = load_gains(path)
+    if fault := load_arm(arm).gains_fault(gains):
+        raise ControllerError(f"{path}: {fault}")
     return gains
 
 
-def _friction_compensator(options: argparse.Namespace) -> FrictionCompensator | None:
-    """What --friction-ratio and --hysteresis-ratio ask for, with a warning where it cannot be had in full.
+def _friction_compensator(
+    controlled: ControlledArm, mode: Mode, ratio: float, hysteresis_ratio: float, friction_model: str | None
+) -> FrictionCompensator | None:
+    """Returns what --friction-ratio and --hysteresis-ratio ask for, with a warning where it cannot be had in full.
 
     Raises:
         ControllerError: it asks for what is not safe.
         ModelError: the model has no friction.
     """
-    if options.friction_ratio == options.hysteresis_ratio == 0:
+    if ratio == hysteresis_ratio == 0:
         return None
     from dvrk_drake.dynamics.friction_compensation import Friction, holding_error
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -175,53 +188,39 @@ def _friction_compensator(options: argparse.Namespace) -> FrictionCompensator | 
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
 
-    if options.mode != "gravity":
+    if mode != "gravity":
         raise ControllerError(
             "--friction-ratio and --hysteresis-ratio are for --mode gravity: an arm that is held or braked shall not "
             "be easy to move"
         )
-    if options.model is None:
+    if controlled.model is None:
         raise ControllerError(
             "--friction-ratio and --hysteresis-ratio need --model: without friction an arm creeps if its weight is "
             "not known well"
         )
-    arm, model = load_arm(options.arm), IdentifiedModel.load(options.model)
+    arm, model = load_arm(controlled.arm), IdentifiedModel.load(controlled.model)
     error = holding_error(model)
-    if options.friction_ratio and not error.any():
+    if ratio and not error.any():
         raise ControllerError(
-            f"--friction-ratio needs a --model from identify of poses at rest; {options.model} does not say how wrong "
-            "its weight may be, so nothing would keep the arm from creeping"
+            f"--friction-ratio needs a --model from identify of poses at rest; {controlled.model} does not say how "
+            "wrong its weight may be, so nothing would keep the arm from creeping"
         )
-    friction = Friction.of_model(IdentifiedModel.load(options.friction or options.model, arm))
+    friction = Friction.of_model(IdentifiedModel.load(friction_model or controlled.model, arm))
     compensator = FrictionCompensator(
         friction,
-        ratio=options.friction_ratio,
-        hysteresis_ratio=options.hysteresis_ratio,
+        ratio=ratio,
+        hysteresis_ratio=hysteresis_ratio,
         holding_error=error,
     )
     of_effects = zip(friction.effects, compensator.ratios, friction.springs_back, strict=True)
     less = {e.coordinate: r for e, r, springs_back in of_effects if not springs_back}
-    if said := ", ".join(f"{name} {r:.2f}" for name, r in less.items() if r < 0.99 * options.friction_ratio):
+    if said := ", ".join(f"{name} {r:.2f}" for name, r in less.items() if r < 0.99 * ratio):
         _warn(f"friction is compensated less where what remains must hold the arm against the model's error: {said}")
     return compensator
 
 
-def add_control(verb: argparse.ArgumentParser) -> None:
-    """Adds the options of `ready_controller`."""
-    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
-    verb.add_argument("--model", metavar="MODEL.yaml", help="from identify; default: what the arm's SDF states")
-    verb.add_argument("--lcm-url", default="", metavar="URL", help="default: LCM_DEFAULT_URL, or LCM's own")
-    verb.add_argument("--realtime", action="store_true", help="real-time scheduling, or a warning where not permitted")
-    verb.add_argument(
-        "--reset",
-        action="store_true",
-        help="say which fault the arm has or why it took over, if it did, and clear that before it is controlled",
-    )
-    add_key(verb)
-
-
 def ready_controller(
-    options: argparse.Namespace,
+    controlled: ControlledArm,
     mode: Mode,
     friction: FrictionCompensator | None = None,
     gains: Gains | None = None,
@@ -245,17 +244,17 @@ def ready_controller(
     from dvrk_drake.processes.pace import make_realtime, settle_memory
 
     quiet_drake()
-    arm, key = load_arm(options.arm), load_key(options.key)
-    model = IdentifiedModel.from_arm(arm) if options.model is None else IdentifiedModel.load(options.model, arm)
-    if options.model is not None and (warning := model_warning(options.model, model)):
+    arm, key = load_arm(controlled.arm), load_key(controlled.key)
+    model = IdentifiedModel.from_arm(arm) if controlled.model is None else IdentifiedModel.load(controlled.model, arm)
+    if controlled.model is not None and (warning := model_warning(controlled.model, model)):
         _warn(warning)
-    url = open_lcm(options.lcm_url).get_lcm_url()
+    url = open_lcm(controlled.lcm_url).get_lcm_url()
     with closing(ArmLink(arm, url, key=key)) as link:
-        if options.reset:
+        if controlled.reset:
             reset_fault(link, _warn)
         status, period = first_status(link)
     controller = ArmController(arm, model, mode, period, friction, gains)
-    if options.realtime:
+    if controlled.realtime:
         for warning in make_realtime():
             _warn(warning)
     settle_memory()
@@ -269,7 +268,7 @@ def model_warning(path: str, model: IdentifiedModel) -> str:
     if model.validation is None:
         bad = unfit(cross_validated_verdicts(model), "usable")
         found = f"; cross-validated: {', '.join(bad)}" if bad else ""
-        command = f"dvrk-drake validate {path} OTHER.csv --save"
+        command = f"dvrk-drake validate OTHER.csv --model {path} --save"
         return f"{path}: no other recording has validated this model{found}; run: {command}"
     verdicts = model.validation.verdicts
     if not (bad := unfit({joint.name: verdicts[joint.name] for joint in model.joints}, "usable")):

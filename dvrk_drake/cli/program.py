@@ -1,38 +1,65 @@
-"""The program behind the command line: parses the arguments and runs a verb.
+"""The program behind the command line: parses the arguments and runs a command.
 
-Verbs import what they need when they run: drake and numba take seconds, `--help` should not.
+Commands import what they need when they run: drake and numba take seconds, `--help` should not.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
-from typing import NoReturn
+
+from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
 
 from dvrk_drake.cli import collect, demo, export, identify, lcm, model, recordings, simulate
+from dvrk_drake.cli.app import app
 from dvrk_drake.cli.support import folders_only_for_results, import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
 
-# Matrices are small here: more threads of BLAS only wait for each other, for minutes where the cores are busy. Said
-# before numpy is imported, which the verbs do.
+# Matrices are small here: more threads of BLAS only wait for each other, for minutes where the cores are busy. Set
+# before numpy is imported, which the commands do.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+#: Their import adds the commands to the application.
+COMMANDS = model, recordings, identify, export, simulate, demo, lcm, collect
+
+#: Options that were renamed in version 0.2, by command. "" is an argument that became an option.
+RENAMED = {
+    "model": {"": "--arm", "--latex": "--format latex", "--python": "--format python", "--c": "--format c"},
+    "view": {"": "--arm"},
+    "simulate": {"": "--arm"},
+    "validate": {"": "--model"},
+    "predict": {"": "--model"},
+    "recalibrate": {"": "--model"},
+    "export": {"": "--model or --arm"},
+    "convert": {"": "--output", "--format": "--input-format"},
+    "record": {"": "--output"},
+    "key": {"": "--output"},
+    "identify": {"--tables": "--verbose"},
+    "compare-gc": {"--plot": "--plots"},
+    "demo": {"--output": "--folder"},
+    "reproduce": {"--output": "--folder"},
+    "teleop": {"--html": "--output"},
+    "run": {"--friction": "--friction-model"},
+}
 
 
 def run(arguments: Sequence[str] | None) -> int:
-    """Runs one verb; returns the exit code. Without `arguments` those of the process, which is then the verb's own."""
-    options = _parser().parse_args(arguments)
+    """Runs one command; returns the exit code. Without `arguments` it takes those of the process, and its Ctrl-C."""
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        command, bound, _ = app.parse_args(words, print_error=False, exit_on_error=False)
+    except CycloptsError as error:
+        print(_usage_error(error, words), file=sys.stderr)
+        return 2
     try:
         import_interruptibly()
         if arguments is None:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         with folders_only_for_results():
-            options.run(options)
+            command(*bound.args, **bound.kwargs)
     except DvrkDrakeError as error:
-        _print_findings(error)
         print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except BrokenPipeError:
@@ -45,29 +72,15 @@ def run(arguments: Sequence[str] | None) -> int:
     return 0
 
 
-def _print_findings(error: DvrkDrakeError) -> None:
-    """What `check` found in the recording that the error is about, on stdout."""
-    if error.findings:
-        from dvrk_drake.reports.terminal_tables import make_console
-
-        console = make_console()
-        for finding in error.findings:
-            console.print(str(finding), style="yellow", markup=False, soft_wrap=True)
-
-
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, as everything else here does; usage is what --help is for."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: error: {message}; see {self.prog} --help\n")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="dvrk-drake", description="Model, identify, compensate and simulate da Vinci Research Kit arms with Drake."
-    )
-    parser.add_argument("--version", action="version", version=version("dvrk-drake"))
-    verbs = parser.add_subparsers(required=True, metavar="VERB")
-    for module in (model, recordings, identify, export, simulate, demo, lcm, collect):
-        module.add_verbs(verbs)
-    return parser
+def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
+    """What is wrong with the arguments, in one line that names the new option where an old one was given."""
+    name = error.command_chain[0] if error.command_chain else ""
+    program = f"dvrk-drake {name}".rstrip()
+    message = " ".join(str(error).split()).rstrip(".")
+    renamed = RENAMED.get(name, {})
+    options = {word.partition("=")[0] for word in words if word.startswith("--")}
+    if old := sorted(options & renamed.keys()):
+        message = "; ".join(f"{option} is now {renamed[option]}" for option in old)
+    elif "" in renamed and isinstance(error, MissingArgumentError | UnusedCliTokensError):
+        message += f"; since version 0.2, {renamed['']} takes what was an argument without a name"
+    return f"dvrk-drake: error: {message}; see {program} --help"

@@ -1,100 +1,101 @@
-"""The verbs `check` and `convert`, for recordings."""
+"""The commands `check` and `convert`, for recordings."""
 
 from __future__ import annotations
 
-import argparse
-import sys
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.support import (
-    ProgressBar,
-    add_overwrite,
-    add_recording,
-    check_output,
-    made_folder,
-    write_json,
-)
+from dvrk_drake.cli.app import IDENTIFY, Arm, Coordinates, Json, Overwrite, Plots, Verbose, app
+from dvrk_drake.cli.support import Steps, check_output, plots_folder, print_notes, print_written, write_json
 from dvrk_drake.errors import RecordingError
 
 
-def add_verbs(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verbs and their options."""
-    verb = verbs.add_parser(
-        "check",
-        help="say what is wrong with a recording before anything is identified from it; exit code 2: unusable",
-    )
-    add_recording(verb)
-    verb.add_argument("--arm", required=True, help="the arm that was recorded: mtml, mtmr, psm, or a YAML file")
-    verb.add_argument("--json", metavar="FILE", help="write the findings and numbers as JSON")
-    add_overwrite(verb)
-    verb.add_argument("--plots", metavar="DIR", help="of a motion: write spectra of its efforts into this folder")
-    verb.set_defaults(run=_check)
+@app.command(group=IDENTIFY)
+def check(
+    recording: str,
+    /,
+    *,
+    arm: Arm,
+    coordinates: Coordinates = "joint",
+    json: Json = None,
+    plots: Plots = None,
+    overwrite: Overwrite = False,
+    verbose: Verbose = False,
+) -> None:
+    """Say what is wrong with a recording.
 
-    verb = verbs.add_parser("convert", help="turn a recording (CSV, LCM log, team .mat, WPI CSV) into our CSV")
-    verb.add_argument("input", metavar="INPUT")
-    verb.add_argument("output", metavar="OUTPUT.csv")
-    verb.add_argument("--format", choices=("csv", "team-mat", "wpi-csv", "lcm-log"), help="default: detected")
-    verb.add_argument(
-        "--coordinates",
-        choices=("joint", "actuator"),
-        help="what q and tau of a CSV with a header are of; needed there, the other formats define it",
-    )
-    verb.add_argument("--variable", metavar="NAME", help="the .mat's variable, where several fit")
-    verb.add_argument(
-        "--rate",
-        type=float,
-        metavar="HZ",
-        help="samples a second of a CSV without time stamps; default: WPI 200, with a header none are written",
-    )
-    verb.add_argument(
-        "--arm", help="e.g. psm; CSV, WPI: write its joint coordinates, not the actuators'; LCM log: which arm"
-    )
-    verb.add_argument(
-        "--skip-invalid",
-        action="store_true",
-        help="leave out rows with an empty cell, a NaN or an infinity, and count them",
-    )
-    add_overwrite(verb)
-    verb.set_defaults(run=_convert)
+    The exit code is 2 where no model can be identified from it.
 
-
-def _check(options: argparse.Namespace) -> None:
-    from dvrk_drake.reports.recording_check import plot_report, print_report
+    Args:
+        recording: CSV with header q1..qn, tau1..taun (t, qd1..qdn optional), or an LCM log.
+    """
+    from dvrk_drake.reports.recording_check import print_report
     from dvrk_drake.reports.terminal_tables import make_console
 
-    arm = dvrk.load_arm(options.arm)
-    if options.json is not None:
-        check_output(options.json, options.recording, overwrite=options.overwrite)
-    plots = None if options.plots is None else made_folder(options.plots)
-    with ProgressBar("reading") as bar:
-        recording = dvrk.read_recording(options.recording, arm, options.coordinates, progress=bar)
-        bar("checking the recording", 0.0)
-        report = dvrk.check(recording, arm, progress=bar)
-    print_report(make_console(), report)
-    if options.json is not None:
-        write_json(options.json, report.as_dict())
-    if plots is not None and not plot_report(plots, report, recording, arm):
-        print("no plots: spectra need a motion with efforts at a known rate", file=sys.stderr)
+    recorded_arm = dvrk.load_arm(arm)
+    if json is not None:
+        check_output(json, recording, overwrite=overwrite)
+    folder = plots_folder(plots, overwrite=overwrite)
+    with Steps("reading", "checking the recording") as steps:
+        checked = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
+        report = dvrk.check(checked, recorded_arm, progress=steps)
+    print_report(make_console(), report, verbose=verbose)
+    if json is not None:
+        write_json(json, report.as_dict())
+    if folder is not None:
+        from dvrk_drake.reports.recording_check import plot_report
+
+        if plot_report(folder, report, checked, recorded_arm):
+            print_written(folder)
+        else:
+            print_notes(recording, ["no plots: spectra need a motion with efforts at a known rate"])
     if report.refusals:
         raise RecordingError(report.refusal)
 
 
-def _convert(options: argparse.Namespace) -> None:
-    from dvrk_drake.recordings.conversion import convert
-    from dvrk_drake.reports.terminal_tables import make_console
+@app.command(group=IDENTIFY)
+def convert(
+    recording: str,
+    /,
+    *,
+    output: Annotated[str, Parameter(metavar="FILE.csv")],
+    input_format: Literal["csv", "team-mat", "wpi-csv", "lcm-log"] | None = None,
+    coordinates: Literal["joint", "actuator"] | None = None,
+    variable: Annotated[str | None, Parameter(metavar="NAME")] = None,
+    rate: Annotated[float | None, Parameter(metavar="HZ")] = None,
+    arm: Annotated[str | None, Parameter(metavar="ARM")] = None,
+    skip_invalid: Annotated[bool, Parameter(show_default=False)] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Convert a recording to the CSV of this project.
 
-    check_output(options.output, options.input, overwrite=options.overwrite)
-    console = make_console()
-    recording = convert(
-        options.input,
-        options.output,
-        format=options.format,
-        coordinates=options.coordinates,
-        variable=options.variable,
-        rate=options.rate,
-        arm=None if options.arm is None else dvrk.load_arm(options.arm),
-        skip_invalid=options.skip_invalid,
+    It reads CSV, LCM logs, .mat files of the JHU-WPI team, and CSV of WPI.
+
+    Args:
+        recording: The file to convert.
+        output: The CSV to write.
+        input_format: Format of the recording. Without it: detected.
+        coordinates: Coordinates of q and tau in a CSV with a header. Needed there; the other formats define it.
+        variable: Variable of the .mat file, where several fit.
+        rate: Samples per second of a CSV without time stamps. Without it: 200 for WPI, no times with a header.
+        arm: CSV, WPI: convert the actuators' coordinates to the joints' of this arm. LCM log: the arm to read.
+        skip_invalid: Leave out and count rows with an empty cell, a NaN or an infinity.
+    """
+    from dvrk_drake.recordings.conversion import convert as convert_recording
+
+    check_output(output, recording, overwrite=overwrite)
+    converted = convert_recording(
+        recording,
+        output,
+        format=input_format,
+        coordinates=coordinates,
+        variable=variable,
+        rate=rate,
+        arm=None if arm is None else dvrk.load_arm(arm),
+        skip_invalid=skip_invalid,
     )
-    for note in recording.notes:
-        console.print(note, soft_wrap=True)
-    console.print(f"{options.output}: {len(recording)} rows, {recording.coordinates} coordinates", soft_wrap=True)
+    print_written(output, f"{len(converted)} rows, {converted.coordinates} coordinates")
+    for note in converted.notes:
+        print(note)

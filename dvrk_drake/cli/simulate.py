@@ -2,255 +2,257 @@
 
 from __future__ import annotations
 
-import argparse
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.support import ProgressBar, add_overwrite, check_output, made_folder, quiet_drake, until_stopped
-from dvrk_drake.errors import StudyError
+from dvrk_drake.cli.app import SIMULATE, Arm, Coordinates, Overwrite, Plots, Set, Verbose, app, one_of
+from dvrk_drake.cli.support import Steps, check_output, plots_folder, print_written, quiet_drake, until_stopped
+from dvrk_drake.errors import ModelError, ScenarioError, StudyError
+from dvrk_drake.progress import step_progress
 
 if TYPE_CHECKING:
     from dvrk_drake.experiments.transparency import Compensation
-    from dvrk_drake.models.arm import Arm
+
+_SCENARIO = one_of("Source (give one)")
+_WHERE = one_of("Where it runs (give one at most)", least=0)
 
 
-def add_verbs(verbs: argparse._SubParsersAction) -> None:
-    """Adds the commands and their options."""
-    _add_simulate(verbs)
-    _add_study(verbs)
-    _add_tune(verbs)
-    _add_transparency(verbs)
+@app.command(group=SIMULATE)
+def simulate(
+    scenario: Annotated[str | None, Parameter(group=_SCENARIO)] = None,
+    /,
+    *,
+    arm: Annotated[Arm | None, Parameter(group=_SCENARIO, help="Hold this arm at its home.")] = None,
+    set: Set = None,
+    output: Annotated[str | None, Parameter(metavar="RECORDING.csv")] = None,
+    plots: Plots = None,
+    meshcat: Annotated[bool, Parameter(show_default=False)] = False,
+    overwrite: Overwrite = False,
+    verbose: Verbose = False,
+) -> None:
+    """Simulate an arm under control and record it.
 
-
-def _add_simulate(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verb and its options."""
-    verb = verbs.add_parser("simulate", help="simulate an arm under control, as a scenario file says, and record it")
-    verb.add_argument("scenario", metavar="ARM_OR_SCENARIO", help="mtml, mtmr, psm: holds its home; or scenario.yaml")
-    verb.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="changes the scenario, e.g. controller.mode=gravity; again for more",
-    )
-    verb.add_argument("--output", metavar="RECORDING.csv", help="write t, q, qd and tau")
-    add_overwrite(verb)
-    verb.add_argument("--plots", metavar="DIR", help="write plots into this folder")
-    verb.add_argument("--meshcat", action="store_true", help="show it in a browser, in real time")
-    verb.set_defaults(run=_simulate)
-
-
-def _simulate(options: argparse.Namespace) -> None:
-    from dvrk_drake.reports.figures import plot_simulation
-    from dvrk_drake.reports.terminal_tables import make_console, print_simulation
-
-    quiet_drake()
-    scenario = dvrk.load_scenario(options.scenario, options.set)
-    plots = None if options.plots is None else made_folder(options.plots)
-    if options.output is not None:
-        check_output(options.output, options.scenario, scenario.controller.model, overwrite=options.overwrite)
-    meshcat = dvrk.start_meshcat(scenario.mounted_arm) if options.meshcat else None
-    if meshcat is not None:
-        print(f"{scenario.mounted_arm.name} at {meshcat.web_url()}", flush=True)
-    with ProgressBar("simulating") as bar:
-        simulation = dvrk.simulate(scenario, meshcat=meshcat, progress=bar)
-    print_simulation(make_console(), simulation, scenario.mounted_arm)
-    if options.output is not None:
-        dvrk.write_recording(simulation.recording, options.output)
-        print(f"recording: {options.output}, {len(simulation.recording)} rows")
-    if plots is not None:
-        plot_simulation(plots / "positions.png", simulation, scenario)
-        print(f"plots: {plots}")
-    if meshcat is not None:
-        print("the page can play the motion again; end with Stop, Escape or Ctrl-C", flush=True)
-        until_stopped(meshcat)
-
-
-def _add_study(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verb and its options."""
-    verb = verbs.add_parser("study", help="simulate a scenario over many poses, seeds and errors, on all cores")
-    verb.add_argument("study", metavar="STUDY.yaml")
-    verb.add_argument(
-        "--output", required=True, metavar="RESULTS.csv", help="or .parquet; begun with this study before: goes on"
-    )
-    verb.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="changes its scenario; again for more"
-    )
-    where = verb.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=_workers, metavar="N", help="processes here; default: one a core")
-    where.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster that runs it, e.g. tcp://host:8786")
-    verb.add_argument("--plots", metavar="DIR", help="write study.png into this folder")
-    verb.set_defaults(run=_study)
-
-
-def _study(options: argparse.Namespace) -> None:
-    from dvrk_drake.experiments.study.study import dask_executor, run_study, run_study_locally
-    from dvrk_drake.experiments.study.study_file import load_study
-    from dvrk_drake.reports.study import plot_study, print_study
+    Args:
+        scenario: A scenario's YAML file: arm, controller, motion, effects.
+        output: Write t, q, qd and tau.
+        meshcat: Show it in a browser, in real time.
+    """
+    from dvrk_drake.reports.simulation import print_simulation
     from dvrk_drake.reports.terminal_tables import make_console
 
     quiet_drake()
-    study = load_study(options.study, options.set)
-    if not options.output.endswith((".csv", ".parquet")):
-        raise StudyError(f"{options.output}: must end in .csv or .parquet")
-    check_output(options.output, overwrite=True)
-    plots = None if options.plots is None else made_folder(options.plots)
-    with ProgressBar("runs") as bar:
+    source = arm or scenario or ""
+    loaded = dvrk.load_scenario(source, set or [])
+    folder = plots_folder(plots, overwrite=overwrite)
+    if output is not None:
+        check_output(output, source, loaded.controller.model, overwrite=overwrite)
+    page = dvrk.start_meshcat(loaded.mounted_arm) if meshcat else None
+    if page is not None:
+        print(f"{loaded.mounted_arm.name} at {page.web_url()}", flush=True)
+    with Steps("simulating") as steps:
+        simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
+    print_simulation(make_console(), simulation, loaded.mounted_arm, verbose=verbose)
+    if output is not None:
+        dvrk.write_recording(simulation.recording, output)
+        print_written(output, f"{len(simulation.recording)} rows")
+    if folder is not None:
+        from dvrk_drake.reports.figures import plot_simulation
+
+        plot_simulation(folder / "positions.png", simulation, loaded)
+        print_written(folder)
+    if page is not None:
+        print("the page can play the motion again; end with Stop, Escape or Ctrl-C", flush=True)
+        until_stopped(page)
+
+
+def _check_workers(_: object, value: int | None) -> None:
+    if value is not None and not 1 <= value <= 1024:
+        raise ValueError("must be a number of processes, 1..1024")
+
+
+@app.command(group=SIMULATE)
+def study(
+    study: str,
+    /,
+    *,
+    output: Annotated[str, Parameter(metavar="RESULTS.csv")],
+    set: Set = None,
+    workers: Annotated[int | None, Parameter(metavar="N", group=_WHERE, validator=_check_workers)] = None,
+    scheduler: Annotated[str | None, Parameter(metavar="ADDRESS", group=_WHERE)] = None,
+    plots: Plots = None,
+    overwrite: Overwrite = False,
+    verbose: Verbose = False,
+) -> None:
+    """Simulate a scenario over many poses, seeds and errors.
+
+    Args:
+        study: The study's YAML file.
+        output: Results as .csv or .parquet. A file that this study began is continued, not replaced.
+        workers: Processes on this computer. Without it: one per core.
+        scheduler: Dask cluster that runs it, e.g. tcp://host:8786.
+    """
+    from dvrk_drake.experiments.study.study import dask_executor, run_study, run_study_locally
+    from dvrk_drake.experiments.study.study_file import load_study
+    from dvrk_drake.reports.study import print_study
+    from dvrk_drake.reports.terminal_tables import make_console
+
+    quiet_drake()
+    loaded = load_study(study, set or [])
+    if not output.endswith((".csv", ".parquet")):
+        raise StudyError(f"{output}: must end in .csv or .parquet")
+    check_output(output, overwrite=True)
+    folder = plots_folder(plots, overwrite=overwrite)
+    step = f"simulating {len(loaded.cases)} runs"
+    with Steps(step) as steps:
 
         def show(done: int, all_cases: int) -> None:
-            bar(f"{done}/{all_cases} runs", done / all_cases)
+            steps(step, done / all_cases)
 
-        if options.scheduler is None:
-            rows = run_study_locally(study, options.output, options.workers, show)
+        if scheduler is None:
+            rows = run_study_locally(loaded, output, workers, show)
         else:
-            with dask_executor(options.scheduler) as executor:
-                rows = run_study(study, executor, options.output, show)
-    print_study(make_console(), study, rows)
-    print(f"results: {options.output}, {len(rows)} runs")
-    if plots is not None:
-        plot_study(plots / "study.png", study, rows)
-        print(f"plots: {plots}")
+            with dask_executor(scheduler) as executor:
+                rows = run_study(loaded, executor, output, show)
+    print_study(make_console(), loaded, rows, verbose=verbose)
+    print_written(output, f"{len(rows)} runs")
+    if folder is not None:
+        from dvrk_drake.reports.study import plot_study
+
+        plot_study(folder / "study.png", loaded, rows)
+        print_written(folder)
 
 
-def _workers(text: str) -> int:
-    if not (text.isdigit() and 1 <= int(text) <= 1024):
-        raise argparse.ArgumentTypeError(f'"{text}" is not a number of processes, 1..1024')
-    return int(text)
+@app.command(group=SIMULATE)
+def tune(
+    *,
+    arm: Arm,
+    method: Literal["paper", "model", "both"] = "both",
+    output: Annotated[str | None, Parameter(metavar="GAINS.yaml")] = None,
+    plots: Plots = None,
+    overwrite: Overwrite = False,
+    verbose: Verbose = False,
+) -> None:
+    """Find controller gains on the simulated arm.
 
+    They are compared with the arm's own.
 
-def _add_tune(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verb and its options."""
-    verb = verbs.add_parser("tune", help="find gains on the simulated arm, and compare them with the arm's own")
-    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
-    verb.add_argument(
-        "--method",
-        choices=("paper", "model", "both"),
-        default="both",
-        help="paper: Kp up until it oscillates, Kv, Ki; model: from inertia, friction and delay; default: both",
-    )
-    verb.add_argument("--output", metavar="GAINS.yaml", help="write the gains found; of both methods the better ones")
-    add_overwrite(verb)
-    verb.add_argument("--plots", metavar="DIR", help="write step responses into this folder")
-    verb.set_defaults(run=_tune)
-
-
-def _tune(options: argparse.Namespace) -> None:
+    Args:
+        method: paper: raise Kp until the arm oscillates, then Kv and Ki; model: from inertia, friction and delay.
+        output: Write the gains that were found; of both methods the better ones.
+    """
     from dvrk_drake.experiments.tuning.tuning import Method, tune_arm
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.arm_schema import save_gains
     from dvrk_drake.reports.terminal_tables import make_console
-    from dvrk_drake.reports.tuning import plot_steps, print_tuning
+    from dvrk_drake.reports.tuning import print_tuning
 
     quiet_drake()
-    arm = load_arm(options.arm)
-    if options.output is not None:
-        check_output(options.output, options.arm, overwrite=options.overwrite)
-    plots = None if options.plots is None else made_folder(options.plots)
-    methods: list[Method] = ["paper", "model"] if options.method == "both" else [options.method]
-    with ProgressBar(f"tuning {arm.name}") as bar:
-        tuning = tune_arm(options.arm, methods, bar.share)
-    print_tuning(make_console(), tuning)
+    tuned = load_arm(arm)
+    if output is not None:
+        check_output(output, arm, overwrite=overwrite)
+    folder = plots_folder(plots, overwrite=overwrite)
+    methods: list[Method] = ["paper", "model"] if method == "both" else [method]
+    step = f"tuning {tuned.name}"
+    with Steps(step) as steps:
+        tuning = tune_arm(arm, methods, step_progress(steps, step))
+    print_tuning(make_console(), tuning, verbose=verbose)
     best = tuning.comparison.best(tuning.found)
-    print(f"of the gains found, those of method {best} settle most often, and then fastest")
-    if options.output is not None:
-        save_gains(
-            tuning.found[best], options.output, f"{arm.name}: dvrk-drake tune --arm {options.arm}, method {best}."
-        )
-        print(f"gains: {options.output}")
-    if plots is not None:
-        plot_steps(plots / "steps.png", tuning.comparison)
-        print(f"plots: {plots}")
+    if output is not None:
+        save_gains(tuning.found[best], output, f"{tuned.name}: dvrk-drake tune --arm {arm}, method {best}.")
+        print_written(output)
+    if folder is not None:
+        from dvrk_drake.reports.tuning import plot_steps
+
+        plot_steps(folder / "steps.png", tuning.comparison)
+        print_written(folder)
 
 
-def _add_transparency(verbs: argparse._SubParsersAction) -> None:
-    """Adds the verb and its options."""
-    verb = verbs.add_parser("transparency", help="force and torque that a hand feels of a simulated arm it leads")
-    verb.add_argument("--arm", required=True, help="mtml, mtmr, psm, or the path of an arm's YAML file")
-    verb.add_argument("--path", metavar="RECORDING", help="the motion to follow; default: through random poses")
-    verb.add_argument(
-        "--coordinates", choices=("joint", "actuator"), default="joint", help="what its q are of; default: joint"
-    )
-    verb.add_argument("--speed", type=float, metavar="S", help="S times as fast as recorded; default: 1")
-    verb.add_argument(
-        "--model",
-        action="append",
-        default=[],
-        metavar="NAME=MODEL.yaml",
-        help="compensate with this model; again for more; default: what the arm's SDF states",
-    )
-    verb.add_argument(
-        "--friction-ratio", type=float, default=0.5, metavar="R", help="share of the friction; default: 0.5"
-    )
-    verb.add_argument(
-        "--real-arm",
-        nargs="+",
-        default=["all"],
-        metavar="PART",
-        help="parts of the real arm that the simulation has, as in a scenario; default: all",
-    )
-    verb.add_argument(
-        "--frame",
-        default="",
-        help="the SDF's frame of the handle; default: dh_7 of an MTM, dh_6 of a PSM",
-    )
-    verb.add_argument("--output", metavar="DIR", help="write the table and a plot into this folder")
-    verb.set_defaults(run=_transparency)
+@app.command(group=SIMULATE)
+def transparency(
+    *,
+    arm: Arm,
+    path: Annotated[str | None, Parameter(metavar="RECORDING")] = None,
+    coordinates: Coordinates = "joint",
+    speed: Annotated[float | None, Parameter(metavar="S")] = None,
+    model: Annotated[list[str] | None, Parameter(metavar="MODEL.yaml")] = None,
+    friction_ratio: Annotated[float, Parameter(metavar="R")] = 0.5,
+    real_arm: Annotated[list[str] | None, Parameter(metavar="PART ..", consume_multiple=True)] = None,
+    frame: Annotated[str, Parameter(metavar="NAME", show_default=False)] = "",
+    output: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
+    plots: Plots = None,
+    overwrite: Overwrite = False,
+    verbose: Verbose = False,
+) -> None:
+    """Simulate what an operator feels at the handle of an arm.
 
-
-def _transparency(options: argparse.Namespace) -> None:
-    from dvrk_drake.errors import ScenarioError
+    Args:
+        path: Recording of the motion to follow. Without it: through random poses.
+        speed: Follow the recording S times as fast.
+        model: Compensate with this model; repeat to compare. Without it: what the arm's SDF states.
+        friction_ratio: Share of the friction to compensate.
+        real_arm: Parts of the real arm that the simulation has, as in a scenario. Without it: all.
+        frame: The SDF's frame of the handle. Without it: dh_7 of an MTM, dh_6 of a PSM.
+        output: Write the table.
+    """
     from dvrk_drake.experiments.transparency import feel, rambling_path, recorded_path
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.recordings.recording import read_recording
     from dvrk_drake.reports.terminal_tables import make_console
-    from dvrk_drake.reports.transparency import plot_transparency, print_transparency, write_transparency
+    from dvrk_drake.reports.transparency import print_transparency, write_transparency
 
     quiet_drake()
-    arm = load_arm(options.arm)
-    effects = arm.effects.only(options.real_arm)
-    path = rambling_path(arm)
-    if options.path is not None:
-        recording = read_recording(options.path, arm, options.coordinates)
-        path = recorded_path(arm, recording, 1.0 if options.speed is None else options.speed)
-    elif options.speed is not None:
+    led = load_arm(arm)
+    effects = led.effects.only(real_arm or ["all"])
+    followed = rambling_path(led)
+    if path is not None:
+        followed = recorded_path(led, read_recording(path, led, coordinates), 1.0 if speed is None else speed)
+    elif speed is not None:
         raise ScenarioError("--speed is that of a recorded motion; name one with --path")
-    compensations = _compensations(options, arm)
-    folder = None if options.output is None else made_folder(options.output)
+    compensations = _compensations(led, model or [], friction_ratio)
+    if output is not None:
+        check_output(output, path or "", *(model or []), overwrite=overwrite)
+    folder = plots_folder(plots, overwrite=overwrite)
     felt = []
-    for compensation in compensations:
-        with ProgressBar(compensation.name) as bar:
-            felt.append(feel(arm, path, compensation, effects=effects, frame_name=options.frame, progress=bar.share))
-    print_transparency(make_console(), arm, felt)
+    with Steps(*(compensation.name for compensation in compensations)) as steps:
+        for compensation in compensations:
+            progress = step_progress(steps, compensation.name)
+            felt.append(feel(led, followed, compensation, effects=effects, frame_name=frame, progress=progress))
+    print_transparency(make_console(), led, felt, verbose=verbose)
+    if output is not None:
+        write_transparency(Path(output), felt)
+        print_written(output)
     if folder is not None:
-        write_transparency(folder / "transparency.csv", felt)
-        plot_transparency(folder / "transparency.png", arm, felt)
-        print(f"written: {folder}/transparency.csv, transparency.png")
+        from dvrk_drake.reports.transparency import plot_transparency
+
+        plot_transparency(folder / "transparency.png", led, felt)
+        print_written(folder)
 
 
-def _compensations(options: argparse.Namespace, arm: Arm) -> list[Compensation]:
+def _compensations(arm: dvrk.Arm, paths: list[str], friction_ratio: float) -> list[Compensation]:
     """Nothing, each model, and each model with friction compensation.
 
     Raises:
-        ModelError: a model that is not of this arm.
+        ModelError: a model that is not of this arm, or two of one name.
         ControllerError: a friction ratio that is not allowed.
     """
     from dvrk_drake.dynamics.friction_compensation import check_ratios
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.errors import ModelError
     from dvrk_drake.experiments.transparency import Compensation
 
-    check_ratios(options.friction_ratio)
+    check_ratios(friction_ratio)
     models = {}
-    for given in options.model:
-        name, equals, path = given.partition("=")
-        if not equals or not name or name in models:
-            raise ModelError(f"--model {given}: must be NAME=MODEL.yaml, each name once")
-        models[name] = IdentifiedModel.load(path, arm)
+    for path in paths:
+        name = Path(path).stem
+        if name in models:
+            raise ModelError(f"--model {path}: another model is named {name} too; rename one file")
+        models[name] = dvrk.IdentifiedModel.load(path, arm)
     if not models:
-        models["SDF"] = IdentifiedModel.from_arm(arm)
+        models["SDF"] = dvrk.IdentifiedModel.from_arm(arm)
     listed = [Compensation("nothing")]
     for name, model in models.items():
         listed.append(Compensation(name, model))
-        if options.friction_ratio:
-            listed.append(Compensation(f"{name}, friction {options.friction_ratio:g}", model, options.friction_ratio))
+        if friction_ratio:
+            listed.append(Compensation(f"{name}, friction {friction_ratio:g}", model, friction_ratio))
     return listed

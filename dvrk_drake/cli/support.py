@@ -1,12 +1,10 @@
-"""What the verbs of the command line share: output that is checked first, a progress bar, a clean Ctrl-C."""
+"""What the commands share: output that is checked first, progress, a clean Ctrl-C."""
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import json
 import logging
-import math
 import os
 import signal
 import sys
@@ -19,8 +17,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskID,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
+import dvrk_drake as dvrk
 from dvrk_drake.cli import leave
 from dvrk_drake.errors import DvrkDrakeError
 
@@ -34,12 +41,12 @@ if TYPE_CHECKING:
 
 
 def import_interruptibly() -> None:
-    """Imports what all verbs need such that Ctrl-C ends the process at once: extension modules turn it into tracebacks.
+    """Imports what all commands need such that Ctrl-C ends the process at once.
 
-    Nothing is half-written at that time. Where signals are not ours (a thread, a test) they are left alone.
+    Extension modules turn it into tracebacks. Nothing is half-written at that time. Where signals are not ours (a thread, a test) they are left alone.
     """
     # Together these import what the others do.
-    modules = ("dvrk_drake.reports.figures", "dvrk_drake.reports.terminal_tables")
+    modules = ("dvrk_drake.reports.terminal_tables",)
     if threading.current_thread() is not threading.main_thread() or sys.modules.keys() >= set(modules):
         return
 
@@ -71,11 +78,6 @@ def quiet_drake() -> None:
     logging.getLogger("drake").setLevel(logging.WARNING)
 
 
-def add_key(verb: argparse.ArgumentParser) -> None:
-    """Adds the option --key, for `load_key`."""
-    verb.add_argument("--key", metavar="FILE", help="from dvrk-drake key, one for both sides: authenticates messages")
-
-
 def load_key(path: str | None) -> MessageKey | None:
     """Returns the key in the file that --key names, or None.
 
@@ -85,11 +87,6 @@ def load_key(path: str | None) -> MessageKey | None:
     from dvrk_drake.models.lcm_messages import MessageKey
 
     return None if path is None else MessageKey.load(path)
-
-
-def add_overwrite(verb: argparse.ArgumentParser) -> None:
-    """Adds the option --overwrite, for `check_output`."""
-    verb.add_argument("--overwrite", action="store_true", help="replace output files that exist; default: refuse")
 
 
 def check_output(path: str, *inputs: str, overwrite: bool) -> None:
@@ -119,20 +116,45 @@ def check_output(path: str, *inputs: str, overwrite: bool) -> None:
         raise DvrkDrakeError(f"{path}: exists already; name another file, or replace it with --overwrite")
 
 
+#: Bars on a terminal at most; finished steps give way.
+MOST_BARS = 6
+
 #: Folders that were made, each before the one that it is in.
 _made: list[Path] = []
 
 
-def made_folder(path: str) -> Path:
-    """The folder at `path`, made if it was not there."""
+def new_folder(path: str, *, overwrite: bool) -> Path:
+    """Makes the folder at `path`, and refuses one that holds something already.
+
+    Args:
+        path: of the folder.
+        overwrite: files that are there may be replaced: the user said so.
+    """
     folder = Path(path).absolute()
     missing = [place for place in (folder, *folder.parents) if not os.path.exists(place)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        filled = any(folder.iterdir())
     except OSError as error:
         raise DvrkDrakeError(f"{path}: cannot be made a folder: {error.strerror}") from error
+    if filled and not overwrite:
+        raise DvrkDrakeError(f"{path}: holds files already; name another folder, or replace them with --overwrite")
     _made[:0] = missing
     return Path(path)
+
+
+def plots_folder(path: str | None, *, overwrite: bool) -> Path | None:
+    """Makes the folder of an option --plots, if given, and imports what draws."""
+    if path is None:
+        return None
+    with interrupt_ends_process():
+        importlib.import_module("dvrk_drake.reports.figures")
+    return new_folder(path, overwrite=overwrite)
+
+
+def print_written(path: str | Path, what: str = "") -> None:
+    """Prints that a file or folder was written; `what` says more about it."""
+    print(f"wrote {path}{what and ': '}{what}", flush=True)
 
 
 @contextmanager
@@ -156,42 +178,12 @@ def until_stopped(meshcat: Meshcat, meanwhile: Callable[[], object] = lambda: No
         time.sleep(0.03)
 
 
-def seed(text: str) -> int:
-    """A whole number from 0, for argparse."""
-    if not text.isdigit():
-        raise argparse.ArgumentTypeError(f'"{text}" is not a whole number from 0')
-    return int(text)
-
-
-def seconds(text: str) -> float:
-    """A time above 0, for argparse."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f'"{text}" is not a number of seconds above 0')
-    return value
-
-
-def load_model(name: str) -> IdentifiedModel:
-    """Returns the model of a file, or what the SDF of an arm states; the arm by name or by its own file."""
-    from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.models.arm import known_arms, load_arm
-
-    if name.lower() in known_arms() or _is_arm_file(name):
-        return IdentifiedModel.from_arm(load_arm(name))
-    return IdentifiedModel.load(name)
-
-
-def _is_arm_file(name: str) -> bool:
-    """An arm's YAML names its mechanism; a model's has no such field."""
-    from dvrk_drake.models.files import read_text_input
-
-    try:
-        return any(line.startswith("mechanism:") for line in read_text_input(name, DvrkDrakeError).splitlines())
-    except DvrkDrakeError:
-        return False
+def load_model(model: str | None, arm: str | None) -> IdentifiedModel:
+    """Returns the model of the file --model, or what the SDF of --arm states; one of them is given."""
+    if model is not None:
+        return dvrk.IdentifiedModel.load(model)
+    assert arm is not None
+    return dvrk.IdentifiedModel.from_arm(dvrk.load_arm(arm))
 
 
 def print_warnings(console: Console, warnings: Sequence[Finding]) -> None:
@@ -218,51 +210,25 @@ def print_notes(path: str, notes: Sequence[str]) -> None:
         print(f"dvrk-drake: note: {path}: {note}", file=sys.stderr)
 
 
-def write_tables(path: str, print_to: Callable[[Console], object]) -> None:
-    """Writes what `print_to` prints into a text file."""
-    from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.reports.terminal_tables import TABLE_WIDTH
-
-    with atomic_write(path) as stream:
-        print_to(Console(file=stream, highlight=False, width=TABLE_WIDTH))
-
-
-def add_recording(verb: argparse.ArgumentParser) -> None:
-    """Adds RECORDING and the option --coordinates."""
-    verb.add_argument(
-        "recording", metavar="RECORDING", help="CSV with header q1..qn, tau1..taun; t, qd1.. optional; or an LCM log"
-    )
-    verb.add_argument(
-        "--coordinates", choices=("joint", "actuator"), default="joint", help="what q and tau are of; default: joint"
-    )
-
-
-def add_gravity(verb: argparse.ArgumentParser) -> None:
-    """Adds the option --gravity."""
-    verb.add_argument(
-        "--gravity",
-        nargs=3,
-        type=float,
-        metavar=("X", "Y", "Z"),
-        help="gravity in the arm's base frame [m/s^2], for other mountings; default: the arm's file, 0 0 -9.81",
-    )
-
-
-def mounted(arm: Arm, gravity: list[float] | None) -> Arm:
+def mounted(arm: Arm, gravity: Sequence[float] | None) -> Arm:
     """The arm as --gravity says that it is mounted."""
     if gravity is None:
         return arm
     return arm.with_gravity(gravity)
 
 
-class ProgressBar:
-    """A progress bar of 0..100 on stderr, gone when the work is done; silent where stderr is no terminal."""
+class Steps:
+    """Shows on stderr which step of a command runs: bars with the time left on a terminal, elsewhere a line per step.
 
-    def __init__(self, what: str):
+    It is a `dvrk_drake.progress.Progress`. A step "fig5: releasing" is a part of the step "fig5".
+    """
+
+    def __init__(self, *names: str):
+        self._names, self._tasks = list(names), dict[str, TaskID]()
         console = Console(stderr=True)
         self._progress = Progress(
             TextColumn("{task.description}"),
-            BarColumn(),
+            BarColumn(bar_width=20),
             TaskProgressColumn(),
             TimeElapsedColumn(),
             TextColumn("elapsed,"),
@@ -273,19 +239,30 @@ class ProgressBar:
             disable=not console.is_terminal,
             speed_estimate_period=600,  # a run of a study may take a minute
         )
-        self._task = self._progress.add_task(what, total=100)
 
-    def __enter__(self) -> ProgressBar:
+    def __enter__(self) -> Steps:
         self._progress.start()
         return self
 
     def __call__(self, step: str, share: float) -> None:
-        """Shows a step and its finished share, 0..1; see `dvrk_drake.progress`."""
-        self._progress.update(self._task, description=step, completed=100 * share)
+        """Shows a step and its finished share, 0..1."""
+        if step not in self._tasks:
+            self._begin(step)
+        self._progress.update(self._tasks[step], completed=share)
 
-    def share(self, share: float) -> None:
-        """Shows the finished share of the step that is shown."""
-        self._progress.update(self._task, completed=100 * share)
+    def _begin(self, step: str) -> None:
+        name = step.partition(": ")[0]
+        if name not in self._names:
+            self._names.append(name)
+        count = len(self._names)
+        text = f"{self._names.index(name) + 1} of {count}: {step}" if count > 1 else step
+        if self._progress.disable:
+            print(text, file=sys.stderr, flush=True)
+        for task in self._progress.tasks:
+            self._progress.update(task.id, completed=task.total)
+        if len(self._progress.tasks) >= MOST_BARS:
+            self._progress.remove_task(self._progress.task_ids[0])
+        self._tasks[step] = self._progress.add_task(text, total=1.0)
 
     def __exit__(self, *_: object) -> None:
         self._progress.stop()

@@ -79,7 +79,7 @@ def collect_static_poses(
     *,
     effort_noise: float,
     generator: np.random.Generator,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], object] = lambda share: None,
 ) -> Recording:
     """Visits hand-picked poses under position control and records the holding effort of each (steps 4 to 6).
 
@@ -240,7 +240,7 @@ def collect(
     count: int,
     seed: int,
     executor: Executor,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], object] = lambda share: None,
 ) -> Recording:
     """`count` poses of a true arm with all its effects, each approached from both sides and averaged.
 

@@ -132,7 +132,7 @@ def feel(
     grip: Grip | None = None,
     frame_name: str = "",
     seed: int = 0,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], object] = lambda share: None,
 ) -> Felt:
     """Lets a hand lead the handle of a simulated arm along the way that `path` takes it.
 

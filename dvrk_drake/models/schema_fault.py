@@ -11,7 +11,7 @@ import dataclasses
 import difflib
 import math
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from numbers import Integral, Real
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -139,7 +139,7 @@ def _faults(schema: Any, value: Any, key: str, what: str, allowed: Range | None)
         ranges = {entry.name: entry.metadata.get(RANGE) for entry in dataclasses.fields(schema)}
         for name, entry in value.items():
             if name not in hints:
-                yield f"{f'{key}: ' if key else ''}key {_quoted(name)} is unknown; {_meant(name, hints)}" + (
+                yield f"{f'{key}: ' if key else ''}key {_quoted(name)} is unknown; {meant(name, hints)}" + (
                     f"allowed in {what}: {_keys(schema)}"
                 )
             else:
@@ -232,7 +232,8 @@ def _keys(schema: Any) -> str:
     return ", ".join(get_type_hints(schema))
 
 
-def _meant(name: Any, known: dict[str, Any]) -> str:
+def meant(name: object, known: Iterable[str]) -> str:
+    """Returns "did you mean ...? " with the known name that is most like a wrong one, or ""."""
     of_lower_case = {key.lower(): key for key in known}
     near = difflib.get_close_matches(str(name)[:_LONGEST].lower(), of_lower_case, 1)
     return f'did you mean "{of_lower_case[near[0]]}"? ' if near else ""

@@ -45,7 +45,7 @@ def live_view(arm: str, url: str) -> Iterator[subprocess.Popen]:
 
     A process of its own, because a loop at 1 kHz that draws is late. On Linux it also ends if this one is killed.
     """
-    command = [sys.executable, "-m", "dvrk_drake.cli", "view", arm, "--live", "--lcm-url", url]
+    command = [sys.executable, "-m", "dvrk_drake.cli", "view", "--arm", arm, "--live", "--lcm-url", url]
     viewer = subprocess.Popen(command, preexec_fn=_end_with_parent)  # noqa: PLW1509
     try:
         yield viewer

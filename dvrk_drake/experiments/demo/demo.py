@@ -24,6 +24,7 @@ from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.loop_closure import Closure
+from dvrk_drake.progress import Progress
 from dvrk_drake.recordings.recording import Recording, write_recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.arm_view import start_meshcat
@@ -133,7 +134,7 @@ def run_demo(
     output: Path,
     arm_name: str = "mtml",
     seed: int = 0,
-    progress: Callable[[str, float], None] = lambda what, share: None,
+    progress: Progress = lambda step, share: None,
 ) -> DemoResult:
     """Runs it and writes `output`, an existing folder.
 
@@ -152,9 +153,7 @@ def run_demo(
         return _run_demo(output, Path(folder) / "true_arm.sdf", arm_name, seed, progress)
 
 
-def _run_demo(
-    output: Path, true_sdf: Path, arm_name: str, seed: int, progress: Callable[[str, float], None]
-) -> DemoResult:
+def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: Progress) -> DemoResult:
     generator = np.random.default_rng(seed)
     arm, plan = load_arm(arm_name), PLANS[arm_name]
     nominal = IdentifiedModel.from_arm(arm)
@@ -189,7 +188,7 @@ def _run_demo(
     paper_model = identify_static(poses, arm, "paper").model
     fresh_paper = validate_static(paper_model, fresh_poses)
 
-    def third(index: int) -> Callable[[float], None]:
+    def third(index: int) -> Callable[[float], object]:
         return lambda share: progress("releasing and holding", (index + share) / 3)
 
     meshcat = start_meshcat(arm)
@@ -243,7 +242,7 @@ def _release(
     model: IdentifiedModel,
     plan: DemoPlan,
     meshcat: Meshcat | None,
-    progress: Callable[[float], None],
+    progress: Callable[[float], object],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Holds a pose, releases the arm under gravity compensation, drives it home; t (m,) and q (m, n)."""
     simulator, log, controller, desired = _closed_loop(station, model, plan.release)
@@ -262,7 +261,7 @@ def _release(
 
 
 def _step(
-    station: ArmStation, model: IdentifiedModel, plan: DemoPlan, progress: Callable[[float], None]
+    station: ArmStation, model: IdentifiedModel, plan: DemoPlan, progress: Callable[[float], object]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """From the plan's step to its home under gravity + PID; t (m,) and q (m, n)."""
     simulator, log, _, desired = _closed_loop(station, model, plan.step)

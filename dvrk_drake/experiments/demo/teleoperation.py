@@ -69,7 +69,7 @@ class _Samples:
 
 
 def play_teleoperation(
-    meshcat: Meshcat | None = None, duration: float = DURATION, progress: Callable[[float], None] = lambda share: None
+    meshcat: Meshcat | None = None, duration: float = DURATION, progress: Callable[[float], object] = lambda share: None
 ) -> TeleoperationResult:
     """Plays a hand that draws, turns the handle, lets the clutch go, comes back and draws on; records it in `meshcat`.
 

@@ -110,7 +110,7 @@ def _model(path: str) -> IdentifiedModel:
 
 
 def release_all(
-    cases: Sequence[Release], executor: Executor, progress: Callable[[float], None] = lambda share: None
+    cases: Sequence[Release], executor: Executor, progress: Callable[[float], object] = lambda share: None
 ) -> NDArray[np.float64]:
     """Positions (cases, samples, n) of each; they do not depend on the executor."""
     futures = [executor.submit(release, case) for case in cases]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +26,7 @@ from dvrk_drake.experiments.reproduction.published import (
 )
 from dvrk_drake.experiments.transparency import Compensation, Felt, feel, rambling_path
 from dvrk_drake.models.arm import Arm, load_arm
+from dvrk_drake.progress import Progress
 from dvrk_drake.recordings.recording import Recording, write_recording
 
 
@@ -70,7 +71,7 @@ class Laboratory:
         folder: that the results go to.
         recordings: of the paper's arm.
         executor: what is simulated runs there.
-        progress: called with what is being done and the finished share of it.
+        progress: called with the step and its finished share, 0..1.
         extent: how much is done.
         seed: of true arms, poses and noise.
     """
@@ -78,7 +79,7 @@ class Laboratory:
     folder: Path
     recordings: PaperRecordings
     executor: Executor
-    progress: Callable[[str, float], None] = lambda what, share: None
+    progress: Progress = lambda step, share: None
     extent: Extent = Extent()
     seed: int = 0
 

@@ -52,7 +52,7 @@ def paper_simulated_arm(arm: Arm, path: Path) -> Arm:
 
 
 def simulate_paper_controller(
-    arm: Arm, duration: float, faulty: bool, progress: Callable[[float], None] = lambda share: None
+    arm: Arm, duration: float, faulty: bool, progress: Callable[[float], object] = lambda share: None
 ) -> NDArray[np.float64]:
     """q (samples, n) every `PERIOD` under the paper's equation 11, with its node's fault or without.
 

@@ -149,7 +149,7 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
         executor.shutdown(cancel_futures=True)
 
 
-def await_results(futures: Sequence[Future[Result]], progress: Callable[[float], None]) -> list[Result]:
+def await_results(futures: Sequence[Future[Result]], progress: Callable[[float], object]) -> list[Result]:
     """The results of all futures in their order, or the first error; `progress` is called with the finished share."""
     for done, future in enumerate(as_completed(futures), start=1):
         future.result()

@@ -128,7 +128,7 @@ Method = Literal["paper", "model"]
 #: What gains are called in tables that no method has found.
 OWN, PUBLISHED = "the arm's own", "published"
 #: Called with the finished share, 0..1.
-Progress = Callable[[float], None]
+Progress = Callable[[float], object]
 #: Of the time that a run takes, the share of the procedure.
 PROCEDURE_SHARE = 0.5
 

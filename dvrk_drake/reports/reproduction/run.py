@@ -9,6 +9,7 @@ from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.experiments.reproduction.laboratory import Extent, Laboratory
 from dvrk_drake.experiments.reproduction.published import PaperRecordings
 from dvrk_drake.experiments.study.study import local_executor
+from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, reproduce_figure_6
 from dvrk_drake.reports.reproduction.mechanisms import reproduce_psm, reproduce_table_1
 from dvrk_drake.reports.reproduction.page import Section, write_page
@@ -19,7 +20,7 @@ from dvrk_drake.reports.transparency import reproduce_transparency
 _MAKERS: dict[str, Callable[[Laboratory], Section]] = {
     "table1": lambda laboratory: reproduce_table_1(),
     "fig4": lambda laboratory: reproduce_figure_4(
-        laboratory.recordings, laboratory.folder, lambda share: laboratory.progress("Fig. 4: identifying", share)
+        laboratory.recordings, laboratory.folder, step_progress(laboratory.progress, "identifying")
     ),
     "fig5": reproduce_figure_5,
     "fig6": reproduce_figure_6,
@@ -35,7 +36,7 @@ def reproduce(
     names: Sequence[str],
     folder: Path,
     recordings: PaperRecordings,
-    progress: Callable[[str, float], None] = lambda what, share: None,
+    progress: Progress = lambda step, share: None,
     extent: Extent | None = None,
     seed: int = 0,
 ) -> Path:
@@ -45,7 +46,7 @@ def reproduce(
         names: of `NAMES`.
         folder: an existing one.
         recordings: without them Fig. 4 is left out if other things are asked for, and Fig. 5 and 6 have another arm.
-        progress: called with what is being done and the finished share of it.
+        progress: called with a step, "fig5: releasing" for example, and its finished share, 0..1.
         extent: how much is done.
         seed: of true arms, poses and noise.
 
@@ -64,10 +65,16 @@ def reproduce(
         wanted.remove("fig4")
         left_out.append("Fig. 4 needs the recording of the paper's poses; name its folder with --data.")
     with local_executor() as executor:
-        laboratory = Laboratory(folder, recordings, executor, progress, extent or Extent(), seed)
+        laboratory = Laboratory(folder, recordings, executor, extent=extent or Extent(), seed=seed)
         sections: list[Section] = []
         for name in wanted:
+            progress(name, 0.0)
+            laboratory.progress = _within(progress, name)
             sections.append(_MAKERS[name](laboratory))
             unfinished = [f"{later} was not finished." for later in wanted[len(sections) :]]
             page = write_page(folder, sections, [*left_out, *unfinished])
     return page
+
+
+def _within(progress: Progress, name: str) -> Progress:
+    return lambda step, share: progress(f"{name}: {step}", share)

@@ -35,7 +35,7 @@ def reproduce_figure_7(laboratory: Laboratory, duration: float = DURATION) -> Se
     folder, mtm = laboratory.folder, laboratory.mtm
 
     def progress(share: float) -> None:
-        laboratory.progress("Fig. 7: stepping to zero", share)
+        laboratory.progress("stepping to zero", share)
 
     theirs_arm = paper_simulated_arm(load_arm(PAPER_ARM), folder / "paper_simulated_mtm.sdf")
     faulty = simulate_paper_controller(theirs_arm, duration, True, lambda share: progress(0.4 * share))

@@ -21,7 +21,7 @@ FLOOR = 1e-9
 
 
 def reproduce_figure_4(
-    recordings: PaperRecordings, folder: Path, progress: Callable[[float], None] = lambda share: None
+    recordings: PaperRecordings, folder: Path, progress: Callable[[float], object] = lambda share: None
 ) -> Section:
     """Squared torque errors of joints 2-7 at the paper's 72 poses; writes fig4.png into `folder`.
 

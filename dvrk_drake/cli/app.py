@@ -1,0 +1,88 @@
+"""The application behind the command line: groups of commands, and the options that several commands share.
+
+One thing has one name in all commands. What a command reads (recordings, scenarios, studies) is positional. Everything
+else is an option: --arm, --model, --output (a file), --folder, --plots (a folder), --json, --overwrite, --verbose.
+"""
+
+from __future__ import annotations
+
+import math
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import App, ArgumentCollection, Group, Parameter
+
+app = App(
+    name="dvrk-drake",
+    help="Model, identify, compensate and simulate da Vinci Research Kit arms with Drake.",
+    version=lambda: version("dvrk-drake"),
+    help_format="plaintext",
+    group_parameters=Group("Options", sort_key=1),
+    default_parameter=Parameter(negative=()),
+)
+MODEL, IDENTIFY, SIMULATE, HARDWARE, PAPER, OPTIONS = (
+    Group.create_ordered(name) for name in ("Model", "Identify", "Simulate", "Hardware", "Paper", "Options")
+)
+app["--help"].group = app["--version"].group = OPTIONS
+app.register_install_completion_command(
+    name="--install-completion", group=OPTIONS, help="Install the completion of commands for this shell."
+)
+
+
+def _complete_arm(_: Any) -> list[str]:
+    arms = Path(__file__).parents[1] / "models/arms"
+    return sorted(path.stem for path in arms.glob("*.yaml"))
+
+
+def _check_seconds(_: object, value: float | None) -> None:
+    if value is not None and not (math.isfinite(value) and value > 0):
+        raise ValueError("must be a number of seconds above 0")
+
+
+def _check_seed(_: object, value: int) -> None:
+    if value < 0:
+        raise ValueError("must be a whole number from 0")
+
+
+def one_of(title: str, least: int = 1) -> Group:
+    """A group of options of which a user gives `least`, 0 or 1, up to one."""
+
+    def check(arguments: ArgumentCollection) -> None:
+        if not least <= sum(argument.has_tokens for argument in arguments) <= 1:
+            names = " or ".join(argument.name for argument in arguments)
+            raise ValueError(f"give {'one of' if least else 'at most one of'} {names}")
+
+    return Group(title, validator=check, sort_key=0)
+
+
+Arm = Annotated[str, Parameter(metavar="ARM", completer=_complete_arm, help="mtml, mtmr, psm, or an arm's YAML file.")]
+Model = Annotated[str, Parameter(metavar="MODEL.yaml", help="An identified model, from identify.")]
+Coordinates = Annotated[Literal["joint", "actuator"], Parameter(help="Coordinates of q and tau in a CSV recording.")]
+Gravity = Annotated[
+    tuple[float, float, float] | None,
+    Parameter(
+        metavar="X Y Z",
+        help="Gravity in the arm's base frame [m/s^2], for another mounting. Without it: 0 0 -9.81, or as its file says.",
+    ),
+]
+Overwrite = Annotated[bool, Parameter(show_default=False, help="Replace files that exist. Without it they are kept.")]
+Verbose = Annotated[bool, Parameter(alias="-v", show_default=False, help="Print all details, not only the summary.")]
+Plots = Annotated[str | None, Parameter(metavar="FOLDER", help="Write figures into this folder, new or empty.")]
+Json = Annotated[str | None, Parameter(metavar="FILE", help="Write the results as JSON.")]
+Seed = Annotated[int, Parameter(validator=_check_seed, help="Seed of random numbers.")]
+Seconds = Annotated[float, Parameter(metavar="S", validator=_check_seconds)]
+Port = Annotated[int | None, Parameter(help="Port of the page. Without it: a free one.")]
+LcmUrl = Annotated[
+    str, Parameter(metavar="URL", show_default=False, help="LCM network. Without it: LCM_DEFAULT_URL, or LCM's own.")
+]
+Key = Annotated[
+    str | None,
+    Parameter(metavar="FILE", help="Key from dvrk-drake key that signs messages, the same on both sides."),
+]
+Realtime = Annotated[
+    bool, Parameter(show_default=False, help="Ask for real-time scheduling; a warning where it is not permitted.")
+]
+Set = Annotated[
+    list[str] | None, Parameter(metavar="KEY=VALUE", help="Change a value of the scenario; repeat for more.")
+]
