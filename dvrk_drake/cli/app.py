@@ -50,8 +50,8 @@ def one_of(title: str, least: int = 1) -> Group:
 
     def check(arguments: ArgumentCollection) -> None:
         if not least <= sum(argument.has_tokens for argument in arguments) <= 1:
-            names = " or ".join(argument.name for argument in arguments)
-            raise ValueError(f"give {'one of' if least else 'at most one of'} {names}")
+            names = ", ".join(argument.name for argument in arguments)
+            raise ValueError(f"give {'one' if least else 'at most one'} of {names}")
 
     return Group(title, validator=check, sort_key=0)
 
@@ -63,7 +63,7 @@ Gravity = Annotated[
     tuple[float, float, float] | None,
     Parameter(
         metavar="X Y Z",
-        help="Gravity in the arm's base frame [m/s^2], for another mounting. Without it: 0 0 -9.81, or as its file says.",
+        help="Gravity in the arm's base frame [m/s^2], for another mounting. Without it: 0 0 -9.81 or as in its file.",
     ),
 ]
 Overwrite = Annotated[bool, Parameter(show_default=False, help="Replace files that exist. Without it they are kept.")]

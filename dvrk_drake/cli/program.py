@@ -6,11 +6,12 @@ Commands import what they need when they run: drake and numba take seconds, `--h
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
 
-from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
+from cyclopts import CycloptsError, MissingArgumentError, UnknownCommandError, ValidationError
 
 from dvrk_drake.cli import collect, demo, export, identify, lcm, model, recordings, simulate
 from dvrk_drake.cli.app import app
@@ -54,7 +55,8 @@ def run(arguments: Sequence[str] | None) -> int:
         print(_usage_error(error, words), file=sys.stderr)
         return 2
     try:
-        import_interruptibly()
+        if command.__module__.startswith("dvrk_drake."):  # not the help or the version
+            import_interruptibly()
         if arguments is None:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         with folders_only_for_results():
@@ -75,12 +77,22 @@ def run(arguments: Sequence[str] | None) -> int:
 def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
     """What is wrong with the arguments, in one line that names the new option where an old one was given."""
     name = error.command_chain[0] if error.command_chain else ""
-    program = f"dvrk-drake {name}".rstrip()
-    message = " ".join(str(error).split()).rstrip(".")
     renamed = RENAMED.get(name, {})
     options = {word.partition("=")[0] for word in words if word.startswith("--")}
+    message = " ".join(str(error).split()).rstrip(".")
     if old := sorted(options & renamed.keys()):
         message = "; ".join(f"{option} is now {renamed[option]}" for option in old)
-    elif "" in renamed and isinstance(error, MissingArgumentError | UnusedCliTokensError):
-        message += f"; since version 0.2, {renamed['']} takes what was an argument without a name"
-    return f"dvrk-drake: error: {message}; see {program} --help"
+    elif isinstance(error, UnknownCommandError):
+        message = message.partition(" Available commands")[0]
+    elif isinstance(error, ValidationError):
+        message = (
+            error.exception_message if error.group else message.replace('". ', '": ', 1).replace(". must", ": must")
+        )
+        if "" in renamed and error.group and len(options) == 0:
+            message += f"; since version 0.2 {renamed['']} is an option"
+    elif isinstance(error, MissingArgumentError) and error.argument and error.argument.name not in options:
+        suggestion = re.search(r"Did you mean .*", message)
+        message = f"{error.argument.name} is required{'. ' + suggestion[0] if suggestion else ''}"
+        if error.argument.name == renamed.get(""):
+            message += " (since version 0.2 it is an option)"
+    return f"dvrk-drake: error: {message}; see {f'dvrk-drake {name}'.rstrip()} --help"

@@ -40,10 +40,13 @@ def simulate(
         output: Write t, q, qd and tau.
         meshcat: Show it in a browser, in real time.
     """
+    from dvrk_drake.models.arm import known_arms
     from dvrk_drake.reports.simulation import print_simulation
     from dvrk_drake.reports.terminal_tables import make_console
 
     quiet_drake()
+    if scenario in known_arms():
+        raise ScenarioError(f"{scenario} is an arm, not a scenario; name it with --arm {scenario}")
     source = arm or scenario or ""
     loaded = dvrk.load_scenario(source, set or [])
     folder = plots_folder(plots, overwrite=overwrite)

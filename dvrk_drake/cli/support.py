@@ -29,7 +29,7 @@ from rich.progress import (
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import leave
-from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.errors import DvrkDrakeError, ModelError
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -43,7 +43,8 @@ if TYPE_CHECKING:
 def import_interruptibly() -> None:
     """Imports what all commands need such that Ctrl-C ends the process at once.
 
-    Extension modules turn it into tracebacks. Nothing is half-written at that time. Where signals are not ours (a thread, a test) they are left alone.
+    Extension modules turn it into tracebacks. Nothing is half-written at that time. Where signals are not ours (a thread,
+    a test) they are left alone.
     """
     # Together these import what the others do.
     modules = ("dvrk_drake.reports.terminal_tables",)
@@ -180,6 +181,10 @@ def until_stopped(meshcat: Meshcat, meanwhile: Callable[[], object] = lambda: No
 
 def load_model(model: str | None, arm: str | None) -> IdentifiedModel:
     """Returns the model of the file --model, or what the SDF of --arm states; one of them is given."""
+    from dvrk_drake.models.arm import known_arms
+
+    if model in known_arms():
+        raise ModelError(f"{model} is an arm, not a model; name it with --arm {model}")
     if model is not None:
         return dvrk.IdentifiedModel.load(model)
     assert arm is not None
