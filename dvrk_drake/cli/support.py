@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 def import_interruptibly() -> None:
     """Imports what all commands need such that Ctrl-C ends the process at once.
 
-    Extension modules turn it into tracebacks. Nothing is half-written at that time. Where signals are not ours (a thread,
-    a test) they are left alone.
+    Extension modules turn it into tracebacks. Nothing is half-written at that time. Where signals are not ours
+    (a thread, a test) they are left alone.
     """
     # Together these import what the others do.
     modules = ("dvrk_drake.reports.terminal_tables",)
