@@ -29,11 +29,9 @@ COMMANDS = model, recordings, identify, export, simulate, demo, lcm, collect
 RENAMED = {
     "model": {"": "--arm", "--latex": "--format latex", "--python": "--format python", "--c": "--format c"},
     "view": {"": "--arm"},
-    "simulate": {"": "--arm"},
     "validate": {"": "--model"},
     "predict": {"": "--model"},
     "recalibrate": {"": "--model"},
-    "export": {"": "--model or --arm"},
     "convert": {"": "--output", "--format": "--input-format"},
     "record": {"": "--output"},
     "key": {"": "--output"},
@@ -85,11 +83,9 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
     elif isinstance(error, UnknownCommandError):
         message = message.partition(" Available commands")[0]
     elif isinstance(error, ValidationError):
-        message = (
-            error.exception_message if error.group else message.replace('". ', '": ', 1).replace(". must", ": must")
-        )
-        if "" in renamed and error.group and len(options) == 0:
-            message += f"; since version 0.2 {renamed['']} is an option"
+        message = error.exception_message if error.group else message.replace(". must", ": must")
+    elif isinstance(error, UnusedCliTokensError):
+        message = f"Unexpected argument: {' '.join(error.unused_tokens or [])}"
     elif isinstance(error, MissingArgumentError) and error.argument and error.argument.name not in options:
         suggestion = re.search(r"Did you mean .*", message)
         message = f"{error.argument.name} is required{'. ' + suggestion[0] if suggestion else ''}"
