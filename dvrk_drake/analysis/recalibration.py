@@ -109,8 +109,10 @@ def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progr
     """
     dynamics = model.dynamic_model
     report = require_usable(recording, dynamics.arm, progress)
+    share = step_progress(progress, "refitting friction")
+    share(0.0)
     result = refit_friction(model, recording)
-    step_progress(progress, "refitting friction")(1.0)
+    share(1.0)
     return replace(result, warnings=report.warnings)
 
 

@@ -51,6 +51,8 @@ def validate(
     arm = model.arm
     poses = find_poses(recording, arm, slow_parts)
     report = require_usable(poses.recording, arm, progress)
+    share = step_progress(progress, "validating")
+    share(0.0)
     validation: StaticValidation | DynamicValidation
     if poses.moves and model.dynamics is not None:
         validation = validate_motion(model, poses.recording)
@@ -59,7 +61,7 @@ def validate(
     else:
         validation = validate_static(model, poses.recording, poses.measured)
         found = _motion(poses.recording.motion(arm), report.source)
-    step_progress(progress, "validating")(1.0)
+    share(1.0)
     if validation.of_same_recording:
         what = "the model was identified from this recording, so these are errors of the fit"
         found += (Finding("warning", "same recording", report.source, what, "validate with another one"),)
@@ -103,8 +105,10 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
     if model.dynamics is None or not find_poses(measured, arm).moves:
         return Prediction(predict_static(model, recording))
     report = require_usable(measured, arm, progress, apart_from="no effort" if recording.tau is None else "")
+    share = step_progress(progress, "predicting")
+    share(0.0)
     tau = predict_motion(model, recording)
     if recording.coordinates == "joint":
         tau = arm.transmission.pull_back_effort(tau)
-    step_progress(progress, "predicting")(1.0)
+    share(1.0)
     return Prediction(tau, report.warnings)

@@ -11,7 +11,13 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from cyclopts import CycloptsError, MissingArgumentError, UnknownCommandError, ValidationError
+from cyclopts import (
+    CycloptsError,
+    MissingArgumentError,
+    UnknownCommandError,
+    UnusedCliTokensError,
+    ValidationError,
+)
 
 from dvrk_drake.cli import collect, demo, export, identify, lcm, model, recordings, simulate
 from dvrk_drake.cli.app import app

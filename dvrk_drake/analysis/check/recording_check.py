@@ -245,8 +245,10 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
         >>> [finding.kind for finding in report.refusals]
         ['unusable']
     """
+    share = step_progress(progress, "checking the recording")
+    share(0.0)
     report = check_with_channels(recording, arm)
-    step_progress(progress, "checking the recording")(1.0)
+    share(1.0)
     if report.refusals:
         return report
     refusals = _refusals_of_identify(recording, arm)
