@@ -51,8 +51,9 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 def _demo(options: argparse.Namespace) -> None:
     from dvrk_drake.experiments.demo.demo import run_demo
-    from dvrk_drake.reports.figures import plot_demo
-    from dvrk_drake.reports.terminal_tables import make_console, print_demo
+    from dvrk_drake.reports.demo import print_demo
+    from dvrk_drake.reports.figures.demo import plot_demo
+    from dvrk_drake.reports.terminal_tables import make_console
 
     quiet_drake()
     output = made_folder(options.output)
@@ -67,7 +68,8 @@ def _demo(options: argparse.Namespace) -> None:
 def _teleop(options: argparse.Namespace) -> None:
     from dvrk_drake.experiments.demo.teleoperation import play_teleoperation, run_live_teleoperation, start_scene
     from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.reports.terminal_tables import make_console, print_teleoperation
+    from dvrk_drake.reports.demo import print_teleoperation
+    from dvrk_drake.reports.terminal_tables import make_console
 
     quiet_drake()
     if options.html is None:

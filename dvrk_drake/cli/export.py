@@ -92,7 +92,7 @@ def _export(options: argparse.Namespace) -> None:
 def _compare(options: argparse.Namespace) -> None:
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-    from dvrk_drake.reports.export import plot_compensation, print_comparison
+    from dvrk_drake.reports.export import print_comparison
     from dvrk_drake.reports.terminal_tables import make_console
 
     for path in (options.plot, options.json):
@@ -109,6 +109,8 @@ def _compare(options: argparse.Namespace) -> None:
     for warning in comparison.warnings:
         print(f"dvrk-drake: warning: {options.file}: {warning}", file=sys.stderr, flush=True)
     if options.plot is not None:
+        from dvrk_drake.reports.figures.export import plot_compensation
+
         plot_compensation(options.plot, comparison, f"{options.file} and {options.model} over the joint box, at rest")
         console.print(f"plot: {options.plot}", soft_wrap=True)
     if options.json is not None:

@@ -94,7 +94,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _identify(options: argparse.Namespace) -> None:
-    from dvrk_drake.reports.identification import plot_identification, print_identification
+    from dvrk_drake.reports.identification import print_identification
     from dvrk_drake.reports.terminal_tables import make_console
 
     check_output(options.output, options.recording, overwrite=options.overwrite)
@@ -110,13 +110,15 @@ def _identify(options: argparse.Namespace) -> None:
     print_warnings(console, result.warnings)
     if result.note:
         console.print(result.note)
-    print_identification(console, result)
+    print_identification(console, result, model_path=options.output)
     result.save(options.output, overwrite=True)
     console.print(f"model: {options.output}")
     if options.tables is not None:
-        write_tables(options.tables, lambda file: print_identification(file, result, full=True))
+        write_tables(options.tables, lambda file: print_identification(file, result, verbose=True))
         console.print(f"all parameters: {options.tables}")
     if plots is not None:
+        from dvrk_drake.reports.figures.identification import plot_identification
+
         plot_identification(plots, result)
         console.print(f"plots: {options.plots}")
 
@@ -130,7 +132,7 @@ def _model_and_recording(options: argparse.Namespace) -> tuple[dvrk.IdentifiedMo
 
 
 def _validate(options: argparse.Namespace) -> None:
-    from dvrk_drake.reports.identification import plot_validation, print_validation
+    from dvrk_drake.reports.identification import print_validation
     from dvrk_drake.reports.terminal_tables import make_console
 
     if options.json is not None:
@@ -152,8 +154,10 @@ def _validate(options: argparse.Namespace) -> None:
     if options.json is not None:
         write_json(options.json, validation.as_dict())
     console = make_console()
-    print_validation(console, validation)
+    print_validation(console, validation, model_path=options.model)
     if plots is not None:
+        from dvrk_drake.reports.figures.identification import plot_validation
+
         plot_validation(plots, validation)
         console.print(f"plots: {options.plots}")
     if validation.note:
@@ -190,13 +194,13 @@ def _recalibrate(options: argparse.Namespace) -> None:
     with ProgressBar("recalibrating") as bar:
         result = dvrk.recalibrate(model, recording, progress=bar)
     console = make_console()
-    print_recalibration(console, result)
+    print_recalibration(console, result, model_path=options.output)
     result.save(options.output, overwrite=True)
     console.print(f"model: {options.output}")
 
 
 def _payload(options: argparse.Namespace) -> None:
-    from dvrk_drake.reports.payload import print_links, print_payload
+    from dvrk_drake.reports.payload import print_payload
     from dvrk_drake.reports.terminal_tables import make_console
 
     model = None if options.model is None else dvrk.IdentifiedModel.load(options.model)
@@ -212,10 +216,8 @@ def _payload(options: argparse.Namespace) -> None:
         result = dvrk.payload(reference, loaded, model or arm, options.link, progress=bar)
     console = make_console()
     other_link = [warning for warning in result.warnings if warning.kind == "other link"]
-    if options.link is None or other_link:
-        print_links(console, result.estimates)
+    print_payload(console, result)
     print_warnings(console, other_link)
-    print_payload(console, result.payload, result.estimates)
     if options.json is not None:
         write_json(options.json, result.as_dicts())
 

@@ -59,7 +59,7 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    from dvrk_drake.reports.recording_check import plot_report, print_report
+    from dvrk_drake.reports.recording_check import print_report
     from dvrk_drake.reports.terminal_tables import make_console
 
     arm = dvrk.load_arm(options.arm)
@@ -70,11 +70,14 @@ def _check(options: argparse.Namespace) -> None:
         recording = dvrk.read_recording(options.recording, arm, options.coordinates, progress=bar)
         bar("checking the recording", 0.0)
         report = dvrk.check(recording, arm, progress=bar)
-    print_report(make_console(), report)
+    print_report(make_console(), report, arm=options.arm)
     if options.json is not None:
         write_json(options.json, report.as_dict())
-    if plots is not None and not plot_report(plots, report, recording, arm):
-        print("no plots: spectra need a motion with efforts at a known rate", file=sys.stderr)
+    if plots is not None:
+        from dvrk_drake.reports.figures.recording_check import plot_report
+
+        if not plot_report(plots, report, recording, arm):
+            print("no plots: spectra need a motion with efforts at a known rate", file=sys.stderr)
     if report.refusals:
         raise RecordingError(report.refusal)
 

@@ -41,8 +41,9 @@ def _add_simulate(verbs: argparse._SubParsersAction) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    from dvrk_drake.reports.figures import plot_simulation
-    from dvrk_drake.reports.terminal_tables import make_console, print_simulation
+    from dvrk_drake.reports.figures.simulation import plot_simulation
+    from dvrk_drake.reports.simulation import print_simulation
+    from dvrk_drake.reports.terminal_tables import make_console
 
     quiet_drake()
     scenario = dvrk.load_scenario(options.scenario, options.set)
@@ -86,7 +87,8 @@ def _add_study(verbs: argparse._SubParsersAction) -> None:
 def _study(options: argparse.Namespace) -> None:
     from dvrk_drake.experiments.study.study import dask_executor, run_study, run_study_locally
     from dvrk_drake.experiments.study.study_file import load_study
-    from dvrk_drake.reports.study import plot_study, print_study
+    from dvrk_drake.reports.figures.study import plot_study
+    from dvrk_drake.reports.study import print_study
     from dvrk_drake.reports.terminal_tables import make_console
 
     quiet_drake()
@@ -138,8 +140,9 @@ def _tune(options: argparse.Namespace) -> None:
     from dvrk_drake.experiments.tuning.tuning import Method, tune_arm
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.arm_schema import save_gains
+    from dvrk_drake.reports.figures.tuning import plot_steps
     from dvrk_drake.reports.terminal_tables import make_console
-    from dvrk_drake.reports.tuning import plot_steps, print_tuning
+    from dvrk_drake.reports.tuning import print_tuning
 
     quiet_drake()
     arm = load_arm(options.arm)
@@ -202,8 +205,9 @@ def _transparency(options: argparse.Namespace) -> None:
     from dvrk_drake.experiments.transparency import feel, rambling_path, recorded_path
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.recordings.recording import read_recording
+    from dvrk_drake.reports.figures.transparency import plot_transparency
     from dvrk_drake.reports.terminal_tables import make_console
-    from dvrk_drake.reports.transparency import plot_transparency, print_transparency, write_transparency
+    from dvrk_drake.reports.transparency import print_transparency, write_transparency
 
     quiet_drake()
     arm = load_arm(options.arm)

@@ -39,7 +39,7 @@ def import_interruptibly() -> None:
     Nothing is half-written at that time. Where signals are not ours (a thread, a test) they are left alone.
     """
     # Together these import what the others do.
-    modules = ("dvrk_drake.reports.figures", "dvrk_drake.reports.terminal_tables")
+    modules = ("dvrk_drake.reports.figures.demo", "dvrk_drake.reports.identification")
     if threading.current_thread() is not threading.main_thread() or sys.modules.keys() >= set(modules):
         return
 
@@ -221,10 +221,10 @@ def print_notes(path: str, notes: Sequence[str]) -> None:
 def write_tables(path: str, print_to: Callable[[Console], object]) -> None:
     """Writes what `print_to` prints into a text file."""
     from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.reports.terminal_tables import TABLE_WIDTH
+    from dvrk_drake.reports.terminal_tables import TABLE_WIDTH, TableConsole
 
     with atomic_write(path) as stream:
-        print_to(Console(file=stream, highlight=False, width=TABLE_WIDTH))
+        print_to(TableConsole(file=stream, highlight=False, width=TABLE_WIDTH))
 
 
 def add_recording(verb: argparse.ArgumentParser) -> None:
