@@ -28,8 +28,8 @@ def demo(
         arm: The arm to simulate.
     """
     from dvrk_drake.experiments.demo.demo import run_demo
-    from dvrk_drake.reports.figures import plot_demo
-    from dvrk_drake.reports.simulation import print_demo
+    from dvrk_drake.reports.demo import print_demo
+    from dvrk_drake.reports.figures.demo import plot_demo
     from dvrk_drake.reports.terminal_tables import make_console
 
     quiet_drake()
@@ -58,7 +58,7 @@ def teleop(
     """
     from dvrk_drake.experiments.demo.teleoperation import play_teleoperation, run_live_teleoperation, start_scene
     from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.reports.simulation import print_teleoperation
+    from dvrk_drake.reports.demo import print_teleoperation
     from dvrk_drake.reports.terminal_tables import make_console
 
     quiet_drake()

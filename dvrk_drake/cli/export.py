@@ -136,7 +136,7 @@ def compare_gc(
     for warning in comparison.warnings:
         print(f"dvrk-drake: warning: {file}: {warning}", file=sys.stderr, flush=True)
     if folder is not None:
-        from dvrk_drake.reports.export import plot_compensation
+        from dvrk_drake.reports.figures.export import plot_compensation
 
         plot_compensation(folder / "compensation.png", comparison, f"{file} and {origin} over the joint box, at rest")
         print_written(folder)

@@ -74,14 +74,14 @@ def identify(
         print_notes(recording, read.notes)
         result = dvrk.identify(read, recorded_arm, method=method, slow_parts=slow_parts, progress=steps)
     console = make_console()
-    print_identification(console, result, verbose=verbose)
+    print_identification(console, result, model_path=output, verbose=verbose)
     if result.note:
         console.print(result.note)
     print_warnings(console, result.warnings)
     result.save(output, overwrite=True)
     print_written(output)
     if folder is not None:
-        from dvrk_drake.reports.identification import plot_identification
+        from dvrk_drake.reports.figures.identification import plot_identification
 
         plot_identification(folder, result)
         print_written(folder)
@@ -140,12 +140,12 @@ def validate(
     if json is not None:
         write_json(json, validation.as_dict())
     console = make_console()
-    print_validation(console, validation, verbose=verbose)
+    print_validation(console, validation, model_path=model, verbose=verbose)
     if validation.note:
         console.print(validation.note)
     print_warnings(console, validation.warnings)
     if folder is not None:
-        from dvrk_drake.reports.identification import plot_validation
+        from dvrk_drake.reports.figures.identification import plot_validation
 
         plot_validation(folder, validation)
         print_written(folder)
@@ -210,7 +210,7 @@ def recalibrate(
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "refitting friction") as steps:
         result = dvrk.recalibrate(*_model_and_recording(model, recording, coordinates, steps), progress=steps)
-    print_recalibration(make_console(), result, verbose=verbose)
+    print_recalibration(make_console(), result, model_path=output, verbose=verbose)
     result.save(output, overwrite=True)
     print_written(output)
 

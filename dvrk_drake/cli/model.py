@@ -32,7 +32,8 @@ def model(
     from dvrk_drake.export import gravity_sources
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.reports.terminal_tables import make_console, print_symbolic_model
+    from dvrk_drake.reports.model import print_symbolic_model
+    from dvrk_drake.reports.terminal_tables import make_console
 
     if output is not None:
         if format is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
@@ -41,16 +42,18 @@ def check(
     with Steps("reading", "checking the recording") as steps:
         checked = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
         report = dvrk.check(checked, recorded_arm, progress=steps)
-    print_report(make_console(), report, verbose=verbose)
+    print_report(make_console(), report, arm=arm, verbose=verbose)
     if json is not None:
         write_json(json, report.as_dict())
     if folder is not None:
-        from dvrk_drake.reports.recording_check import plot_report
+        from dvrk_drake.reports.figures.recording_check import plot_report
 
         if plot_report(folder, report, checked, recorded_arm):
             print_written(folder)
         else:
             print_notes(recording, ["no plots: spectra need a motion with efforts at a known rate"])
+    for refusal in report.refusals[1:]:
+        print(f"dvrk-drake: {refusal}", file=sys.stderr)
     if report.refusals:
         raise RecordingError(report.refusal)
 

@@ -62,7 +62,7 @@ def simulate(
         dvrk.write_recording(simulation.recording, output)
         print_written(output, f"{len(simulation.recording)} rows")
     if folder is not None:
-        from dvrk_drake.reports.figures import plot_simulation
+        from dvrk_drake.reports.figures.simulation import plot_simulation
 
         plot_simulation(folder / "positions.png", simulation, loaded)
         print_written(folder)
@@ -122,7 +122,7 @@ def study(
     print_study(make_console(), loaded, rows, verbose=verbose)
     print_written(output, f"{len(rows)} runs")
     if folder is not None:
-        from dvrk_drake.reports.study import plot_study
+        from dvrk_drake.reports.figures.study import plot_study
 
         plot_study(folder / "study.png", loaded, rows)
         print_written(folder)
@@ -167,7 +167,7 @@ def tune(
         save_gains(tuning.found[best], output, f"{tuned.name}: dvrk-drake tune --arm {arm}, method {best}.")
         print_written(output)
     if folder is not None:
-        from dvrk_drake.reports.tuning import plot_steps
+        from dvrk_drake.reports.figures.tuning import plot_steps
 
         plot_steps(folder / "steps.png", tuning.comparison)
         print_written(folder)
@@ -228,7 +228,7 @@ def transparency(
         write_transparency(Path(output), felt)
         print_written(output)
     if folder is not None:
-        from dvrk_drake.reports.transparency import plot_transparency
+        from dvrk_drake.reports.figures.transparency import plot_transparency
 
         plot_transparency(folder / "transparency.png", led, felt)
         print_written(folder)

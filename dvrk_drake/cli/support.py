@@ -47,7 +47,7 @@ def import_interruptibly() -> None:
     (a thread, a test) they are left alone.
     """
     # Together these import what the others do.
-    modules = ("dvrk_drake.reports.terminal_tables",)
+    modules = ("dvrk_drake.reports.identification",)
     if threading.current_thread() is not threading.main_thread() or sys.modules.keys() >= set(modules):
         return
 
@@ -149,7 +149,7 @@ def plots_folder(path: str | None, *, overwrite: bool) -> Path | None:
     if path is None:
         return None
     with interrupt_ends_process():
-        importlib.import_module("dvrk_drake.reports.figures")
+        importlib.import_module("dvrk_drake.reports.figures.style")
     return new_folder(path, overwrite=overwrite)
 
 

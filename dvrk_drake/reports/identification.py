@@ -1,161 +1,215 @@
-"""Identified models, recalibrations and their errors on recordings: tables in a terminal, and figures of efforts."""
+"""Identified models, recalibrations and their errors on recordings as text in a terminal."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification
-from dvrk_drake.analysis.dynamic.estimates import DRY_KINDS, LEAST_TOLD
-from dvrk_drake.analysis.dynamic.validation import DynamicValidation, validate_motion
+from dvrk_drake.analysis.dynamic.estimates import LEAST_TOLD
+from dvrk_drake.analysis.dynamic.validation import DynamicValidation
 from dvrk_drake.analysis.recalibration import FOLDS, Recalibration
 from dvrk_drake.analysis.results import Identification, Validation
+from dvrk_drake.analysis.static.doubts import Doubt
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
 from dvrk_drake.analysis.static.validation import StaticValidation
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS
-from dvrk_drake.dynamics.dynamic_section import (
-    ActuatorStatistics,
-    CorrelatedEstimates,
-    DynamicSection,
-)
+from dvrk_drake.analysis.verdict import cross_validated_verdicts, rule_text, worst
+from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect
+from dvrk_drake.dynamics.dynamic_section import CorrelatedEstimates, DynamicSection
+from dvrk_drake.dynamics.gravity_regressor import derive_gravity
+from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.dynamics.physical_consistency import total_mass_reached
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.reports.figures import (
-    MEASURED_COLOUR,
-    MODEL_COLOUR,
-    ZERO_COLOUR,
-    plot_static_identification,
-    plot_static_validation,
-    save_figure,
-)
-from dvrk_drake.reports.terminal_tables import (
-    VERDICT_STYLES,
-    make_table,
-    print_doubts,
-    print_model,
-    print_rule,
-    print_static_validation,
-    print_verdict,
-)
+from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
-#: On a screen: base parameters of more than so many standard errors, so many pairs, so many effects beside friction.
-SHOWN_BEYOND, SHOWN_PAIRS, SHOWN_EFFECTS = 10.0, 5, 10
+#: Colours of rows by verdict.
+_STYLES: dict[Verdict, str] = {"do not use": "red", "not judged": "yellow"}
+_EFFECT_COLUMNS = ("", "kind", "scale", "value", "+-", "unit if revolute")
+_NAME_WIDTH, _REMARK_WIDTH = 64, 26
 
 
-def print_identification(console: Console, result: Identification, full: bool = False) -> None:
-    """Prints parameters, effects and errors.
+def print_identification(
+    console: Console, result: Identification, *, model_path: str = "MODEL.yaml", verbose: bool = False
+) -> None:
+    """Prints the verdict by cross-validation and the error of each joint.
 
     Args:
         console: to print to.
-        result: of poses or of a motion.
-        full: print every parameter, and nothing but the model.
+        result: from poses or from a motion.
+        model_path: file that the model is written to, for the next command.
+        verbose: also print every parameter with its standard error, and the excluded measurements.
     """
+    verdicts = cross_validated_verdicts(result.model)
+    next_command = f"validate OTHER.csv --model {model_path} --save"
+    if worst(verdicts)[0] == "do not use":
+        next_command = f"check {result.recording.source or 'RECORDING.csv'} --arm {result.model.arm.source}"
     if isinstance(result, DynamicIdentification):
-        print_dynamics(console, result, full)
+        actuators = result.model.dynamic_model.section.actuators
+        fit, held_out = (
+            np.mean([getattr(a, which) / a.rms_effort for a in actuators if a.rms_effort > 0])
+            for which in ("rms_fit", "rms_cross_validation")
+        )
+        error = f"Mean effort error {_percent(fit)} in the fit, {_percent(held_out)} cross-validated."
+        _print_verdict(console, verdicts, error, next_command)
+        _print_motion_errors(console, result, verdicts)
+        if verbose:
+            _print_motion_details(console, result)
     elif isinstance(result, StaticIdentification):
-        if not full:
-            print_doubts(console, result.doubts)
-        print_model(console, result.model)
-        if not full and len(result.recording) < result.num_rows:
-            console.print(
-                f"{result.num_rows} rows are {len(result.recording)} distinct poses; samples of a pose are averaged"
-            )
+        joints = result.model.joints
+        errors = np.array([j.rms_cross_validation_undoubted for j in joints])
+        torques = np.array([j.rms_zero_torque_undoubted for j in joints])
+        error = _largest_error(result.model.arm, errors, torques, "cross-validated ")
+        _print_verdict(console, verdicts, error, next_command)
+        _print_pose_errors(console, result, verdicts)
+        if verbose:
+            _print_pose_details(console, result)
 
 
-def print_validation(console: Console, validation: Validation) -> None:
-    """Prints verdicts and errors on poses or on a motion."""
+def print_validation(
+    console: Console, validation: Validation, *, model_path: str = "MODEL.yaml", verbose: bool = False
+) -> None:
+    """Prints the verdict on a recording and the error of each joint.
+
+    Args:
+        console: to print to.
+        validation: on poses or on a motion.
+        model_path: file of the model, for the next command.
+        verbose: also print the rule behind the verdicts, the kinds of errors, and the excluded measurements.
+    """
+    verdicts, model = validation.verdicts, validation.model
+    source = validation.recording.source or "RECORDING.csv"
+    next_command = f"run --arm {model.arm.source} --model {model_path} --mode gravity"
+    if validation.of_same_recording:
+        next_command = f"validate OTHER.csv --model {model_path} --save"
+    elif validation.verdict == "do not use":
+        next_command = f"check {source} --arm {model.arm.source}"
+        if model.dynamics is not None:
+            next_command = f"recalibrate {source} --model {model_path} --output NEW.yaml"
     if isinstance(validation, DynamicValidation):
-        print_dynamic_validation(console, validation)
+        error = f"Mean effort error {_percent(validation.mean_relative_error)}."
+        _print_verdict(console, verdicts, error, next_command)
+        _print_motion_validation(console, validation, verbose)
     elif isinstance(validation, StaticValidation):
-        print_static_validation(console, validation)
-        print_doubts(console, validation.doubts)
+        errors = np.array([j.rms_error_undoubted for j in validation.joints])
+        torques = np.array([j.rms_torque_undoubted for j in validation.joints])
+        error = _largest_error(model.arm, errors, torques)
+        _print_verdict(console, verdicts, error, next_command)
+        _print_pose_validation(console, validation, verbose)
 
 
-def plot_identification(folder: Path, result: Identification) -> None:
-    """Writes PNGs of fitted and predicted efforts; a motion's as `plot_motion`."""
-    if isinstance(result, DynamicIdentification):
-        fit = validate_motion(result.model, result.recording)
-        arm = result.model.arm
-        plot_motion(folder, arm, fit, f"{arm.name}, fitted to {Path(result.recording.source).name}")
-    elif isinstance(result, StaticIdentification):
-        plot_static_identification(folder, result)
+def print_recalibration(
+    console: Console, result: Recalibration, *, model_path: str = "MODEL.yaml", verbose: bool = False
+) -> None:
+    """Prints errors before and after, and the new friction and offsets.
+
+    Args:
+        console: to print to.
+        result: to print.
+        model_path: file that the new model is written to, for the next command.
+        verbose: also print how errors are computed, and friction that actuators share.
+    """
+    before, after = (float(np.mean([getattr(a, which) for a in result.actuators])) for which in ("before", "after"))
+    kept = sum(a.kept for a in result.actuators)
+    print_answer(
+        console,
+        f"Mean effort error {_percent(before)} before and {_percent(after)} after the refit, cross-validated; "
+        f"{kept} of {len(result.actuators)} actuators refitted.",
+        f"validate OTHER.csv --model {model_path} --save",
+    )
+    table = make_table(
+        f"{result.model.arm.name}, {result.seconds:.1f} s of motion: effort error, and change of friction and offset",
+        *("", "error before", "error after", "dry friction factor", "viscous factor", "offset change [N m; N]", ""),
+    )
+    for a in result.actuators:
+        new = [_factor(a.dry), _factor(a.viscous), f"{a.offset:+.4f}"] if a.kept else ["", "", ""]
+        table.add_row(a.name, _percent(a.before), _percent(a.after), *new, "" if a.kept else f"unchanged: {a.reason}")
+    table.columns[-1].justify, table.columns[-1].no_wrap = "left", False
+    table.add_row("mean", _percent(before), _percent(after), "", "", "", "")
+    console.print(table)
+    print_note(
+        console,
+        "The gain is for motions like the recalibration recording. At other positions and speeds it can be much "
+        "smaller: validate the new model on the motion that you need.",
+    )
+    if not verbose:
+        return
+    print_note(
+        console,
+        f"Error: |measured - predicted| / |measured effort| of the actuators, after the model's low-pass filter. "
+        f"After: {FOLDS}-fold cross-validation over the motion. Factors and offsets: fitted to the whole motion.",
+    )
+    if result.shared:
+        shared = ", ".join(f"{name} x {scale:.2f}" for name, scale in result.shared.items())
+        console.print(f"Friction that several actuators share: {shared}", markup=False)
 
 
-def plot_validation(folder: Path, validation: Validation) -> None:
-    """Writes PNGs of errors; a motion's as `plot_motion`."""
-    if isinstance(validation, DynamicValidation):
-        arm = validation.model.arm
-        plot_motion(folder, arm, validation, f"{arm.name}, {Path(validation.recording.source).name}")
-    elif isinstance(validation, StaticValidation):
-        plot_static_validation(folder, validation)
+def _print_verdict(console: Console, verdicts: Mapping[str, Verdict], error: str, next_command: str) -> None:
+    """The least favourable verdict and the joints that have it, the error, and the joints without torque."""
+    verdict, names = worst(verdicts)
+    which = "" if len(names) == len(verdicts) else f" ({', '.join(names)})"
+    off = [name for name, v in verdicts.items() if v == "off"]
+    disabled = f" Feedforward disabled: {', '.join(off)}." if off else ""
+    answer = f"Verdict: {verdict}{which}. {error}{disabled}"
+    print_answer(console, answer, next_command, _STYLES.get(verdict, "green"))
 
 
-def print_dynamics(console: Console, result: DynamicIdentification, full: bool = False) -> None:
-    """Links, base parameters, the drive, and how each actuator's effort was fitted; `full`: every number of them."""
+def _largest_error(arm: Arm, errors: np.ndarray, torques: np.ndarray, kind: str = "") -> str:
+    """Names the joint with the largest error as a share of its effort limit."""
+    j = int(np.nanargmax(np.where(torques > 0, errors / arm.effort_limits, -1.0)))
+    unit = "N" if arm.prismatic[j] else "N m"
+    share = f", {_percent(errors[j] / torques[j])} of its measured torque" if torques[j] > 0 else ""
+    return f"Largest {kind}error {errors[j]:.3g} {unit} ({arm.joint_names[j]}){share}."
+
+
+def _print_motion_errors(console: Console, result: DynamicIdentification, verdicts: Mapping[str, Verdict]) -> None:
     section = result.model.dynamic_model.section
-    _print_links(console, section, result.nominal_mass)
-    _print_base_parameters(console, section, full)
-    if full:
-        _print_effects(console, section)
-    _print_drive(console, section, result.dry_friction)
+    title = f"{result.model.arm.name}, {len(result.recording)} rows of motion: RMS effort error of the actuators"
+    columns = ("", "measured effort [N m; N]", "error in the fit", "cross- validated", "repeat- ability", "verdict")
+    table = make_table(title, *columns)
+    table.columns[-1].justify = "left"
+    errors = ("rms_fit", "rms_cross_validation", "rms_repeatability")
+    shares = {
+        a.name: [getattr(a, which) / a.rms_effort if a.rms_effort > 0 else 0.0 for which in errors]
+        for a in section.actuators
+    }
+    for a in section.actuators:
+        verdict = verdicts[a.name]
+        cells = (_percent(share) if share > 0 else "" for share in shares[a.name])
+        table.add_row(a.name, f"{a.rms_effort:.4f}", *cells, verdict, style=_STYLES.get(verdict, ""))
+    moved = [shares[a.name] for a in section.actuators if a.rms_effort > 0]
+    means = np.mean(moved, axis=0) if moved else np.zeros(3)
+    table.add_row("mean", "", *(_percent(mean) if mean > 0 else "" for mean in means), "")
+    console.print(table)
     tilt = np.degrees(_angle(np.array(section.gravity), np.array(section.gravity_expected)))
     if tilt > 0.1:
+        gravity = ", ".join(f"{x:.3f}" for x in section.gravity)
         console.print(
-            f"gravity in the base frame: {', '.join(f'{x:.3f}' for x in section.gravity)} m/s^2, {tilt:.1f} deg from "
-            "what was expected: the base leans, or was not levelled\n",
-            soft_wrap=True,
+            f"The base is tilted by {tilt:.1f} deg: gravity in the base frame is {gravity} m/s^2.", markup=False
         )
-    title = f"Efforts of the actuators behind {section.signals.effort_cut_off:g} Hz [N m; N]"
-    table = make_table(title, "", "measured RMS", "error, fit", "cross-validated*", "%, fit", "%, cross*", "%, floor**")
-    for a in section.actuators:
-        shares = [_percent(x, a.rms_effort) for x in (a.rms_fit, a.rms_cross_validation, a.rms_repeatability)]
-        numbers = (a.rms_effort, a.rms_fit, a.rms_cross_validation)
-        table.add_row(a.name, *(f"{x:.4f}" for x in numbers), *shares)
-    table.add_row("mean", "", "", "", *(_mean_percent(section.actuators, w) for w in _MEANS))
-    console.print(table)
-    console.print(
-        "* sixths of the motion's phases (stretches, if it does not repeat) predicted by models that know nothing of "
-        "them: neither parameters nor the choice of effects nor how the base leans. What the arm's file says of its "
-        "drives flatters, for it was chosen on such motions; on another day friction is another",
-        style="dim",
-        soft_wrap=True,
+    console.print()
+
+
+def _print_motion_details(console: Console, result: DynamicIdentification) -> None:
+    """Every parameter with its standard error."""
+    section = result.model.dynamic_model.section
+    print_note(
+        console,
+        f"Efforts are compared after a low-pass filter at {section.signals.effort_cut_off:g} Hz. Cross-validated: each "
+        "sixth of the motion's phases is predicted by a model identified without it, including the choice of effects "
+        "and the base tilt. The effects that the arm's file lists were chosen on such motions, and friction changes "
+        "from day to day: on another recording the error can be larger. Repeatability: difference between periods of "
+        "the motion; a fit can be below it where the executed motion differs too.",
     )
-    console.print(
-        "** what differs from period to period; a fit is below it where the executed motion differs too\n", style="dim"
-    )
-
-
-def print_dynamic_validation(console: Console, validation: DynamicValidation) -> None:
-    """Verdicts, errors on a motion and of what kind they are."""
-    print_verdict(console, validation.verdicts)
-    title = f"RMS effort error of the actuators behind {validation.cut_off:g} Hz [N m; N]"
-    table = make_table(title, "", "measured RMS", "error", "ratio %", "floor %", "verdict")
-    table.columns[-1].justify = "left"
-    for a in validation.actuators:
-        numbers = ("" if x is None else f"{100 * x:.1f}" for x in (a.relative_error, a.repeatability))
-        style = VERDICT_STYLES.get(a.verdict, "")
-        table.add_row(a.name, f"{a.rms_effort:.4f}", f"{a.rms_error:.4f}", *numbers, a.verdict, style=style)
-    table.add_row("mean", "", "", f"{100 * validation.mean_relative_error:.1f}", "", "")
-    console.print(table)
-    print_rule(console, in_motion=True)
-    table = make_table("Shares of the squared error", "", "bias", "friction-like", "position", "other")
-    for a in validation.actuators:
-        shares = (a.bias, a.friction_like, a.position_dependent, a.other)
-        table.add_row(a.name, *(f"{s:.0%}" for s in shares))
-    console.print(table)
-    console.print("Much bias or friction: recalibrate; much position: cables\n", style="dim", soft_wrap=True)
-
-
-_COLUMNS = ("", "value", "+-", "unit")
-_EFFECT_COLUMNS = ("", "kind", "scale", "value", "+-", "unit if it turns")
-_NAME_WIDTH, _REMARK_WIDTH = 64, 30
-_MEANS = ("rms_fit", "rms_cross_validation", "rms_repeatability")
+    _print_links(console, section, result.nominal_mass)
+    _print_base_parameters(console, section)
+    _print_correlations(console, section.correlations)
+    _print_drive(console, section, result.dry_friction)
+    _print_effects(console, section)
 
 
 def _print_links(console: Console, section: DynamicSection, nominal_mass: float) -> None:
@@ -165,7 +219,7 @@ def _print_links(console: Console, section: DynamicSection, nominal_mass: float)
         m, *h = link.parameters[:4]
         com = np.array(h) / m
         errors = np.array(link.standard_errors[:4])
-        # First order, mass and first moments taken for independent: the better known of both decides.
+        # First order, mass and first moments taken for independent: the larger of both decides.
         spread = float(np.max(np.hypot(errors[1:], com * errors[0]))) / m
         remark = "; ".join(link.bounds) + " *" if link.bounds else ("mass: the SDF's" if link.mass_told < 0.5 else "")
         place = ", ".join(f"{x:+.3f}" for x in com)
@@ -175,55 +229,42 @@ def _print_links(console: Console, section: DynamicSection, nominal_mass: float)
     table.add_row("all", f"{total:.4g}", "", "", "", f"{nominal_mass:.4g} in the SDF" + " *" * reached)
     console.print(table)
     if reached or any(link.bounds for link in section.links):
-        console.print("* at its bound: this number is the bound's, not the motion's", style="yellow")
-    console.print(
-        "+-: standard errors, of one by one: a motion tells sums of links far better, the base parameters\n",
-        style="dim",
-        soft_wrap=True,
+        console.print("* at its bound: the value is that of the bound, not of the motion", style="yellow")
+    print_note(
+        console,
+        "+-: standard errors of single parameters. A motion determines the base parameters, which are combinations of "
+        "links, far better.",
     )
 
 
-def _print_base_parameters(console: Console, section: DynamicSection, full: bool) -> None:
-    parameters = section.base_parameters
-    known = [p for p in parameters if p.told >= LEAST_TOLD and abs(p.value) > SHOWN_BEYOND * p.standard_error]
-    title = "Base parameters" if full else f"Base parameters known to {1 / SHOWN_BEYOND:.0%}"
-    table = make_table(title, *_COLUMNS, *([""] if full else []))
+def _print_base_parameters(console: Console, section: DynamicSection) -> None:
+    table = make_table("Base parameters", "", "value", "+-", "unit", "")
     table.columns[0].max_width = _NAME_WIDTH
-    for p in parameters if full else known:
-        remark = "" if p.told >= LEAST_TOLD else "not told"
+    for p in section.base_parameters:
+        remark = "" if p.told >= LEAST_TOLD else "from the SDF"
         if not remark and abs(p.value) < 2 * p.standard_error:
             remark = "zero?"
-        numbers = (f"{p.value:+.3g}", f"{p.standard_error:.1g}", p.unit, *([remark] if full else []))
-        table.add_row(escape(p.name), *numbers)
+        table.add_row(escape(p.name), f"{p.value:+.3g}", f"{p.standard_error:.1g}", p.unit, remark)
     console.print(table)
-    rest = [p for p in parameters if p not in known]
-    untold = sum(p.told < LEAST_TOLD for p in rest)
-    vague = sum(p.told >= LEAST_TOLD and abs(p.value) < 2 * p.standard_error for p in rest)
-    console.print(
-        f"of {len(parameters)}: {len(rest) - untold - vague} more known to a half, {vague} not told from 0, "
-        f"{untold} better told by the SDF",
-        style="dim",
-        soft_wrap=True,
+    print_note(
+        console, "from the SDF: the motion does not determine this parameter. zero?: less than two standard errors."
     )
-    _print_correlations(console, section.correlations, len(section.correlations) if full else SHOWN_PAIRS)
 
 
-def _print_correlations(console: Console, pairs: Sequence[CorrelatedEstimates], most: int) -> None:
-    for pair in pairs[:most]:
+def _print_correlations(console: Console, pairs: Sequence[CorrelatedEstimates]) -> None:
+    for pair in pairs:
         what = "difference" if pair.correlation > 0 else "sum"
         console.print(
-            f"not told apart: {pair.first} | {pair.second}: {pair.correlation:+.3f}, only their scaled {what} is known",
+            f"not identifiable separately: {pair.first} and {pair.second} (correlation {pair.correlation:+.3f}); only "
+            f"their scaled {what} is known",
             style="yellow",
             markup=False,
-            soft_wrap=True,
         )
-    if len(pairs) > most:
-        console.print(f"and {len(pairs) - most} more pairs", style="yellow")
-    console.print()
+    if pairs:
+        console.print()
 
 
 def _print_drive(console: Console, section: DynamicSection, dry: dict[str, tuple[float, float]]) -> None:
-    others = [e for e in section.effects if e.kind not in (*DRY_KINDS, "viscous", "offset")]
     table = make_table("Drive [N m, N m s/rad; N, N s/m]", "", "dry friction", "+-", "viscous", "+-", "offset", "+-")
     for name in dict.fromkeys([*dry, *(e.coordinate for e in section.effects)]):
         cells = [f"{dry[name][0]:.3g}", f"{dry[name][1]:.1g}"] if name in dry else ["", ""]
@@ -232,14 +273,6 @@ def _print_drive(console: Console, section: DynamicSection, dry: dict[str, tuple
             cells += ["", ""] if found is None else [f"{found.coefficient:.3g}", f"{found.standard_error:.1g}"]
         table.add_row(name, *cells)
     console.print(table)
-    if others:
-        strongest = sorted(others, key=lambda e: -abs(e.coefficient) / (e.standard_error or 1.0))[:SHOWN_EFFECTS]
-        table = make_table("Springs, cables, friction by direction", *_EFFECT_COLUMNS)
-        for e in strongest:
-            table.add_row(*_effect_cells(e))
-        console.print(table)
-        if len(others) > len(strongest):
-            console.print(f"and {len(others) - len(strongest)} more, less certain", style="dim")
     console.print()
 
 
@@ -258,115 +291,138 @@ def _effect_cells(e: DriveEffect) -> tuple[str, ...]:
     return e.coordinate, e.kind, scale, f"{e.coefficient:+.3g}", f"{e.standard_error:.1g}", EFFECT_KINDS[e.kind].unit
 
 
-def _percent(part: float, whole: float) -> str:
-    return f"{100 * part / whole:.1f}" if whole > 0 and part > 0 else ""
+def _print_pose_errors(console: Console, result: StaticIdentification, verdicts: Mapping[str, Verdict]) -> None:
+    joints, poses = result.model.joints, len(result.recording)
+    title = f"{result.model.arm.name}, {poses} static poses: RMS holding torque and error"
+    table = make_table(
+        title, "", "torque [N m; N]", "error, cross- validated", "ratio", "feed- forward scale", "range covered",
+        "excluded", "verdict",
+    )  # fmt: skip
+    table.columns[-1].justify = "left"
+    for j in joints:
+        torque, error, verdict = j.rms_zero_torque_undoubted, j.rms_cross_validation_undoubted, verdicts[j.name]
+        table.add_row(
+            *(j.name, f"{torque:.4f}", f"{error:.4f}", f"{error / torque:.2f}" if torque > 0 else ""),
+            *(f"{j.trust:.2f}", f"{100 * j.coverage:.0f} %", f"{j.num_doubted or ''}", verdict),
+            style=_STYLES.get(verdict, ""),
+        )
+    console.print(table)
+    if poses < result.num_rows:
+        console.print(f"{result.num_rows} rows are {poses} distinct poses: repeated samples of a pose are averaged.")
+    for j in joints:
+        if j.trust == 0.0:
+            why = "the joint moved too little to separate gravity from friction"
+            if j.rms_zero_torque == 0.0:
+                why = "no holding torque was measured"
+            console.print(f"{j.name}: feedforward disabled: {why}", style="yellow", markup=False)
+    console.print()
 
 
-def _mean_percent(actuators: list[ActuatorStatistics], which: str) -> str:
-    shares = [getattr(a, which) / a.rms_effort for a in actuators if a.rms_effort > 0]
-    return f"{100 * np.mean(shares):.1f}" if shares and np.any(shares) else ""
+def _print_pose_details(console: Console, result: StaticIdentification) -> None:
+    """Excluded measurements, parameters and effects with their standard errors, and errors in detail."""
+    _print_excluded(console, result.doubts)
+    print_static_parameters(console, result.model)
+
+
+def print_static_parameters(console: Console, model: IdentifiedModel) -> None:
+    """Parameters of a static model with their standard errors, then how each joint was fitted."""
+    provenance = model.provenance
+    table = make_table("Base parameters", "", "value", "standard error", "unit", "")
+    units = derive_gravity(model.arm).base.units
+    for p, unit in zip(model.base_parameters, units, strict=True):
+        zero = "" if p.distinguishable else "zero?"
+        table.add_row(escape(p.name), f"{p.value:+.5f}", f"{p.standard_error:.5f}", unit, zero)
+    console.print(table)
+    print_note(
+        console,
+        f"Method {provenance.method}, rank {provenance.rank} of {len(model.base_parameters)}, condition number "
+        f"{provenance.condition_number:.3g}. zero?: less than two standard errors.",
+    )
+    if model.effects:
+        table = make_table("Joint effects [N m; N]", "", "value", "standard error", "")
+        for e in model.effects:
+            numbers = (f"{e.coefficient:+.5f}", f"{e.standard_error:.5f}", "" if e.distinguishable else "zero?")
+            table.add_row(str(ActuatorEffect.of(e)), *numbers)
+        console.print(table)
+        console.print()
+    title = "RMS error [N m; N], and with the excluded measurements*"
+    table = make_table(title, "", "fit", "leave- one-out", "torque*", "fit*", "leave- one-out*", "positions [rad; m]")
+    for j in model.joints:
+        own = (j.rms_fit_undoubted, j.rms_leave_one_out_undoubted)
+        errors = (*own, j.rms_zero_torque, j.rms_fit, j.rms_leave_one_out)
+        positions = f"{j.position_lower:+.2f}..{j.position_upper:+.2f}"
+        table.add_row(j.name, *(f"{e:.4f}" for e in errors), positions)
+    console.print(table)
+    print_note(
+        console,
+        "Cross-validated: each tenth of the poses is predicted from the others, joint effects and feedforward scale "
+        "chosen anew.",
+    )
+
+
+def _print_excluded(console: Console, doubts: Sequence[Doubt]) -> None:
+    if not doubts:
+        return
+    console.print(f"Excluded measurements, in {len({d.where for d in doubts})} poses:", style="yellow")
+    for doubt in doubts:
+        console.print(f"  {doubt.where}: {doubt.reason}", style="yellow", markup=False)
+    console.print()
+
+
+def _print_motion_validation(console: Console, validation: DynamicValidation, verbose: bool) -> None:
+    name = Path(validation.recording.source).name or "recording"
+    title = f"{validation.model.arm.name}, {name}: RMS effort of the actuators [N m; N]"
+    table = make_table(title, "", "measured", "error", "ratio", "repeat- ability", "verdict")
+    table.columns[-1].justify = "left"
+    for a in validation.actuators:
+        shares = ("" if x is None else _percent(x) for x in (a.relative_error, a.repeatability))
+        style = _STYLES.get(a.verdict, "")
+        table.add_row(a.name, f"{a.rms_effort:.4f}", f"{a.rms_error:.4f}", *shares, a.verdict, style=style)
+    table.add_row("mean", "", "", _percent(validation.mean_relative_error), "", "")
+    console.print(table)
+    console.print()
+    if not verbose:
+        return
+    print_note(console, f"{rule_text(in_motion=True)} Low-pass filter: {validation.cut_off:g} Hz.")
+    table = make_table("Shares of the squared error", "", "bias", "friction-like", "position", "other")
+    for a in validation.actuators:
+        shares = (f"{100 * s:.0f} %" for s in (a.bias, a.friction_like, a.position_dependent, a.other))
+        table.add_row(a.name, *shares)
+    console.print(table)
+    print_note(console, "Large bias or friction: recalibrate. Large position share: the cables pull differently.")
+
+
+def _print_pose_validation(console: Console, validation: StaticValidation, verbose: bool) -> None:
+    name = Path(validation.recording.source).name or "recording"
+    title = f"{validation.model.arm.name}, {validation.poses} poses of {name}: RMS torque [N m; N]"
+    table = make_table(title, "", "measured", "error", "ratio", "excluded", "verdict")
+    table.columns[-1].justify = "left"
+    for j in validation.joints:
+        ratio = "" if j.relative_error_undoubted is None else f"{j.relative_error_undoubted:.2f}"
+        numbers = (f"{j.rms_torque_undoubted:.4f}", f"{j.rms_error_undoubted:.4f}", ratio, f"{j.num_doubted or ''}")
+        table.add_row(j.name, *numbers, j.verdict, style=_STYLES.get(j.verdict, ""))
+    console.print(table)
+    console.print()
+    if not verbose:
+        return
+    print_note(console, rule_text(in_motion=False))
+    if validation.doubts:
+        table = make_table("With the excluded measurements", "", "measured", "error", "ratio")
+        for j in validation.joints:
+            ratio = "" if j.relative_error is None else f"{j.relative_error:.2f}"
+            table.add_row(j.name, f"{j.rms_torque:.4f}", f"{j.rms_error:.4f}", ratio)
+        console.print(table)
+        console.print()
+    _print_excluded(console, validation.doubts)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
+
+
+def _factor(factor: float | None) -> str:
+    return "none" if factor is None else f"{factor:.2f}"
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
-
-
-def plot_motion(folder: Path, arm: Arm, validation: DynamicValidation, title: str) -> None:
-    """Writes efforts.png, residuals.png and error_budget.png of a motion."""
-    _plot_efforts(folder / "efforts.png", arm, validation, title)
-    _plot_residuals(folder / "residuals.png", arm, validation, title)
-    _plot_budget(folder / "error_budget.png", validation, title)
-
-
-def _plot_efforts(path: Path, arm: Arm, validation: DynamicValidation, title: str) -> None:
-    """One panel an actuator: measured and predicted effort over time, and their difference."""
-    count = arm.num_joints
-    figure, axes = plt.subplots(count, 1, figsize=(13, 1.9 * count), sharex=True, layout="constrained")
-    for i, (actuator, ax) in enumerate(zip(validation.actuators, axes, strict=True)):
-        measured, predicted = validation.measured[:, i], validation.predicted[:, i]
-        ax.plot(validation.t, measured - predicted, color=ZERO_COLOUR, linewidth=0.8, label="measured - predicted")
-        ax.plot(validation.t, measured, color=MEASURED_COLOUR, linewidth=1.0, label="measured")
-        ax.plot(validation.t, predicted, color=MODEL_COLOUR, linewidth=1.0, label="predicted")
-        relative = "" if actuator.relative_error is None else f", error {100 * actuator.relative_error:.1f} %"
-        ax.set_title(f"actuator {i + 1} {actuator.name}{relative}", fontsize=9)
-        ax.set_ylabel("N" if arm.prismatic[i] else "N m", fontsize=8)
-        ax.tick_params(labelsize=7)
-    axes[-1].set_xlabel("time [s]", fontsize=8)
-    axes[0].legend(fontsize=7, loc="upper right", ncols=3)
-    figure.suptitle(f"{title}: efforts of the actuators behind {validation.cut_off:g} Hz")
-    save_figure(figure, path)
-
-
-def _plot_residuals(path: Path, arm: Arm, validation: DynamicValidation, title: str) -> None:
-    """One column an actuator: the difference over position, velocity and time."""
-    count = arm.num_joints
-    figure, axes = plt.subplots(3, count, figsize=(2.6 * count, 7), sharey="col", layout="constrained")
-    residuals = validation.measured - validation.predicted
-    for i, actuator in enumerate(validation.actuators):
-        length = "m" if arm.prismatic[i] else "rad"
-        over = (
-            (validation.q[:, i], f"position [{length}]"),
-            (validation.v[:, i], f"velocity [{length}/s]"),
-            (validation.t, "time [s]"),
-        )
-        for (x, label), ax in zip(over, axes[:, i], strict=True):
-            ax.plot(x, residuals[:, i], ",", color=MODEL_COLOUR, alpha=0.5)
-            ax.axhline(0.0, color="black", linewidth=0.6)
-            ax.set_xlabel(label, fontsize=8)
-            ax.tick_params(labelsize=7)
-        axes[0, i].set_title(f"{i + 1} {actuator.name}\n[{'N' if arm.prismatic[i] else 'N m'}]", fontsize=9)
-    figure.suptitle(f"{title}: measured - predicted effort")
-    save_figure(figure, path)
-
-
-def _plot_budget(path: Path, validation: DynamicValidation, title: str) -> None:
-    """Stacked shares of each actuator's squared error, their height the relative error."""
-    kinds = ("bias", "friction_like", "position_dependent", "other")
-    colours = ("#edae49", MEASURED_COLOUR, MODEL_COLOUR, ZERO_COLOUR)
-    figure, ax = plt.subplots(figsize=(11, 5), layout="constrained")
-    heights = np.array([100 * (a.relative_error or 0.0) for a in validation.actuators])
-    bottom = np.zeros(len(heights))
-    for kind, colour in zip(kinds, colours, strict=True):
-        part = heights * np.array([getattr(a, kind) for a in validation.actuators])
-        ax.bar(range(len(heights)), part, 0.6, bottom=bottom, color=colour, label=kind.replace("_", " "))
-        bottom += part
-    for i, actuator in enumerate(validation.actuators):
-        if actuator.repeatability is not None:
-            floor = 100 * actuator.repeatability
-            ax.plot(
-                [i - 0.35, i + 0.35], [floor, floor], color="black", linewidth=1.2, label="_" if i else "repeatability"
-            )
-    ax.set_xticks(range(len(heights)), [a.name.replace("_", "\n") for a in validation.actuators], fontsize=8)
-    ax.set_ylabel("relative error [%], split by shares of its square")
-    ax.set_title(title)
-    ax.legend(fontsize=8)
-    save_figure(figure, path)
-
-
-def print_recalibration(console: Console, result: Recalibration) -> None:
-    """Errors before and after, what is kept, and the new scales."""
-    title = f"Error over {result.seconds:.1f} s*, and friction after the fit to all of it"
-    table = make_table(title, "", "before", "refit", "", "dry friction x", "viscous x", "offset +")
-    for a in result.actuators:
-        new = [_scale(a.dry), _scale(a.viscous), f"{a.offset:+.4f}"] if a.kept else ["as it was", "", ""]
-        table.add_row(a.name, f"{100 * a.before:.1f} %", f"{100 * a.after:.1f} %", "kept" if a.kept else a.reason, *new)
-    before, after = (float(np.mean([getattr(a, which) for a in result.actuators])) for which in ("before", "after"))
-    table.add_row("mean", f"{100 * before:.1f} %", f"{100 * after:.1f} %", "", "", "", "")
-    console.print(table)
-    console.print(
-        "* actuators: |tau_f - tau_hat| / |tau_f| behind the model's low-pass; refit: each of "
-        f"{FOLDS} parts of the motion predicted from the others\n",
-        style="dim",
-    )
-    console.print(
-        "This gain is for motions like the recalibration recording. At other positions and speeds it can be much "
-        "smaller: validate the new model on the motion that you need.\n",
-        soft_wrap=True,
-    )
-    shared = [f"{name} x {scale:.2f}" for name, scale in result.shared.items()]
-    if shared:
-        console.print(f"friction that actuators share: {', '.join(shared)}", soft_wrap=True)
-
-
-def _scale(scale: float | None) -> str:
-    return "none" if scale is None else f"{scale:.2f}"

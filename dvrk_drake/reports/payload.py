@@ -1,4 +1,4 @@
-"""An estimated payload as tables in a terminal."""
+"""An estimated payload as text in a terminal."""
 
 from __future__ import annotations
 
@@ -6,74 +6,92 @@ from collections.abc import Sequence
 
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
 
-from dvrk_drake.analysis.payload.payload import CONFIDENCE, Payload, as_good, shown_elsewhere
+from dvrk_drake.analysis.payload.payload import CONFIDENCE, Payload, PayloadIdentification, as_good, shown_elsewhere
 from dvrk_drake.analysis.payload.point_mass import LARGEST_MASS
-from dvrk_drake.reports.terminal_tables import make_table
+from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
 
-def print_links(console: Console, estimates: Sequence[Payload]) -> None:
-    """What each link would have to carry, the best first."""
-    table = make_table("Where the payload may be, best first", "link", "left-out error*", "mass [kg]", "+- [kg]", "")
-    good = as_good(estimates)
-    for payload in estimates:
-        note = "" if payload not in good else "best" if payload is estimates[0] else "cannot be told from it"
-        mass, error = "none found", ""
-        if payload.found:
-            mass, error = f"{payload.body.mass:.4f}", f"{payload.mass_error:.4f}"
-        table.add_row(payload.link, f"{100 * payload.left_out:.1f} %", mass, error, note if payload.found else "")
-    console.print(table)
-    console.print(
-        "* phases of the motion predicted from the others: RMS error, whitened, as a share of that without payload, "
-        "geometric mean over the actuators\n",
-        style="dim",
-    )
-    if estimates[0].found and len(good) > 1:
-        console.print(
-            "These recordings cannot tell which of the best links it is: name the one that carries it with --link.\n",
-            style="yellow",
-            soft_wrap=True,
-        )
-
-
-def print_payload(console: Console, payload: Payload, estimates: Sequence[Payload] = ()) -> None:
-    """Prints mass and place with their intervals and what is explained, or that no payload was found.
+def print_payload(
+    console: Console, result: PayloadIdentification, *, model_path: str = "MODEL.yaml", verbose: bool = False
+) -> None:
+    """Prints the mass and its link, or that no payload was found; then mass and place with their intervals.
 
     Args:
         console: to print to.
-        payload: to print.
-        estimates: of all links; an upper bound of the mass is printed only where none of them shows a payload.
+        result: to print.
+        model_path: file of the arm's model, for the next command.
+        verbose: also print the estimate on every link, and the efforts that the payload explains.
     """
+    payload, estimates = result.payload, result.estimates
+    # A named link is compared with the others by a warning.
+    others = [] if result.link else [other.link for other in as_good(estimates) if other is not payload]
     if not payload.found:
-        console.print(_none_found(payload, shown_elsewhere(payload, estimates)), soft_wrap=True)
-        return
-    table = make_table(
-        f"Payload on {payload.link}",
-        "",
-        "estimate",
-        "standard error",
-        f"{CONFIDENCE:.0%} interval",
-        "base frame, q = 0",
-    )
+        answer = _none_found(payload, shown_elsewhere(payload, estimates))
+    else:
+        answer = f"Payload: {payload.body.mass:.4f} +- {payload.mass_error:.4f} kg on {payload.link}."
+        if others:
+            names = " or ".join(others)
+            answer += f" These recordings do not distinguish it from a payload on {names}: name the link with --link."
+    command = f"payload REFERENCE.csv LOADED.csv --model {model_path}"
+    link = "LINK" if others else payload.link
+    ambiguous = others or not payload.found
+    print_answer(console, answer, f"{command} --link {link} --json payload.json", "yellow" if ambiguous else "green")
+    if payload.found:
+        console.print(_estimate_table(payload))
+        console.print()
+    if not payload.found or others or verbose:
+        _print_links(console, estimates)
+    if verbose and payload.found:
+        _print_efforts(console, payload)
+
+
+def _estimate_table(payload: Payload) -> Table:
+    columns = ("", "estimate", "standard error", f"{100 * CONFIDENCE:.0f} % interval", "base frame, q = 0")
+    table = make_table(f"Payload on {payload.link}", *columns)
     rows = [("mass [kg]", payload.body.mass, payload.mass_error, "")]
     for axis, x, error, base in zip("xyz", payload.body.place, payload.place_error, payload.place_in_base, strict=True):
         rows.append((f"{axis} [m]", x, error, f"{base:+.4f}"))
     for k, (name, value, error, base) in enumerate(rows):
         if k and not payload.body.determined[k - 1]:
-            table.add_row(escape(name), "fixed: not determined by this motion", "", "", "")
+            table.add_row(escape(name), "not determined", "", "", "")
             continue
         reach = payload.quantile * error
         table.add_row(
-            escape(name), f"{value:+.4f}", f"{error:.4f}", f"{value - reach:+.4f} .. {value + reach:+.4f}", base
+            escape(name), f"{value:+.4f}", f"{error:.4f}", f"{value - reach:+.4f}..{value + reach:+.4f}", base
         )
+    return table
+
+
+def _print_links(console: Console, estimates: Sequence[Payload]) -> None:
+    """The estimate on each link, best first."""
+    table = make_table("Links, best first", "", "error*", "mass [kg]", "+- [kg]", "")
+    table.columns[-1].justify = "left"
+    good = as_good(estimates)
+    for payload in estimates:
+        note = "" if payload not in good else "best" if payload is estimates[0] else "as good"
+        mass, error = "none found", ""
+        if payload.found:
+            mass, error = f"{payload.body.mass:.4f}", f"{payload.mass_error:.4f}"
+        error_share = f"{100 * payload.left_out:.1f} %"
+        table.add_row(payload.link, error_share, mass, error, note if payload.found else "")
     console.print(table)
-    table = make_table("RMS efforts [N m; N if prismatic]", "", "change", "payload", "left*", "explained")
+    print_note(
+        console,
+        "* cross-validated over the phases of the motion: RMS error, whitened, as a share of that without payload, "
+        "geometric mean over the actuators",
+    )
+
+
+def _print_efforts(console: Console, payload: Payload) -> None:
+    table = make_table("RMS efforts [N m; N]", "", "change", "payload", "residual*", "explained")
     for actuator in payload.actuators:
         explained = "not loaded" if actuator.explained is None else f"{100 * actuator.explained:.1f} %"
         numbers = (f"{x:.4f}" for x in (actuator.change, actuator.payload, actuator.left))
         table.add_row(actuator.name, *numbers, explained)
     console.print(table)
-    console.print("* by the payload and by what changed in the drives: offsets, friction\n", style="dim")
+    print_note(console, "* after the payload, and what changed in the drives: offsets, friction")
 
 
 def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
@@ -81,7 +99,9 @@ def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
     said = f"No payload found on {payload.link}: the interval of its mass includes 0. "
     if elsewhere:
         first = elsewhere[0]
-        return said + f"A payload on {first.link} explains the change (left-out error {first.left_out:.1%})."
+        share = f"{100 * first.left_out:.1f} %"
+        return said + f"A payload on {first.link} explains the change (cross-validated error {share})."
     if payload.largest_at_com > LARGEST_MASS:
-        return said + "A mass at the link's centre of mass would not show in this motion."
-    return said + f"At the link's centre of mass it is below {1e3 * payload.largest_at_com:.3g} g ({CONFIDENCE:.0%})."
+        return said + "This motion does not show a mass at the link's centre of mass."
+    largest = f"{1e3 * payload.largest_at_com:.3g} g ({100 * CONFIDENCE:.0f} %)"
+    return said + f"At the link's centre of mass it is below {largest}."

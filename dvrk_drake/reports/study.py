@@ -1,102 +1,74 @@
-"""A study's summary as a table in a terminal and as a picture."""
+"""A study's summary as text in a terminal."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from pathlib import Path
 
-import matplotlib.pyplot as plt
-import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import Study
-from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise, values_of
-from dvrk_drake.reports.figures import MEASURED_COLOUR, MODEL_COLOUR, save_figure
-from dvrk_drake.reports.terminal_tables import make_table
+from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise
+from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
-COLOURS = (MODEL_COLOUR, MEASURED_COLOUR, "#edae49", "#66a182", "#2e4057", "#8d5a97")
+#: Failed runs that are printed without `verbose`.
+_MOST = 3
 
 
-def print_study(console: Console, study: Study, rows: Mapping[int, Row]) -> None:
-    """Each measure of each variation, then the errors of runs that failed."""
+def print_study(
+    console: Console, study: Study, rows: Mapping[int, Row], *, study_path: str = "STUDY.yaml", verbose: bool = False
+) -> None:
+    """Prints the first measure of each variation, then all measures, and errors of runs that failed.
+
+    Args:
+        console: to print to.
+        study: whose summary is printed.
+        rows: results by number of the case.
+        study_path: file of the study, for the next command.
+        verbose: print all failed runs, not only the first.
+    """
     summaries = summarise(study, rows)
-    for summary in summaries:
-        title = f"{summary.variation}: {summary.runs} runs"
-        title += f", {summary.failed} failed and counted as the worst" if summary.failed else ""
-        table = make_table(title, "", "yes", "share", "95 % interval", "median", "95th percentile", "largest", "unit")
-        for measure in study.measures:
-            table.add_row(measure.column, *_cells(measure, summary))
-        console.print(table)
-    if len(study.seeds) > 1:
-        console.print("* several seeds a pose: runs are not independent, and the intervals too narrow", style="dim")
-    for case in [case for case in study.cases if case.index in rows and rows[case.index].error][:10]:
-        text = f"case {case.index}, {case.variation}, pose {case.pose}, seed {case.seed}: {rows[case.index].error}"
-        console.print(text, style="yellow", markup=False, soft_wrap=True)
-
-
-def plot_study(path: Path, study: Study, rows: Mapping[int, Row]) -> None:
-    """One panel a measure: shares with their intervals, or the share of runs up to each number."""
-    summaries, count = summarise(study, rows), len(study.measures)
-    columns = math.ceil(math.sqrt(count))
-    figure, axes = plt.subplots(
-        math.ceil(count / columns),
-        columns,
-        figsize=(4.4 * columns, 3.4 * math.ceil(count / columns)),
-        layout="constrained",
-        squeeze=False,
+    failed = [case for case in study.cases if case.index in rows and rows[case.index].error]
+    first = study.measures[0]
+    found = "; ".join(f"{s.variation}: {_headline(first, s)}" for s in summaries)
+    answer = f"{first.column} {found}. {len(rows)} of {len(study.cases)} runs, {len(failed)} failed."
+    command = f"study {study_path} --output RESULTS.csv --plots FOLDER"
+    print_answer(console, answer, command, "yellow" if failed else "green")
+    table = make_table(
+        f"{study.arm.name}, {len(rows)} runs",
+        *("", "variation", "share", "95 % interval", "median", "95th percentile", "largest", "unit"),
     )
-    for ax, measure in zip(axes.flat, study.measures, strict=False):
-        if measure.is_answer:
-            _draw_shares(ax, measure, summaries)
-        else:
-            _draw_distribution(ax, measure, study, rows)
-    for ax in axes.flat[count:]:
-        ax.axis("off")
-    figure.suptitle(f"{study.arm.name}, {Path(study.scenario).name}: {len(rows)} runs")
-    save_figure(figure, path)
+    table.columns[1].justify = "left"
+    for measure in study.measures:
+        for k, summary in enumerate(summaries):
+            table.add_row(measure.column if k == 0 else "", summary.variation, *_cells(measure, summary))
+    console.print(table)
+    console.print()
+    if failed:
+        print_note(console, "A run that failed counts as the worst result.")
+    if verbose:
+        print_note(console, "95 % interval: Wilson's interval of the share, for independent runs.")
+    if len(study.seeds) > 1:
+        print_note(console, "Several seeds per pose: runs are not independent, so the intervals are too narrow.")
+    for case in failed if verbose else failed[:_MOST]:
+        text = f"case {case.index}, {case.variation}, pose {case.pose}, seed {case.seed}: {rows[case.index].error}"
+        console.print(text, style="yellow", markup=False)
+    if not verbose and len(failed) > _MOST:
+        console.print(f"and {len(failed) - _MOST} more failed runs: --verbose prints them.", style="yellow")
+
+
+def _headline(measure: Measure, summary: Summary) -> str:
+    value = summary.measures[measure.column]
+    if isinstance(value, Share):
+        return f"{value.yes} of {value.runs} runs"
+    return f"median {value.median:.4g} {measure.unit}".strip()
 
 
 def _cells(measure: Measure, summary: Summary) -> list[str]:
     value = summary.measures[measure.column]
     if isinstance(value, Share):
         share = f"{100 * value.yes / value.runs:.1f} %"
-        return [f"{value.yes}", share, f"{100 * value.lower:.1f}..{100 * value.upper:.1f} %", "", "", "", ""]
+        return [share, f"{100 * value.lower:.1f}..{100 * value.upper:.1f} %", "", "", "", ""]
     numbers = [f"{number:.4g}" for number in (value.median, value.percentile_95, value.largest)]
-    return ["", "", "", *numbers, escape(measure.unit)]
-
-
-def _draw_shares(ax: plt.Axes, measure: Measure, summaries: list[Summary]) -> None:
-    for i, summary in enumerate(summaries):
-        share = summary.measures[measure.column]
-        assert isinstance(share, Share)
-        y, low, high = (100 * value for value in (share.yes / share.runs, share.lower, share.upper))
-        error = [[max(0.0, y - low)], [max(0.0, high - y)]]
-        ax.errorbar(i, y, error, fmt="o", capsize=6, color=COLOURS[i % len(COLOURS)])
-    ax.set_xticks(range(len(summaries)), [summary.variation for summary in summaries], fontsize=8)
-    ax.set(xlim=(-0.6, len(summaries) - 0.4), ylim=(-3, 103), ylabel="runs [%]")
-    ax.set_title(f"{measure.column}, 95 % intervals", fontsize=10)
-    ax.grid(alpha=0.3)
-
-
-def _draw_distribution(ax: plt.Axes, measure: Measure, study: Study, rows: Mapping[int, Row]) -> None:
-    smallest = np.inf
-    for i, variation in enumerate(study.variations):
-        of_it = [rows[c.index] for c in study.cases if c.variation == variation.name and c.index in rows]
-        values = np.sort(values_of(measure, of_it))
-        share = 100 * np.arange(1, len(values) + 1) / max(len(values), 1)
-        finite = np.isfinite(values)
-        colour = COLOURS[i % len(COLOURS)]
-        smallest = min(smallest, values.min(initial=np.inf))
-        # What is infinite has no place on the axis: the line ends below 100 %.
-        ax.step(
-            values[finite], share[finite], where="post", marker=".", markersize=3, color=colour, label=variation.name
-        )
-    if measure.unit and smallest > 0:
-        ax.set_xscale("log")
-    ax.set(ylim=(-3, 103), ylabel="runs up to it [%]", xlabel=f"[{measure.unit}]" if measure.unit else "share of limit")
-    ax.set_title(measure.column, fontsize=10)
-    ax.grid(alpha=0.3)
-    ax.legend(fontsize=7)
+    return ["", "", *numbers, escape(measure.unit)]

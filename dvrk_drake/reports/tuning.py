@@ -1,36 +1,68 @@
-"""Tuned gains as tables in a terminal and as figures."""
+"""Tuned gains as text in a terminal."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Sequence
 
-import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
 from dvrk_drake.experiments.tuning.bench import band, step_size
-from dvrk_drake.experiments.tuning.model_based import ArmDesign, friction
+from dvrk_drake.experiments.tuning.model_based import ArmDesign, JointDesign, friction
 from dvrk_drake.experiments.tuning.procedure import JointProcedure
-from dvrk_drake.experiments.tuning.tuning import DURATION, OWN, PUBLISHED, REST, Comparison, Tuning
+from dvrk_drake.experiments.tuning.tuning import DURATION, OWN, REST, Comparison, Tuning
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.reports.figures import save_figure
-from dvrk_drake.reports.terminal_tables import make_table
+from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
 
-def print_tuning(console: Console, tuning: Tuning) -> None:
-    """How the gains were found, then how they compare."""
+def print_tuning(console: Console, tuning: Tuning, *, verbose: bool = False) -> None:
+    """Prints which gains settle most often and then fastest, then how the gains compare.
+
+    Args:
+        console: to print to.
+        tuning: to print.
+        verbose: also print how the gains were found, and the comparison of each joint and pose.
+    """
+    comparison, name = tuning.comparison, tuning.arm.source
+    best = comparison.best(tuning.found)
+    found, own = (_settled(comparison.table(which, "settling").ravel()) for which in (best, OWN))
+    verdict = "better than" if comparison.best([OWN, best]) == best else "not better than"
+    print_answer(
+        console,
+        f"Gains of method {best} are {verdict} {OWN}: settled steps and mean settling time {found}; {OWN}: {own}.",
+        f"tune --arm {name} --output GAINS.yaml",
+        "green" if verdict == "better than" else "yellow",
+    )
+    _print_summary(console, comparison)
+    if not verbose:
+        return
     if tuning.procedure is not None:
-        print_procedure(console, tuning.arm, tuning.procedure)
+        _print_procedure(console, tuning.arm, tuning.procedure)
     if tuning.design is not None:
-        print_design(console, tuning.arm, tuning.design)
-    print_comparison(console, tuning.comparison)
+        _print_design(console, tuning.arm, tuning.design)
+    _print_joints(console, comparison)
+    _print_poses(console, comparison)
 
 
-def print_procedure(console: Console, arm: Arm, joints: tuple[JointProcedure, ...]) -> None:
-    """Ultimate gains and what was made of them."""
-    columns = ("joint", "pushed by", "sticks within", "ultimate Kp", "period s", "growth", "Kp", "Kv", "Ki", "left")
-    table = make_table(f"{arm.name} by the paper's procedure", *columns)
+def _print_summary(console: Console, comparison: Comparison) -> None:
+    """One row per condition of the arm, over all joints and poses."""
+    title = f"{comparison.arm.name}, simulated: settled steps, mean settling time"
+    table = make_table(title, "condition", *comparison.gains)
+    for c, condition in enumerate(comparison.conditions):
+        table.add_row(condition.name, *(_settled(comparison.table(g, "settling")[c].ravel()) for g in comparison.gains))
+    console.print(table)
+    print_note(
+        console,
+        f"All joints step at once, from {len(comparison.poses)} poses. G, M: true gravity torque and inertia differ "
+        "from the model's.",
+    )
+
+
+def _print_procedure(console: Console, arm: Arm, joints: tuple[JointProcedure, ...]) -> None:
+    """Ultimate gains and the gains that follow, two rows per joint."""
+    columns = ("step", "dead zone", "ultimate Kp", "period [s]", "growth", "residual")
+    table = make_table(f"{arm.name}, the paper's procedure", "", *columns)
     for j, joint in enumerate(joints):
         unit, found = "mm" if arm.prismatic[j] else "mrad", joint.ultimate
         table.add_row(
@@ -40,21 +72,29 @@ def print_procedure(console: Console, arm: Arm, joints: tuple[JointProcedure, ..
             f"{'' if found.sustained else '> '}{found.gain:.4g}",
             f"{found.period:.3f}",
             f"{found.growth:.3f}",
-            *(f"{value:.3g}" for value in (joint.kp, joint.kd, joint.ki)),
-            f"{1e3 * joint.offset:.2f} {unit}" + ("" if joint.damped else ", swings"),
+            f"{1e3 * joint.offset:.2f} {unit}" + ("" if joint.damped else " *"),
         )
     console.print(table)
-    console.print(
-        "pushed by: how far the joint is moved away and let go; sticks within: dry friction over the ultimate Kp; "
-        "growth: of a swing over the one before; >: swings died away up to this Kp, beyond it the motor only "
-        "switches; left: of the step.\n"
+    print_note(
+        console,
+        "dead zone: dry friction over the ultimate Kp; growth: of an oscillation over the one before; >: oscillations "
+        "decay up to this Kp, beyond it the motor only switches; residual: of the step, * while it oscillates.",
     )
+    _print_gains(console, f"{arm.name}, gains of the paper's procedure", arm, joints)
 
 
-def print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
-    """What the model says of each joint, and the gains that follow."""
-    columns = ("joint", "inertia", "rad/s", "phase", "gain", "Kp", "Kv", "Ki", "limited by")
-    table = make_table(f"{arm.name} by the model", *columns)
+def _print_gains(console: Console, title: str, arm: Arm, joints: Sequence[JointProcedure | JointDesign]) -> None:
+    table = make_table(title, "", "Kp", "Kv", "Ki")
+    for name, joint in zip(arm.joint_names, joints, strict=True):
+        table.add_row(name, *(f"{value:.3g}" for value in (joint.kp, joint.kd, joint.ki)))
+    console.print(table)
+    console.print()
+
+
+def _print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
+    """Inertia and margins of each joint by the model, and the gains that follow."""
+    columns = ("inertia", "rad/s", "phase", "gain", "limited by")
+    table = make_table(f"{arm.name}, by the model", "", *columns)
     for name, fact, joint in zip(arm.joint_names, design.facts, design.joints, strict=True):
         table.add_row(
             name,
@@ -62,32 +102,32 @@ def print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
             f"{joint.frequency:.1f}",
             "..".join(f"{np.degrees(margins.phase):.0f}" for margins in joint.margins),
             "..".join(f"{margins.gain:.1f}" for margins in joint.margins),
-            *(f"{value:.3g}" for value in (joint.kp, joint.kd, joint.ki)),
             joint.limited_by,
         )
     console.print(table)
-    console.print(
-        "inertia in the joint box: least, all other joints free, and largest, all others held [kg m^2; kg]; margins "
-        "of phase [deg] and gain: there. Limited by other joints: slower than alone, so that all are stable at once.\n",
-        markup=False,
+    print_note(
+        console,
+        "inertia in the joint box: least, all other joints free, and largest, all others held [kg m^2; kg]; phase "
+        "[deg] and gain: stability margins there. Limited by other joints: slower than alone, so that all are stable "
+        "at once.",
     )
+    _print_gains(console, f"{arm.name}, gains by the model", arm, design.joints)
 
 
-def print_comparison(console: Console, comparison: Comparison) -> None:
-    """One table a joint and one over poses."""
+def _print_joints(console: Console, comparison: Comparison) -> None:
+    """One table per joint."""
     arm, poses = comparison.arm, len(comparison.poses)
-    console.print(
-        f"All joints of {arm.name} step at once, from {poses} poses. Settling time [s]: afterwards the joint stays "
-        f"inside its band, 2 % of the step or a count of its encoder; the slowest pose; n/{poses}: from n poses it "
-        f"has not settled in {DURATION - REST:g} s. Overshoot, what is left, unrest (peak to peak of effort at rest, "
-        "over its limit): the worst pose, arm as modelled. G, M: true gravity torque, true inertia over the model's.\n",
-        markup=False,
+    print_note(
+        console,
+        "Settling time [s]: afterwards the joint stays inside its band, 2 % of the step or a count of its encoder; "
+        f"the slowest pose; n/{poses}: from n poses it has not settled in {DURATION - REST:g} s. Overshoot, residual, "
+        "oscillation (peak to peak of the effort at rest over its limit): the worst pose, arm as modelled.",
     )
     for j, joint in enumerate(arm.joint_names):
         unit, size = ("mm", step_size(arm)[j]) if arm.prismatic[j] else ("mrad", step_size(arm)[j])
         title = f"{joint}, step {1e3 * size:g} {unit}, band {1e3 * band(arm)[j]:.2g} {unit}"
         names = [condition.name for condition in comparison.conditions]
-        table = make_table(title, "", *names, "overshoot", "left", "unrest")
+        table = make_table(title, "", *names, "over- shoot", f"residual [{unit}]", "oscil- lation")
         for which in comparison.gains:
             settling = comparison.table(which, "settling")[:, :, j]
             worst = [comparison.table(which, name)[0, :, j].max() for name in ("overshoot", "steady_error", "unrest")]
@@ -95,28 +135,18 @@ def print_comparison(console: Console, comparison: Comparison) -> None:
                 which,
                 *(_slowest(row) for row in settling),
                 f"{100 * worst[0]:.0f} %",
-                f"{1e3 * worst[1]:.2f} {unit}",
+                f"{1e3 * worst[1]:.2f}",
                 f"{100 * worst[2]:.1f} %",
             )
         console.print(table)
         console.print()
-    _print_poses(console, comparison)
 
 
 def _print_poses(console: Console, comparison: Comparison) -> None:
-    n = comparison.arm.num_joints
-    table = make_table(
-        f"Joints of {n} that settle, and their mean settling time [s]",
-        "pose [rad, m]",
-        *comparison.gains,
-    )
+    table = make_table("Settled joints by pose [rad, m], mean settling time", "", *comparison.gains)
     for p, q in enumerate(comparison.poses):
         cells = [_settled(comparison.table(which, "settling")[0, p]) for which in comparison.gains]
         table.add_row(" ".join(f"{x:.2f}" for x in q), *cells)
-    table.add_section()
-    for c, condition in enumerate(comparison.conditions):
-        cells = [_settled(comparison.table(which, "settling")[c].ravel()) for which in comparison.gains]
-        table.add_row(f"all poses, {condition.name}", *cells)
     console.print(table)
 
 
@@ -127,35 +157,5 @@ def _slowest(settling: NDArray[np.float64]) -> str:
 
 def _settled(settling: NDArray[np.float64]) -> str:
     inside = np.isfinite(settling)
-    mean = f", {settling[inside].mean():.2f}" if inside.any() else ""
+    mean = f", {settling[inside].mean():.2f} s" if inside.any() else ""
     return f"{np.count_nonzero(inside)}/{len(settling)}{mean}"
-
-
-COLOURS = {OWN: "#9a9a9a", PUBLISHED: "#b58db6", "paper": "#edae49", "model": "#d1495b"}
-
-
-def plot_steps(path: Path, comparison: Comparison) -> None:
-    """One panel a joint: the step of all joints at once from the first pose, with all gains; the band is shaded."""
-    arm = comparison.arm
-    figure, axes = plt.subplots(2, -(-arm.num_joints // 2), figsize=(15, 7), layout="constrained")
-    for j, (name, ax) in enumerate(zip(arm.joint_names, axes.flat, strict=False)):
-        unit = "mm" if arm.prismatic[j] else "mrad"
-        for which, response in comparison.responses.items():
-            way = 1e3 * (response.q[:, j] - response.q[0, j])
-            sign = np.sign(response.q_desired[j] - response.q[0, j])
-            ax.plot(response.t, sign * way, color=COLOURS[which], label=which, linewidth=1.2)
-            goal = 1e3 * abs(response.q_desired[j] - response.q[0, j])
-        half = 1e3 * band(arm)[j]
-        ax.axhspan(goal - half, goal + half, color="#1f6f8b", alpha=0.15, linewidth=0)
-        # What runs away would flatten all the others.
-        ax.set_ylim(-0.1 * goal, 1.6 * goal)
-        ax.set_title(f"J{j + 1} {name}", fontsize=9)
-        ax.set_ylabel(f"[{unit}]", fontsize=8)
-        ax.set_xlabel("time [s]", fontsize=8)
-        ax.tick_params(labelsize=8)
-    for ax in axes.flat[arm.num_joints :]:
-        ax.axis("off")
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower right", fontsize=9)
-    figure.suptitle(f"{arm.name}, simulated with all effects: all joints step at once; shaded: settled")
-    save_figure(figure, path)

@@ -46,7 +46,7 @@ from dvrk_drake.reports.reproduction.drift import reproduce_figure_5
 from dvrk_drake.reports.reproduction.mechanisms import reproduce_table_1
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, share, write_page
 from dvrk_drake.reports.reproduction.run import NAMES, reproduce
-from dvrk_drake.reports.transparency import reproduce_transparency
+from dvrk_drake.reports.reproduction.transparency import reproduce_transparency
 
 ARM = load_arm(PAPER_ARM)
 

@@ -17,7 +17,7 @@ from dvrk_drake.experiments.reproduction.laboratory import Laboratory
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.tuning.model_based import friction
 from dvrk_drake.models.effects_schema import EFFECT_NAMES
-from dvrk_drake.reports.figures import MEASURED_COLOUR, MODEL_COLOUR, save_figure
+from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, save_figure
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers, share
 
 #: Over what a drift rate is taken [s].

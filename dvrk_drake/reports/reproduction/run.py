@@ -15,7 +15,7 @@ from dvrk_drake.reports.reproduction.mechanisms import reproduce_psm, reproduce_
 from dvrk_drake.reports.reproduction.page import Section, write_page
 from dvrk_drake.reports.reproduction.step_response import reproduce_figure_7
 from dvrk_drake.reports.reproduction.torque_errors import reproduce_figure_4
-from dvrk_drake.reports.transparency import reproduce_transparency
+from dvrk_drake.reports.reproduction.transparency import reproduce_transparency
 
 _MAKERS: dict[str, Callable[[Laboratory], Section]] = {
     "table1": lambda laboratory: reproduce_table_1(),

@@ -23,7 +23,7 @@ from dvrk_drake.experiments.reproduction.step_response import (
     swings,
 )
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.reports.figures import save_figure
+from dvrk_drake.reports.figures.style import save_figure
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers
 
 _FILE = "fig7.png"

@@ -1,0 +1,1 @@
+"""Figures in one style, as PNG files. Matplotlib is imported here only."""

@@ -1,0 +1,94 @@
+"""Figure of the dVRK's installed gravity compensation beside a model's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import CompensationComparison
+from dvrk_drake.reports.figures.style import MODEL_COLOUR, save_figure
+
+FILE_COLOUR = "#d1495b"
+
+#: What is wrong with a pose -> colour of its strip.
+_FLAGS = {"clip active": "#edae49", "pushes against the model": "#d1495b", "runaway": "#5b3a8c"}
+
+_BINS = 60
+
+_DRAWN = 6  # the file has nothing for joint 7
+
+
+def plot_compensation(path: str | Path, comparison: CompensationComparison, title: str) -> None:
+    """One panel a joint over its position: ranges over all poses, and below the share of poses that are wrong.
+
+    Bands are the range over all other joints. Drawn are the file before its clip, its limits (dashed), and the sweep
+    that the file says its data are from (grey ground).
+
+    Args:
+        path: PNG to write.
+        comparison: what to draw.
+        title: above all.
+
+    Raises:
+        DvrkDrakeError: the file cannot be written.
+    """
+    figure = plt.figure(figsize=(16, 9.5), layout="constrained")
+    grid = figure.add_gridspec(4, 3, height_ratios=[3, 1, 3, 1])
+    for j in range(_DRAWN):
+        row, column = 2 * (j // 3), j % 3
+        torque_axes = figure.add_subplot(grid[row, column])
+        share_axes = figure.add_subplot(grid[row + 1, column], sharex=torque_axes)
+        _draw_torque(torque_axes, comparison, j)
+        _draw_shares(share_axes, comparison, j)
+    handles, labels = (a + b for a, b in zip(*(ax.get_legend_handles_labels() for ax in figure.axes[:2]), strict=True))
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    figure.suptitle(title)
+    save_figure(figure, Path(path))
+
+
+def _draw_torque(axes: Axes, comparison: CompensationComparison, j: int) -> None:
+    joint, file = comparison.joints[j], comparison.file
+    edges, centres, members = _bins(comparison, j)
+    if file.sweep is not None:
+        span = np.clip(file.sweep[:, j], edges[0], edges[-1])
+        axes.axvspan(*span, color="0.92", label="sweep of the file's data")
+    for torque, colour, label in (
+        (comparison.file_torque, FILE_COLOUR, "installed file, before its clip"),
+        (comparison.model_torque, MODEL_COLOUR, "model"),
+    ):
+        low, middle, high = (np.array([f(torque[m, j]) for m in members]) for f in (np.min, np.mean, np.max))
+        axes.fill_between(centres, low, high, color=colour, alpha=0.3, label=f"{label} (range)")
+        axes.plot(centres, middle, color=colour, linewidth=1.2)
+    for i, limit in enumerate((joint.clip_lower, joint.clip_upper)):
+        axes.axhline(limit, color="black", linestyle="--", linewidth=0.9, label="" if i else "clip of the file")
+    axes.set_title(f"J{j + 1} {joint.name}", fontsize=10)
+    axes.set_ylabel("torque [N m]")
+    axes.tick_params(labelbottom=False)
+    axes.set_xlim(edges[0], edges[-1])
+
+
+def _draw_shares(axes: Axes, comparison: CompensationComparison, j: int) -> None:
+    _, centres, members = _bins(comparison, j)
+    flags = (comparison.clipped, comparison.opposed, comparison.runaway)
+    for (label, colour), flag in zip(_FLAGS.items(), flags, strict=True):
+        axes.plot(centres, [100 * flag[m, j].mean() for m in members], color=colour, label=f"{label} [% of poses]")
+    axes.set_ylim(-3, 103)
+    axes.set_ylabel("% of poses")
+    axes.set_xlabel(f"q{j + 1} [rad]")
+    axes.grid(alpha=0.3)
+
+
+def _bins(
+    comparison: CompensationComparison, j: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], list[NDArray[np.int_]]]:
+    """Edges and centres of bins of q_j that hold poses, and which."""
+    q = comparison.q[:, j]
+    edges = np.linspace(q.min(), q.max(), _BINS + 1)
+    index = np.clip(np.digitize(q, edges) - 1, 0, _BINS - 1)
+    members = [np.flatnonzero(index == i) for i in range(_BINS)]
+    used = [i for i, m in enumerate(members) if len(m)]
+    return edges, (edges[:-1] + edges[1:])[used] / 2, [members[i] for i in used]

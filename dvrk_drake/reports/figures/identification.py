@@ -1,0 +1,230 @@
+"""Figures of identifications and validations, of poses and of motions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification
+from dvrk_drake.analysis.dynamic.validation import DynamicValidation, validate_motion
+from dvrk_drake.analysis.results import Identification, Validation
+from dvrk_drake.analysis.static.doubts import Doubt, usable_measurements
+from dvrk_drake.analysis.static.static_identification import StaticIdentification
+from dvrk_drake.analysis.static.validation import StaticValidation
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, ZERO_COLOUR, save_figure
+
+
+def plot_identification(folder: Path, result: Identification) -> None:
+    """Writes PNGs of fitted and predicted efforts; a motion's as `plot_motion`."""
+    if isinstance(result, DynamicIdentification):
+        fit = validate_motion(result.model, result.recording)
+        arm = result.model.arm
+        plot_motion(folder, arm, fit, f"{arm.name}, fitted to {Path(result.recording.source).name}")
+    elif isinstance(result, StaticIdentification):
+        plot_static_identification(folder, result)
+
+
+def plot_validation(folder: Path, validation: Validation) -> None:
+    """Writes PNGs of errors; a motion's as `plot_motion`."""
+    if isinstance(validation, DynamicValidation):
+        arm = validation.model.arm
+        plot_motion(folder, arm, validation, f"{arm.name}, {Path(validation.recording.source).name}")
+    elif isinstance(validation, StaticValidation):
+        plot_static_validation(folder, validation)
+
+
+def plot_static_identification(folder: Path, result: StaticIdentification) -> None:
+    """Writes torque_error.png and predicted.png of an identification."""
+    recording = result.recording
+    joints = result.model.joints
+    plot_torque_error(
+        folder / "torque_error.png",
+        result.model.arm,
+        np.array([j.rms_zero_torque_undoubted for j in joints]),
+        {
+            "leave-one-out": np.array([j.rms_leave_one_out_undoubted for j in joints]),
+            "ten-fold, effects chosen anew": np.array([j.rms_cross_validation_undoubted for j in joints]),
+        },
+        f"{result.model.arm.name}: poses not used for fitting ({Path(recording.source).name}, without doubted ones)",
+    )
+    plot_measured_against_predicted(folder / "predicted.png", result.model, recording, result.measured, result.doubts)
+
+
+def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
+    """Writes torque_error.png and predicted.png of a validation."""
+    model = validation.model
+    arm = model.arm
+    recording = validation.recording.in_joint_coordinates(arm)
+    plot_torque_error(
+        folder / "torque_error.png",
+        arm,
+        np.array([j.rms_torque for j in validation.joints]),
+        {"model": np.array([j.rms_error for j in validation.joints])},
+        f"{model.arm.name}: all {validation.poses} poses of {Path(recording.source).name}",
+    )
+    plot_measured_against_predicted(folder / "predicted.png", model, recording, validation.measured, validation.doubts)
+
+
+def plot_torque_error(
+    path: Path,
+    arm: Arm,
+    rms_zero: NDArray[np.float64],
+    rms_model: dict[str, NDArray[np.float64]],
+    title: str,
+) -> None:
+    """RMS torque error per joint (n,) [N m, N], zero torque beside each model; log scale: joints differ by decades."""
+    names = arm.joint_names
+    figure, axes = plt.subplots(figsize=(11, 5), layout="constrained")
+    bars = {"zero torque": rms_zero, **rms_model}
+    colours = [ZERO_COLOUR, MODEL_COLOUR, MEASURED_COLOUR, "#edae49"]
+    width = 0.8 / len(bars)
+    for i, (label, values) in enumerate(bars.items()):
+        x = np.arange(len(names)) + (i - (len(bars) - 1) / 2) * width
+        drawn = axes.bar(x, values, width, label=label, color=colours[i % len(colours)])
+        axes.bar_label(drawn, [f"{v:.2g}" for v in values], fontsize=7, padding=2, rotation=90)
+    if any(np.any(values > 0) for values in bars.values()):
+        axes.set_yscale("log")
+    axes.set_xticks(range(len(names)), _labels(names), fontsize=8)
+    forces = "".join(f"; J{j + 1}: N" for j in np.flatnonzero(arm.prismatic))
+    axes.set_ylabel(f"RMS torque error [N m{forces}]")
+    axes.set_title(title)
+    axes.margins(y=0.25)
+    axes.legend(fontsize=8)
+    save_figure(figure, path)
+
+
+def plot_measured_against_predicted(
+    path: Path,
+    model: IdentifiedModel,
+    recording: Recording,
+    measured_joints: NDArray[np.bool_],
+    doubts: list[Doubt],
+) -> None:
+    """One panel a joint: predicted over measured torque of every pose.
+
+    Args:
+        path: PNG to write.
+        model: what predicts.
+        recording: in joint coordinates.
+        measured_joints: (m, n); what is no holding torque is not drawn.
+        doubts: what is doubted is drawn as a cross, and does not stretch the axes.
+    """
+    usable = usable_measurements(recording.q.shape, doubts) & measured_joints
+    arm = model.arm
+    names = arm.joint_names
+    measured, predicted = recording.measured_effort(), model.holding_torque(recording.q)
+    figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained")
+    for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
+        use, doubted = usable[:, j], measured_joints[:, j] & ~usable[:, j]
+        if not np.any(use):
+            ax.set_title(f"J{j + 1} {name}: nothing measured", fontsize=10)
+            ax.set(xticks=[], yticks=[])
+            continue
+        shown = np.concatenate([measured[use, j], predicted[use, j], [0.0]])
+        pad = 0.05 * max(float(np.ptp(shown)), 1e-6)
+        limits = np.array([shown.min() - pad, shown.max() + pad])
+        ax.plot(limits, limits, color="black", linewidth=0.8, label="measured = predicted")
+        ax.plot(measured[use, j], predicted[use, j], ".", color=MODEL_COLOUR, label="one pose")
+        ax.plot(
+            np.clip(measured[doubted, j], *limits),
+            np.clip(predicted[doubted, j], *limits),
+            "x",
+            color=MEASURED_COLOUR,
+            label="doubted (at the edge: outside)",
+        )
+        ax.set(xlim=limits, ylim=limits)
+        ax.locator_params(nbins=5)
+        ax.set_title(f"J{j + 1} {name}", fontsize=10)
+        unit = "N" if arm.prismatic[j] else "N m"
+        ax.set_xlabel(f"measured [{unit}]", fontsize=8)
+        ax.set_ylabel(f"predicted [{unit}]", fontsize=8)
+        ax.tick_params(labelsize=7)
+    for ax in axes.flat[len(names) :]:
+        ax.axis("off")
+    key = next((ax.get_legend_handles_labels() for ax in axes.flat if ax.has_data()), None)
+    if key:
+        figure.legend(*key, loc="lower right", fontsize=8)
+    figure.suptitle(f"{model.arm.name}: holding torque, {len(recording)} rows of {Path(recording.source).name}")
+    save_figure(figure, path)
+
+
+def plot_motion(folder: Path, arm: Arm, validation: DynamicValidation, title: str) -> None:
+    """Writes efforts.png, residuals.png and error_budget.png of a motion."""
+    _plot_efforts(folder / "efforts.png", arm, validation, title)
+    _plot_residuals(folder / "residuals.png", arm, validation, title)
+    _plot_budget(folder / "error_budget.png", validation, title)
+
+
+def _plot_efforts(path: Path, arm: Arm, validation: DynamicValidation, title: str) -> None:
+    """One panel an actuator: measured and predicted effort over time, and their difference."""
+    count = arm.num_joints
+    figure, axes = plt.subplots(count, 1, figsize=(13, 1.9 * count), sharex=True, layout="constrained")
+    for i, (actuator, ax) in enumerate(zip(validation.actuators, axes, strict=True)):
+        measured, predicted = validation.measured[:, i], validation.predicted[:, i]
+        ax.plot(validation.t, measured - predicted, color=ZERO_COLOUR, linewidth=0.8, label="measured - predicted")
+        ax.plot(validation.t, measured, color=MEASURED_COLOUR, linewidth=1.0, label="measured")
+        ax.plot(validation.t, predicted, color=MODEL_COLOUR, linewidth=1.0, label="predicted")
+        relative = "" if actuator.relative_error is None else f", error {100 * actuator.relative_error:.1f} %"
+        ax.set_title(f"actuator {i + 1} {actuator.name}{relative}", fontsize=9)
+        ax.set_ylabel("N" if arm.prismatic[i] else "N m", fontsize=8)
+        ax.tick_params(labelsize=7)
+    axes[-1].set_xlabel("time [s]", fontsize=8)
+    axes[0].legend(fontsize=7, loc="upper right", ncols=3)
+    figure.suptitle(f"{title}: efforts of the actuators behind {validation.cut_off:g} Hz")
+    save_figure(figure, path)
+
+
+def _plot_residuals(path: Path, arm: Arm, validation: DynamicValidation, title: str) -> None:
+    """One column an actuator: the difference over position, velocity and time."""
+    count = arm.num_joints
+    figure, axes = plt.subplots(3, count, figsize=(2.6 * count, 7), sharey="col", layout="constrained")
+    residuals = validation.measured - validation.predicted
+    for i, actuator in enumerate(validation.actuators):
+        length = "m" if arm.prismatic[i] else "rad"
+        over = (
+            (validation.q[:, i], f"position [{length}]"),
+            (validation.v[:, i], f"velocity [{length}/s]"),
+            (validation.t, "time [s]"),
+        )
+        for (x, label), ax in zip(over, axes[:, i], strict=True):
+            ax.plot(x, residuals[:, i], ",", color=MODEL_COLOUR, alpha=0.5)
+            ax.axhline(0.0, color="black", linewidth=0.6)
+            ax.set_xlabel(label, fontsize=8)
+            ax.tick_params(labelsize=7)
+        axes[0, i].set_title(f"{i + 1} {actuator.name}\n[{'N' if arm.prismatic[i] else 'N m'}]", fontsize=9)
+    figure.suptitle(f"{title}: measured - predicted effort")
+    save_figure(figure, path)
+
+
+def _plot_budget(path: Path, validation: DynamicValidation, title: str) -> None:
+    """Stacked shares of each actuator's squared error, their height the relative error."""
+    kinds = ("bias", "friction_like", "position_dependent", "other")
+    colours = ("#edae49", MEASURED_COLOUR, MODEL_COLOUR, ZERO_COLOUR)
+    figure, ax = plt.subplots(figsize=(11, 5), layout="constrained")
+    heights = np.array([100 * (a.relative_error or 0.0) for a in validation.actuators])
+    bottom = np.zeros(len(heights))
+    for kind, colour in zip(kinds, colours, strict=True):
+        part = heights * np.array([getattr(a, kind) for a in validation.actuators])
+        ax.bar(range(len(heights)), part, 0.6, bottom=bottom, color=colour, label=kind.replace("_", " "))
+        bottom += part
+    for i, actuator in enumerate(validation.actuators):
+        if actuator.repeatability is not None:
+            floor = 100 * actuator.repeatability
+            ax.plot(
+                [i - 0.35, i + 0.35], [floor, floor], color="black", linewidth=1.2, label="_" if i else "repeatability"
+            )
+    ax.set_xticks(range(len(heights)), [a.name.replace("_", "\n") for a in validation.actuators], fontsize=8)
+    ax.set_ylabel("relative error [%], split by shares of its square")
+    ax.set_title(title)
+    ax.legend(fontsize=8)
+    save_figure(figure, path)
+
+
+def _labels(names: tuple[str, ...]) -> list[str]:
+    return [f"J{i + 1}\n{name.replace('_', chr(10))}" for i, name in enumerate(names)]
