@@ -97,7 +97,7 @@ def _print_compensation(
         f"The file differs from the model by at most {off[j]:.1e} N m ({MTM_JOINTS[j]}), at rest.",
         f"compare-gc {path} --model {export.origin}",
     )
-    columns = ("largest difference*", "clip", "friction", "friction ratio", "dead band [rad/s]", "satu- ration [rad/s]")
+    columns = ("largest difference*", "clip", "friction", "friction ratio", "dead band [rad/s]", "saturation [rad/s]")
     table = make_table("Torques [N m]", "", *(columns if verbose else columns[:3]))
     friction = np.append((file.positive - file.negative)[10::5] / 2, 0.0)
     for j, name in enumerate(MTM_JOINTS):

@@ -29,8 +29,8 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 
 #: Colours of rows by verdict.
 _STYLES: dict[Verdict, str] = {"do not use": "red", "not judged": "yellow"}
-_EFFECT_COLUMNS = ("", "kind", "scale", "value", "+-", "unit if revolute")
-_NAME_WIDTH, _REMARK_WIDTH = 64, 26
+_EFFECT_COLUMNS = ("", "kind", "scale", "value", "+-", "unit (revolute)")
+_NAME_WIDTH = 64
 
 
 def print_identification(
@@ -123,11 +123,19 @@ def print_recalibration(
     )
     table = make_table(
         f"{result.model.arm.name}, {result.seconds:.1f} s of motion: effort error, and change of friction and offset",
-        *("", "error before", "error after", "dry friction factor", "viscous factor", "offset change [N m; N]", ""),
+        *(
+            "",
+            "error before",
+            "error after",
+            "dry friction factor",
+            "viscous factor",
+            "offset change [N m; N]",
+            "unchanged: why",
+        ),
     )
     for a in result.actuators:
         new = [_factor(a.dry), _factor(a.viscous), f"{a.offset:+.4f}"] if a.kept else ["", "", ""]
-        table.add_row(a.name, _percent(a.before), _percent(a.after), *new, "" if a.kept else f"unchanged: {a.reason}")
+        table.add_row(a.name, _percent(a.before), _percent(a.after), *new, a.reason)
     table.columns[-1].justify, table.columns[-1].no_wrap = "left", False
     table.add_row("mean", _percent(before), _percent(after), "", "", "", "")
     console.print(table)
@@ -161,15 +169,14 @@ def _print_verdict(console: Console, verdicts: Mapping[str, Verdict], error: str
 def _largest_error(arm: Arm, errors: np.ndarray, torques: np.ndarray, kind: str = "") -> str:
     """Names the joint with the largest error as a share of its effort limit."""
     j = int(np.nanargmax(np.where(torques > 0, errors / arm.effort_limits, -1.0)))
-    unit = "N" if arm.prismatic[j] else "N m"
-    share = f", {_percent(errors[j] / torques[j])} of its measured torque" if torques[j] > 0 else ""
-    return f"Largest {kind}error {errors[j]:.3g} {unit} ({arm.joint_names[j]}){share}."
+    unit, share = "N" if arm.prismatic[j] else "N m", _percent(errors[j] / arm.effort_limits[j])
+    return f"Largest {kind}error: {share} of the effort limit ({arm.joint_names[j]}, {errors[j]:.3g} {unit})."
 
 
 def _print_motion_errors(console: Console, result: DynamicIdentification, verdicts: Mapping[str, Verdict]) -> None:
     section = result.model.dynamic_model.section
     title = f"{result.model.arm.name}, {len(result.recording)} rows of motion: RMS effort error of the actuators"
-    columns = ("", "measured effort [N m; N]", "error in the fit", "cross- validated", "repeat- ability", "verdict")
+    columns = ("", "effort [N m; N]", "error in fit", "cross-validated", "repeatability", "verdict")
     table = make_table(title, *columns)
     table.columns[-1].justify = "left"
     errors = ("rms_fit", "rms_cross_validation", "rms_repeatability")
@@ -214,19 +221,19 @@ def _print_motion_details(console: Console, result: DynamicIdentification) -> No
 
 def _print_links(console: Console, section: DynamicSection, nominal_mass: float) -> None:
     table = make_table("Links", "", "mass [kg]", "+-", "centre of mass [m]", "+-", "")
-    table.columns[-1].no_wrap, table.columns[-1].max_width = False, _REMARK_WIDTH
+    table.columns[0].no_wrap, table.columns[-1].no_wrap = True, False
     for link in section.links:
         m, *h = link.parameters[:4]
         com = np.array(h) / m
         errors = np.array(link.standard_errors[:4])
         # First order, mass and first moments taken for independent: the larger of both decides.
         spread = float(np.max(np.hypot(errors[1:], com * errors[0]))) / m
-        remark = "; ".join(link.bounds) + " *" if link.bounds else ("mass: the SDF's" if link.mass_told < 0.5 else "")
+        remark = "; ".join(link.bounds) + " *" if link.bounds else ("SDF's mass" if link.mass_told < 0.5 else "")
         place = ", ".join(f"{x:+.3f}" for x in com)
         table.add_row(link.link, f"{m:.4g}", f"{errors[0]:.1g}", place, f"{spread:.1g}", remark)
     total = sum(link.parameters[0] for link in section.links)
     reached = total_mass_reached(total, nominal_mass)
-    table.add_row("all", f"{total:.4g}", "", "", "", f"{nominal_mass:.4g} in the SDF" + " *" * reached)
+    table.add_row("all", f"{total:.4g}", "", "", "", f"SDF: {nominal_mass:.4g}" + " *" * reached)
     console.print(table)
     if reached or any(link.bounds for link in section.links):
         console.print("* at its bound: the value is that of the bound, not of the motion", style="yellow")
@@ -295,7 +302,7 @@ def _print_pose_errors(console: Console, result: StaticIdentification, verdicts:
     joints, poses = result.model.joints, len(result.recording)
     title = f"{result.model.arm.name}, {poses} static poses: RMS holding torque and error"
     table = make_table(
-        title, "", "torque [N m; N]", "error, cross- validated", "ratio", "feed- forward scale", "range covered",
+        title, "", "torque [N m; N]", "error, cross-validated", "ratio", "feed-forward scale", "range covered",
         "excluded", "verdict",
     )  # fmt: skip
     table.columns[-1].justify = "left"
@@ -346,7 +353,7 @@ def print_static_parameters(console: Console, model: IdentifiedModel) -> None:
         console.print(table)
         console.print()
     title = "RMS error [N m; N], and with the excluded measurements*"
-    table = make_table(title, "", "fit", "leave- one-out", "torque*", "fit*", "leave- one-out*", "positions [rad; m]")
+    table = make_table(title, "", "fit", "leave-one-out", "torque*", "fit*", "leave-one-out*", "positions [rad; m]")
     for j in model.joints:
         own = (j.rms_fit_undoubted, j.rms_leave_one_out_undoubted)
         errors = (*own, j.rms_zero_torque, j.rms_fit, j.rms_leave_one_out)
@@ -372,7 +379,7 @@ def _print_excluded(console: Console, doubts: Sequence[Doubt]) -> None:
 def _print_motion_validation(console: Console, validation: DynamicValidation, verbose: bool) -> None:
     name = Path(validation.recording.source).name or "recording"
     title = f"{validation.model.arm.name}, {name}: RMS effort of the actuators [N m; N]"
-    table = make_table(title, "", "measured", "error", "ratio", "repeat- ability", "verdict")
+    table = make_table(title, "", "measured", "error", "ratio", "repeatability", "verdict")
     table.columns[-1].justify = "left"
     for a in validation.actuators:
         shares = ("" if x is None else _percent(x) for x in (a.relative_error, a.repeatability))

@@ -14,17 +14,18 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_n
 
 
 def print_payload(
-    console: Console, result: PayloadIdentification, *, model_path: str = "MODEL.yaml", verbose: bool = False
+    console: Console, result: PayloadIdentification, *, model_path: str | None = None, verbose: bool = False
 ) -> None:
     """Prints the mass and its link, or that no payload was found; then mass and place with their intervals.
 
     Args:
         console: to print to.
         result: to print.
-        model_path: file of the arm's model, for the next command.
+        model_path: file of the arm's model, for the next command; None: the model was identified from the reference.
         verbose: also print the estimate on every link, and the efforts that the payload explains.
     """
     payload, estimates = result.payload, result.estimates
+    command = f"--arm {result.model.arm.source}" if model_path is None else f"--model {model_path}"
     # A named link is compared with the others by a warning.
     others = [] if result.link else [other.link for other in as_good(estimates) if other is not payload]
     if not payload.found:
@@ -34,17 +35,16 @@ def print_payload(
         if others:
             names = " or ".join(others)
             answer += f" These recordings do not distinguish it from a payload on {names}: name the link with --link."
-    command = f"payload REFERENCE.csv LOADED.csv --model {model_path}"
-    link = "LINK" if others else payload.link
-    ambiguous = others or not payload.found
-    print_answer(console, answer, f"{command} --link {link} --json payload.json", "yellow" if ambiguous else "green")
+    command += " --json FILE" if payload.found and not others else " --link LINK"
+    style = "green" if payload.found and not others else "yellow"
+    print_answer(console, answer, f"payload REFERENCE LOADED {command}", style)
     if payload.found:
         console.print(_estimate_table(payload))
+    if verbose:
         console.print()
-    if not payload.found or others or verbose:
         _print_links(console, estimates)
-    if verbose and payload.found:
-        _print_efforts(console, payload)
+        if payload.found:
+            _print_efforts(console, payload)
 
 
 def _estimate_table(payload: Payload) -> Table:

@@ -40,7 +40,7 @@ def print_report(console: Console, report: RecordingReport, *, arm: str = "ARM",
 def _print_verdict(console: Console, report: RecordingReport, arm: str) -> None:
     what = f"{report.rows} rows of {report.kind}"
     if report.rate is not None and report.duration is not None:
-        what = f"a motion of {report.rows} rows, {report.duration:.2f} s at {report.rate:.4g} Hz"
+        what = f"motion of {report.rows} rows, {report.duration:.2f} s at {report.rate:.4g} Hz"
     next_command = f"identify {report.source} --arm {arm} --output MODEL.yaml"
     verdict, style, found = "usable", "green", report.warnings
     if report.refusals:
@@ -56,7 +56,7 @@ def _print_verdict(console: Console, report: RecordingReport, arm: str) -> None:
 def _print_joints(console: Console, report: RecordingReport) -> None:
     columns = ("", "range [rad; m]", "share of limits", "RMS effort [N m; N]", "peak / effort limit")
     periodic = report.period is not None
-    table = make_table("Positions and efforts", *columns, *(["repeat- ability"] if periodic else []))
+    table = make_table("Positions and efforts", *columns, *(["repeatability"] if periodic else []))
     for joint in report.joints:
         cells = [f"{joint.range:.3f}", f"{100 * joint.coverage:.0f} %"]
         cells += [_number(joint.effort, "{:.4f}"), _number(joint.peak_effort, "{:.0f} %", 1e2)]

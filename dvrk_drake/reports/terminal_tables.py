@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import os
 import re
+import textwrap
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
 TABLE_WIDTH = 80
-#: A space in a heading, but none of a unit in brackets or at a bar.
-_BETWEEN_WORDS = re.compile(r"(?<!\|) (?![^\[]*\]|\|)")
+#: A space inside of a unit in brackets.
+_IN_UNIT = re.compile(r" (?=[^\[]*\])")
+_NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
 
 
 class TableConsole(Console):
@@ -29,7 +30,7 @@ class TableConsole(Console):
         for table in (thing for thing in objects if isinstance(thing, Table)):
             if self._least_width(table) > width:
                 for column in table.columns:
-                    column.header = _BETWEEN_WORDS.sub("\n", str(column.header))
+                    column.header = Text(_stack(str(column.header), [str(cell) for cell in column.cells]))
             self.width = max(self.width, self._least_width(table))
         try:
             super().print(*objects, **options)
@@ -44,6 +45,14 @@ class TableConsole(Console):
             sizes = [Measurement.get(self, free, cell) for cell in (column.header, *column.cells)]
             least += max(size.maximum if column.no_wrap else size.minimum for size in sizes)
         return least
+
+
+def _stack(heading: str, cells: list[str]) -> str:
+    """A heading on as few lines as fit the width of its longest word or of the cells; units stay on one line."""
+    text = _IN_UNIT.sub(_NO_BREAK_SPACE, heading)
+    words = textwrap.wrap(text, 1, break_long_words=False)
+    width = max(map(len, [*words, *cells]), default=1)
+    return "\n".join(textwrap.wrap(text, width)).replace(_NO_BREAK_SPACE, " ")
 
 
 def make_console() -> Console:
@@ -80,5 +89,5 @@ def make_table(title: str, *columns: str) -> Table:
     for i, column in enumerate(columns):
         # The name of a base parameter may be long; numbers are never cut.
         # Units in brackets are no markup.
-        table.add_column(escape(column), justify="left" if i == 0 else "right", no_wrap=i > 0, overflow="fold")
+        table.add_column(Text(column), justify="left" if i == 0 else "right", no_wrap=i > 0, overflow="fold")
     return table

@@ -127,7 +127,7 @@ def _print_joints(console: Console, comparison: Comparison) -> None:
         unit, size = ("mm", step_size(arm)[j]) if arm.prismatic[j] else ("mrad", step_size(arm)[j])
         title = f"{joint}, step {1e3 * size:g} {unit}, band {1e3 * band(arm)[j]:.2g} {unit}"
         names = [condition.name for condition in comparison.conditions]
-        table = make_table(title, "", *names, "over- shoot", f"residual [{unit}]", "oscil- lation")
+        table = make_table(title, "", *names, "overshoot", f"residual [{unit}]", "oscillation")
         for which in comparison.gains:
             settling = comparison.table(which, "settling")[:, :, j]
             worst = [comparison.table(which, name)[0, :, j].max() for name in ("overshoot", "steady_error", "unrest")]
