@@ -10,6 +10,7 @@ from dvrk_drake.cli.app import PAPER, SIMULATE, Overwrite, Port, Seed, Verbose, 
 from dvrk_drake.cli.support import Steps, check_output, new_folder, print_written, quiet_drake
 from dvrk_drake.progress import step_progress
 
+_DEMO_STEPS = "collecting poses", "identifying", "collecting fresh poses", "releasing and holding", "drawing"
 Folder = Annotated[str, Parameter(metavar="FOLDER", help="Write into this folder, new or empty.")]
 
 
@@ -34,7 +35,7 @@ def demo(
 
     quiet_drake()
     output = new_folder(folder, overwrite=overwrite)
-    with Steps() as steps:
+    with Steps(*_DEMO_STEPS) as steps:
         result = run_demo(output, arm, seed, steps)
         steps("drawing", 0.0)
         plot_demo(output, result)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Group, Parameter
 
 from dvrk_drake.cli.app import MODEL, Arm, Json, Model, Overwrite, Plots, Verbose, app, one_of
-from dvrk_drake.cli.support import check_output, load_model, plots_folder, print_written, write_json
+from dvrk_drake.cli.support import Steps, check_output, load_model, plots_folder, print_written, write_json
 from dvrk_drake.errors import DvrkDrakeError, ModelError
 
 if TYPE_CHECKING:
@@ -90,7 +90,8 @@ def export(
     }
     # All are computed before the first is written: one that is refused leaves no other behind.
     origin = model or arm or ""
-    exports = {format: prepare_export(loaded, format, origin=origin, **settings) for format in outputs}
+    with Steps(f"exporting {loaded.arm.name}"):
+        exports = {format: prepare_export(loaded, format, origin=origin, **settings) for format in outputs}
     for format, path in outputs.items():
         exports[format].write(path)
         print_export(make_console(), path, exports[format], verbose=verbose)
@@ -129,7 +130,8 @@ def compare_gc(
     installed = GravityCompensationFile.load(file)
     loaded, origin = load_model(model, arm), model or arm or ""
     try:
-        comparison = compare_compensation(installed, loaded)
+        with Steps(f"comparing with {origin}"):
+            comparison = compare_compensation(installed, loaded)
     except ModelError as error:
         raise ModelError(f"{file}: {error}") from error
     print_comparison(make_console(), file, origin, comparison, verbose=verbose)

@@ -76,6 +76,7 @@ def arm(
     configuration.key_file = key or configuration.key_file
     start = start_pose(played, pose)
     url = open_lcm(lcm_url or configuration.lcm_url).get_lcm_url()
+    print(f"starting the simulated {played.name}", flush=True)
     with interrupt_ends_process():
         simulated = SimulatedArm(played, configuration, url, start)
         stopped = stop_on_signals()
@@ -249,6 +250,7 @@ def ready_controller(
     if controlled.model is not None and (warning := model_warning(controlled.model, model)):
         _warn(warning)
     url = open_lcm(controlled.lcm_url).get_lcm_url()
+    print(f"waiting for {arm.name} on LCM {url}", flush=True)
     with closing(ArmLink(arm, url, key=key)) as link:
         if controlled.reset:
             reset_fault(link, _warn)

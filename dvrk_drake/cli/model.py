@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import MODEL, Arm, Gravity, LcmUrl, Overwrite, Port, app
-from dvrk_drake.cli.support import check_output, mounted, print_written, quiet_drake, until_stopped
+from dvrk_drake.cli.support import Steps, check_output, mounted, print_written, quiet_drake, until_stopped
 from dvrk_drake.errors import DvrkDrakeError
 
 
@@ -40,7 +40,8 @@ def model(
             raise DvrkDrakeError("--output needs a --format: latex, python or c")
         check_output(output, overwrite=overwrite)
     shown = mounted(load_arm(arm), gravity)
-    derived = derive_gravity(shown)
+    with Steps("deriving the gravity torque"):
+        derived = derive_gravity(shown)
     if format is None:
         print_symbolic_model(make_console(), derived)
         return

@@ -226,10 +226,14 @@ class Steps:
     """Shows on stderr which step of a command runs: bars with the time left on a terminal, elsewhere a line per step.
 
     It is a `dvrk_drake.progress.Progress`. A step "fig5: releasing" is a part of the step "fig5".
+
+    Args:
+        first: name of the step that begins with the block.
+        names: of the other steps.
     """
 
-    def __init__(self, *names: str):
-        self._names, self._tasks = list(names), dict[str, TaskID]()
+    def __init__(self, first: str, *names: str):
+        self._names, self._tasks = [first, *names], dict[str, TaskID]()
         console = Console(stderr=True)
         self._progress = Progress(
             TextColumn("{task.description}"),
@@ -247,6 +251,7 @@ class Steps:
 
     def __enter__(self) -> Steps:
         self._progress.start()
+        self(self._names[0], 0.0)
         return self
 
     def __call__(self, step: str, share: float) -> None:
