@@ -40,6 +40,7 @@ def demo(
         steps("drawing", 0.0)
         plot_demo(output, result)
     print_demo(make_console(), result, output, verbose=verbose)
+    print_written(output)
 
 
 @app.command(group=SIMULATE)

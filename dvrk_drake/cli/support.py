@@ -258,7 +258,8 @@ class Steps:
         """Shows a step and its finished share, 0..1."""
         if step not in self._tasks:
             self._begin(step)
-        self._progress.update(self._tasks[step], completed=share)
+        if share > 0:  # before, how long it takes is not known
+            self._progress.update(self._tasks[step], total=1.0, completed=share)
 
     def _begin(self, step: str) -> None:
         name = step.partition(": ")[0]
@@ -269,10 +270,10 @@ class Steps:
         if self._progress.disable:
             print(text, file=sys.stderr, flush=True)
         for task in self._progress.tasks:
-            self._progress.update(task.id, completed=task.total)
+            self._progress.update(task.id, total=1.0, completed=1.0)
         if len(self._progress.tasks) >= MOST_BARS:
             self._progress.remove_task(self._progress.task_ids[0])
-        self._tasks[step] = self._progress.add_task(text, total=1.0)
+        self._tasks[step] = self._progress.add_task(text, total=None)
 
     def __exit__(self, *_: object) -> None:
         self._progress.stop()

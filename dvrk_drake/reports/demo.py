@@ -38,13 +38,15 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
     """
     arm = result.arm
     drifts = list(result.drift.values())
-    j = int(np.argmax(drifts[0] / (arm.position_upper - arm.position_lower)))
-    unit = "m" if arm.prismatic[j] else "rad"
-    identified, drawn = (f"{drift[j]:.4f} {unit}" for drift in drifts[:2])
+    furthest = [int(np.argmax(drift / (arm.position_upper - arm.position_lower))) for drift in drifts[:2]]
+    identified, drawn = (
+        f"{drift[j]:.4f} {'m' if arm.prismatic[j] else 'rad'} ({arm.joint_names[j]})"
+        for drift, j in zip(drifts[:2], furthest, strict=True)
+    )
     print_answer(
         console,
-        f"Released under gravity compensation, {arm.name} drifts by at most {identified} ({arm.joint_names[j]}) with "
-        f"the identified model, and by {drawn} with that of the SDF.",
+        f"Released under gravity compensation, {arm.name} drifts by at most {identified} with the identified model, "
+        f"and by {drawn} with that of the SDF.",
         f"identify POSES.csv --arm {arm.source} --output model.yaml",
     )
     table = make_table(
