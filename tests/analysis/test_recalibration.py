@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from command_output import messages, refusal
 from loaded_arm import friction, other_day
 from motions import fourier_motion, recorded, true_dynamics
 
@@ -172,17 +173,18 @@ def test_from_the_command_line(tmp_path, capsys):
     model.save(paths["model.yaml"])
     IdentifiedModel.from_arm(load_arm("psm")).save(paths["static.yaml"])
     write_recording(motion(truth, generator), paths["short.csv"])
-    assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], "--output", paths["new.yaml"]]) == 0
+    assert main(["recalibrate", paths["short.csv"], "--model", paths["model.yaml"], "--output", paths["new.yaml"]]) == 0
     assert IdentifiedModel.load(paths["new.yaml"]).provenance.method.endswith(f"recalibrated on {paths['short.csv']}")
     table = capsys.readouterr().out
     assert all(name in table for name in ("before", "refit", "wrist_yaw", "kept", "motions like the recalibration"))
     again = ["--output", paths["new.yaml"], "--overwrite"]
-    assert main(["recalibrate", paths["static.yaml"], paths["short.csv"], *again]) == 2
-    assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], "--output", paths["model.yaml"]]) == 2
-    lines = capsys.readouterr().err.splitlines()
+    assert main(["recalibrate", paths["short.csv"], "--model", paths["static.yaml"], *again]) == 2
+    command = ["recalibrate", paths["short.csv"], "--model", paths["model.yaml"]]
+    assert main([*command, "--output", paths["model.yaml"]]) == 2
+    lines = messages(capsys.readouterr().err)
     assert len(lines) == 2 and "has no dynamics" in lines[0] and "is an input" in lines[1]
     spiked = read_recording(paths["short.csv"], load_arm("psm"))
     spiked.tau[500, 1] = 500.0
     write_recording(spiked, paths["short.csv"])
-    assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], *again]) == 2
-    assert "above its limit" in capsys.readouterr().out
+    assert main([*command, *again]) == 2
+    assert "above its limit" in refusal(capsys.readouterr().err)

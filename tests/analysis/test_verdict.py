@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from command_output import refusal
 
 from dvrk_drake.analysis.static.static_identification import LEAST_TORQUE
 from dvrk_drake.analysis.static.validation import validate_static
@@ -167,16 +168,16 @@ def files(tmp_path, truth):
 def test_require_sets_the_exit_code_and_names_the_joints(files, tmp_path, capsys):
     model, good, bad = files
     for required in ([], ["--require", "usable"], ["--require", "good"]):
-        assert main(["validate", model, good, *required]) == 0
+        assert main(["validate", good, "--model", model, *required]) == 0
     capsys.readouterr()
     report = tmp_path / "errors.json"
-    assert main(["validate", model, bad]) == 0
+    assert main(["validate", bad, "--model", model]) == 0
     assert capsys.readouterr().out.startswith("verdict: do not use (shoulder_pitch)\n")
     for required in ("usable", "good"):
-        assert main(["validate", model, bad, "--require", required, "--json", str(report), "--overwrite"]) == 2
+        command = ["validate", bad, "--model", model, "--require", required]
+        assert main([*command, "--json", str(report), "--overwrite"]) == 2
         said = capsys.readouterr()
-        assert said.err.count("\n") == 1
-        assert f"not {required} on {bad}: shoulder_pitch (do not use)" in said.err
+        assert f"not {required} on {bad}: shoulder_pitch (do not use)" in refusal(said.err)
         assert said.out.startswith("verdict: do not use (shoulder_pitch)\n")
         found = json.loads(report.read_text())
         assert found["verdict"] == "do not use" and found["rule"] == rule_text(in_motion=False)
@@ -188,8 +189,9 @@ def test_a_closed_pipe_neither_passes_nor_loses_the_verdicts(files):
     model, _, bad = files
     read, write = os.pipe()
     os.close(read)
-    command = [sys.executable, "-m", "dvrk_drake.cli", "validate", model, bad, "--require", "usable", "--save"]
-    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    command = ["validate", bad, "--model", model, "--require", "usable", "--save"]
+    program = [sys.executable, "-m", "dvrk_drake.cli", *command]
+    done = subprocess.run(program, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
     os.close(write)
     assert done.returncode != 0 and "Traceback" not in done.stderr
     assert IdentifiedModel.load(model).validation.verdicts["shoulder_pitch"] == "do not use"
@@ -198,7 +200,7 @@ def test_a_closed_pipe_neither_passes_nor_loses_the_verdicts(files):
 def test_the_tables_fit_80_columns(files, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
     model, _, bad = files
-    assert main(["validate", model, bad]) == 0
+    assert main(["validate", bad, "--model", model]) == 0
     said = capsys.readouterr().out
     assert "do not use" in said and "ratio: error" in said
     assert max(len(line.rstrip()) for line in said.split("\n\n")[0].splitlines()) <= 80
@@ -210,9 +212,9 @@ def test_the_recording_of_the_identification_validates_nothing(files, tmp_path, 
     provenance = dataclasses.replace(loaded.provenance, sha256=read_recording(good).sha256)
     dataclasses.replace(loaded, provenance=provenance).save(model)
     before = (tmp_path / "model.yaml").read_bytes()
-    assert main(["validate", model, good]) == 0
+    assert main(["validate", good, "--model", model]) == 0
     assert "the model was identified from this recording" in capsys.readouterr().err
-    assert main(["validate", model, good, "--save"]) == 2
+    assert main(["validate", good, "--model", model, "--save"]) == 2
     assert "--save needs a recording that the model was not identified from" in capsys.readouterr().err
     assert (tmp_path / "model.yaml").read_bytes() == before
 
@@ -221,14 +223,14 @@ def test_saved_verdicts_are_those_that_run_warns_of(files, capsys):
     model, good, bad = files
     loaded = IdentifiedModel.load(model)
     assert "no other recording has validated this model; cross-validated: " in model_warning(model, loaded)
-    assert main(["validate", model, bad, "--save"]) == 0
+    assert main(["validate", bad, "--model", model, "--save"]) == 0
     saved = IdentifiedModel.load(model)
     assert dataclasses.replace(saved, validation=None) == loaded
     warning = model_warning(model, saved)
     assert f"did not pass validation on {bad}: shoulder_pitch (do not use);" in warning and "\n" not in warning
-    assert main(["validate", model, good, "--save"]) == 2
+    assert main(["validate", good, "--model", model, "--save"]) == 2
     assert f"has verdicts from {bad} already" in capsys.readouterr().err
-    assert main(["validate", model, good, "--save", "--overwrite"]) == 0
+    assert main(["validate", good, "--model", model, "--save", "--overwrite"]) == 0
     assert model_warning(model, IdentifiedModel.load(model)) == ""
 
 
@@ -249,7 +251,7 @@ def test_run_warns_before_it_looks_for_the_arm(files, monkeypatch, capsys):
 
     monkeypatch.setattr("dvrk_drake.processes.lcm_network.open_lcm", stop)
     model, _, bad = files
-    assert main(["validate", model, bad, "--save"]) == 0
+    assert main(["validate", bad, "--model", model, "--save"]) == 0
     capsys.readouterr()
     for path, warnings in ((model, 1), (None, 0)):
         with pytest.raises(ModelError, match="no network"):

@@ -1,4 +1,4 @@
-"""The verb collect, with an arm that sticks in place of the network."""
+"""The command collect, with an arm that sticks in place of the network."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""Ctrl-C while a verb works: one line, exit code 130, and no folder or file that was made for nothing."""
+"""Ctrl-C while a command works: one line, exit code 130, and no folder or file that was made for nothing."""
 
 import importlib
 
@@ -8,24 +8,24 @@ from dvrk_drake.cli import main
 from dvrk_drake.errors import DvrkDrakeError
 
 STUDY = "scenario: psm\nset: [duration=1]\nmeasures: [{kind: drift, time: 1}]\n"
-#: Verb with its options, and the function that does its work.
-VERBS = {
-    "simulate": (["psm", "--output", "o.csv", "--plots", "new/p"], "experiments.simulation.simulate"),
-    "transparency": (["--arm", "mtml", "--output", "new/p"], "experiments.transparency.feel"),
+#: Command with its options, and the function that does its work.
+COMMANDS = {
+    "simulate": (["--arm", "psm", "--output", "o.csv", "--plots", "new/p"], "experiments.simulation.simulate"),
+    "transparency": (["--arm", "mtml", "--output", "o.csv", "--plots", "new/p"], "experiments.transparency.feel"),
     "study": (["study.yaml", "--output", "o.csv", "--plots", "new/p"], "experiments.study.study.run_study_locally"),
     "tune": (["--arm", "mtml", "--output", "o.yaml", "--plots", "new/p"], "experiments.tuning.tuning.tune_arm"),
-    "reproduce": (["fig7", "--output", "new/p"], "reports.reproduction.run.reproduce"),
+    "reproduce": (["fig7", "--folder", "new/p"], "reports.reproduction.run.reproduce"),
 }
 
 
 @pytest.fixture
 def interrupted(monkeypatch, tmp_path):
-    """Runs a verb in an empty folder whose work ends with `error`; returns the exit code."""
+    """Runs a command in an empty folder whose work ends with `error`; returns the exit code."""
     monkeypatch.chdir(tmp_path)
 
-    def run(verb, error, before=lambda: None):
+    def run(command, error, before=lambda: None):
         (tmp_path / "study.yaml").write_text(STUDY)
-        arguments, path = VERBS[verb]
+        arguments, path = COMMANDS[command]
         module, _, function = f"dvrk_drake.{path}".rpartition(".")
 
         def work(*_, **__):
@@ -33,18 +33,18 @@ def interrupted(monkeypatch, tmp_path):
             raise error
 
         monkeypatch.setattr(importlib.import_module(module), function, work)
-        return main([verb, *arguments])
+        return main([command, *arguments])
 
     return run
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_nothing_is_left(verb, interrupted, tmp_path, capsys):
-    assert interrupted(verb, KeyboardInterrupt(), lambda: (tmp_path / "new/p").is_dir() or pytest.fail("made later"))
+@pytest.mark.parametrize("command", COMMANDS)
+def test_nothing_is_left(command, interrupted, tmp_path, capsys):
+    assert interrupted(command, KeyboardInterrupt(), lambda: (tmp_path / "new/p").is_dir() or pytest.fail("made later"))
     assert capsys.readouterr().err == "dvrk-drake: interrupted\n"
-    assert interrupted(verb, KeyboardInterrupt()) == 130
+    assert interrupted(command, KeyboardInterrupt()) == 130
     assert [p.name for p in tmp_path.iterdir()] == ["study.yaml"]
-    assert interrupted(verb, DvrkDrakeError("no")) == 2
+    assert interrupted(command, DvrkDrakeError("no")) == 2
     assert [p.name for p in tmp_path.iterdir()] == ["study.yaml"]
 
 

@@ -96,6 +96,6 @@ def test_a_motor_that_several_joints_turn_is_a_link_that_turns_with_it(actuator,
 def test_what_sdf_cannot_say_is_told(tmp_path, capsys):
     model, path = tmp_path / "model.yaml", tmp_path / "arm.sdf"
     dynamic_model(load_arm("psm"), {"wrist_yaw": 1e-5}).save(model)
-    assert main(["export", str(model), "--sdf", str(path), "--urdf", str(tmp_path / "arm.urdf")]) == 0
+    assert main(["export", "--model", str(model), "--sdf", str(path), "--urdf", str(tmp_path / "arm.urdf")]) == 0
     out = capsys.readouterr().out
     assert "couple joints" in out and "wrist_yaw" in out and "1 effects in the drive" in out

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from command_output import refusal
 from paper_regressor import paper_regressor
 
 from dvrk_drake.cli import demo as verb
@@ -119,16 +120,15 @@ def no_recordings(monkeypatch):
 
 def test_figure_4_without_its_recording_is_refused_in_one_line(no_recordings, tmp_path, capsys):
     output = tmp_path / "out"
-    assert main(["reproduce", "fig4", "--output", str(output)]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
+    assert main(["reproduce", "fig4", "--folder", str(output)]) == 2
+    error = refusal(capsys.readouterr().err)
     assert "mtm_2015_good72.csv" in error
     assert "--data" in error
     assert not output.exists()
 
 
 def test_a_folder_without_the_recording_is_refused(no_recordings, tmp_path, capsys):
-    assert main(["reproduce", "all", "--data", str(tmp_path), "--output", str(tmp_path / "out")]) == 2
+    assert main(["reproduce", "all", "--data", str(tmp_path), "--folder", str(tmp_path / "out")]) == 2
     assert str(tmp_path) in capsys.readouterr().err
     assert PaperRecordings.find(None).folder is None
     with pytest.raises(RecordingError, match="mtm_2015_good72"):

@@ -224,7 +224,7 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
 @pytest.mark.parametrize(("arm", "option"), [("mtml", "--dvrk-gc"), ("psm", "--dvrk-kinematic-gc")])
 def test_a_tolerance_that_is_no_number_accepts_nothing(arm, option, tolerance, tmp_path, capsys):
     path = tmp_path / "gc.json"
-    assert main(["export", arm, option, str(path), f"--gc-tolerance={tolerance}"]) == 2
+    assert main(["export", "--arm", arm, option, str(path), f"--gc-tolerance={tolerance}"]) == 2
     assert f"--gc-tolerance is {tolerance}; allowed: a number of N m from 0" in capsys.readouterr().err
     assert not path.exists()
 
@@ -235,12 +235,12 @@ def test_a_leaning_base_is_refused_by_default_and_held_as_well_as_the_file_can(t
     model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
     given, out = tmp_path / "model.yaml", tmp_path / "gc.json"
     model.save(given)
-    assert main(["export", str(given), "--dvrk-gc", str(out)]) == 2
+    assert main(["export", "--model", str(given), "--dvrk-gc", str(out)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "leans by 2.3 deg" in error and not out.exists()
     # The line names the option that accepts it, and the file is then as close as the line says.
     tolerance = error.split("--gc-tolerance ")[1].strip()
-    assert main(["export", str(given), "--dvrk-gc", str(out), "--gc-tolerance", tolerance]) == 0
+    assert main(["export", "--model", str(given), "--dvrk-gc", str(out), "--gc-tolerance", tolerance]) == 0
     printed = capsys.readouterr().out
     q = model.arm.sample_poses(300, np.random.default_rng(5))
     controller = np.array([dvrk_controller(out, pose, np.zeros(7)) for pose in q])
@@ -268,7 +268,7 @@ def test_a_broken_file_is_one_line(change, message, tmp_path, capsys):
     content = json.loads(path.read_text())
     change(content["GC_controller"])
     path.write_text(json.dumps(content))
-    assert main(["compare-gc", str(path), "--model", "mtml"]) == 2
+    assert main(["compare-gc", str(path), "--arm", "mtml"]) == 2
     error = capsys.readouterr().err
     assert message in error and str(path) in error and error.count("\n") == 1
 
@@ -304,21 +304,21 @@ def test_a_runaway_polynomial_a_tight_clip_and_a_wrong_sign_are_found(tmp_path):
 def test_command_line(tmp_path, capsys):
     model, out = tmp_path / "model.yaml", tmp_path / "gc.json"
     balanced().save(model)
-    assert main(["export", str(model), "--dvrk-gc", str(out), "--coulomb", *["0.01"] * 7]) == 0
+    assert main(["export", "--model", str(model), "--dvrk-gc", str(out), "--coulomb", *["0.01"] * 7]) == 0
     assert "shoulder_pitch" in capsys.readouterr().out
     report = tmp_path / "report.json"
     assert main(["compare-gc", str(out), "--model", str(model), "--json", str(report)]) == 0
     joints = json.loads(report.read_text())["joints"]
     assert [j["clipped"] for j in joints] == [0.0] * 7 and joints[0]["rms_inside"] is None
     out.unlink()
-    assert main(["export", "mtml", "--dvrk-gc", str(out)]) == 2
+    assert main(["export", "--arm", "mtml", "--dvrk-gc", str(out)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and not out.exists()
     # What the line tells to type is accepted.
     asked = error.split("repeat the command with ")[1].split()
-    assert main(["export", "mtml", "--dvrk-gc", str(out), *asked]) == 0 and out.exists()
+    assert main(["export", "--arm", "mtml", "--dvrk-gc", str(out), *asked]) == 0 and out.exists()
     capsys.readouterr()
-    assert main(["export", str(model)]) == 2
+    assert main(["export", "--model", str(model)]) == 2
     assert "--dvrk-gc" in capsys.readouterr().err
-    assert main(["export", str(model), "--dvrk-gc", str(model)]) == 2
+    assert main(["export", "--model", str(model), "--dvrk-gc", str(model)]) == 2
     assert "is an input" in capsys.readouterr().err

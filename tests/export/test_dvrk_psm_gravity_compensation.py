@@ -105,9 +105,9 @@ def test_what_the_file_cannot_hold_is_refused():
 
 def test_command_line(tmp_path, capsys):
     out = tmp_path / "psm.json"
-    assert main(["export", "psm", "--dvrk-kinematic-gc", str(out)]) == 0
+    assert main(["export", "--arm", "psm", "--dvrk-kinematic-gc", str(out)]) == 0
     assert "pitch" in capsys.readouterr().out and out.is_file()
-    assert main(["export", "mtml", "--dvrk-kinematic-gc", str(tmp_path / "mtml.json")]) == 2
+    assert main(["export", "--arm", "mtml", "--dvrk-kinematic-gc", str(tmp_path / "mtml.json")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 
 
@@ -116,7 +116,7 @@ def test_an_export_that_is_refused_leaves_no_other_file(tmp_path, monkeypatch, c
     model = other_psm()
     model.effects = [DriveEffect("joint.pitch", "offset", 0.0, 0.1)]
     model.save("model.yaml")
-    arguments = ["export", "model.yaml", "--sdf", "model.sdf", "--dvrk-kinematic-gc", "gc.json"]
+    arguments = ["export", "--model", "model.yaml", "--sdf", "model.sdf", "--dvrk-kinematic-gc", "gc.json"]
     assert main([*arguments, "--gc-tolerance", "1e-9"]) == 2
     assert "cannot hold this model" in capsys.readouterr().err
     assert os.listdir() == ["model.yaml"]

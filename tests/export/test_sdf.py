@@ -182,7 +182,7 @@ def test_only_what_changed_is_written_anew(tmp_path):
 
 def test_meshes_that_cannot_be_copied_are_one_line_and_no_model(tmp_path, capsys):
     (tmp_path / "arm_meshes").write_text("in the way")
-    assert main(["export", "mtml", "--sdf", str(tmp_path / "arm.sdf")]) == 2
+    assert main(["export", "--arm", "mtml", "--sdf", str(tmp_path / "arm.sdf")]) == 2
     assert "arm_meshes" in capsys.readouterr().err and not (tmp_path / "arm.sdf").exists()
     write_sdf(load_arm("mtml"), [], tmp_path / "other.sdf", "a test")
     (tmp_path / "other_meshes" / "mtm" / "base_link.gltf").unlink()
@@ -206,7 +206,7 @@ def test_an_arm_file_can_name_the_written_sdf(name, tmp_path, capsys):
             text = text.replace(f"{kind}: {part}", f"{kind}: {kind}.yaml")
     (tmp_path / "arm.yaml").write_text(text)
     own = load_arm(str(tmp_path / "arm.yaml"))
-    assert main(["export", str(tmp_path / "arm.yaml"), "--sdf", str(tmp_path / "again.sdf")]) == 0
+    assert main(["export", "--arm", str(tmp_path / "arm.yaml"), "--sdf", str(tmp_path / "again.sdf")]) == 0
     assert "All links are as in the arm's own SDF" in capsys.readouterr().out
     assert own.joint_names == arm.joint_names and own.sdf == (str(tmp_path / "identified.sdf"),)
     np.testing.assert_allclose(own.transmission.matrix, arm.transmission.matrix, rtol=0, atol=1e-12)

@@ -195,7 +195,7 @@ def test_a_model_with_a_number_that_is_none_is_refused(key, number, tmp_path, ca
     content[name][int(index)][attribute] = number
     path.write_text(yaml.safe_dump(content))
     write_recording(random_recording(), tmp_path / "r.csv")
-    assert main(["validate", str(path), str(tmp_path / "r.csv")]) == 2
+    assert main(["validate", str(tmp_path / "r.csv"), "--model", str(path)]) == 2
     assert f"{path}: {key} is {number}; allowed: a finite number" in capsys.readouterr().err
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["model.yaml", "r.csv"]
 

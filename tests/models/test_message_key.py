@@ -77,7 +77,7 @@ def test_bad_keys_are_refused_in_one_line(tmp_path, content, mode, message, caps
     for command in (
         ["run", "--arm", "mtml"],
         ["arm", "--arm", "mtml"],
-        ["record", str(tmp_path / "a.csv"), "--arm", "mtml"],
+        ["record", "--arm", "mtml", "--output", str(tmp_path / "a.csv")],
     ):
         assert main([*command, "--key", str(path), "--lcm-url", "memq://"]) == 2
         said = capsys.readouterr().err
@@ -93,7 +93,7 @@ def test_the_command_makes_a_key_that_is_not_overwritten(tmp_path, capsys):
     first, second = tmp_path / "a.key", tmp_path / "b.key"
     before = os.umask(0)
     try:
-        assert main(["key", str(first)]) == main(["key", str(second)]) == 0
+        assert main(["key", "--output", str(first)]) == main(["key", "--output", str(second)]) == 0
     finally:
         os.umask(before)
     assert f"{first}: copy it to the other side" in capsys.readouterr().out
@@ -101,7 +101,7 @@ def test_the_command_makes_a_key_that_is_not_overwritten(tmp_path, capsys):
     content = first.read_bytes()
     assert len(content) == 32 and content != second.read_bytes()
     MessageKey.load(first)
-    assert main(["key", str(first)]) == 2
+    assert main(["key", "--output", str(first)]) == 2
     assert "a.key: exists already, and a key is not overwritten; name another file" in capsys.readouterr().err
     assert first.read_bytes() == content
     with pytest.raises(KeyFileError, match="cannot be written: No such file or directory"):

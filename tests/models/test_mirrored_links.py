@@ -95,17 +95,17 @@ def test_compare_gc_refuses_a_file_that_names_another_arm(tmp_path, capsys):
     path = tmp_path / "gc.json"
     file = compensation_from_model(stock("mtml"), CompensationOptions(tolerance=0.01))
     file.save(path, "MTML", "test")
-    assert main(["compare-gc", str(path), "--model", "mtmr"]) == 2
+    assert main(["compare-gc", str(path), "--arm", "mtmr"]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"dvrk-drake: error: {path}: the file is of MTML") and "model is of MTMR" in error
     assert error.count("\n") == 1
     # With a wrong name it is compared, and the numbers tell that it is wrong.
     file.save(path, "MTMR", "test")
-    assert main(["compare-gc", str(path), "--model", "mtmr"]) == 0
+    assert main(["compare-gc", str(path), "--arm", "mtmr"]) == 0
     warning = capsys.readouterr().err
     assert "the mirror image of the model fits better" in warning and warning.count("\n") == 1
     file.save(path, "MTML", "test")
-    assert main(["compare-gc", str(path), "--model", "mtml"]) == 0
+    assert main(["compare-gc", str(path), "--arm", "mtml"]) == 0
     assert not capsys.readouterr().err
 
 
@@ -165,7 +165,7 @@ def test_what_cannot_be_mirrored_is_named():
 
 @pytest.mark.slow
 def test_an_exported_left_arm_is_not_mirrored_again(tmp_path):
-    assert main(["export", "mtml", "--sdf", str(tmp_path / "left.sdf")]) == 0
+    assert main(["export", "--arm", "mtml", "--sdf", str(tmp_path / "left.sdf")]) == 0
     for part, text in (("mechanisms/mtm", "sdf: package://dvrk_drake/sdf/mtm.sdf"), ("arms/mtml", "mechanism: mtm\n")):
         new = {"mechanisms/mtm": "sdf: left.sdf", "arms/mtml": "mechanism: mtm.yaml\n"}[part]
         content = (MODELS_FOLDER / f"{part}.yaml").read_text()

@@ -197,15 +197,15 @@ def test_commands_read_a_log_as_they_read_a_csv(tmp_path, capsys):
         status.effort_measured = truth.holding_torque(np.array(status.position)).tolist()
     log = write_log(tmp_path / "poses.log", messages, b"\xed\xa1\xda\x01half an event")
     csv = tmp_path / "poses.csv"
-    assert main(["convert", str(log), str(csv), "--arm", "mtml"]) == 0
+    assert main(["convert", str(log), "--output", str(csv), "--arm", "mtml"]) == 0
     assert "as after a kill" in capsys.readouterr().out
     assert_same_numbers(read_recording(csv, ARM), messages)
     predicted = []
     for recording in (log, csv):
         model, output = tmp_path / f"{recording.suffix}.yaml", tmp_path / f"{recording.suffix}.predicted.csv"
         assert main(["identify", str(recording), "--arm", "mtml", "--output", str(model)]) == 0
-        assert main(["validate", str(model), str(recording)]) == 0
-        assert main(["predict", str(model), str(recording), "--output", str(output)]) == 0
+        assert main(["validate", str(recording), "--model", str(model)]) == 0
+        assert main(["predict", str(recording), "--model", str(model), "--output", str(output)]) == 0
         assert ("note: " in capsys.readouterr().err) == (recording == log)
         predicted.append(np.loadtxt(output, delimiter=",", skiprows=1))
     np.testing.assert_allclose(*predicted, atol=1e-12)

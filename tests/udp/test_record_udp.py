@@ -32,7 +32,9 @@ def test_in_a_network_of_its_own(request):
 def start_records(paths, *options, arms=("mtml", "mtml")):
     """Recorders that listen already; started together, as each waits only 10 s for a status."""
     command = [sys.executable, "-m", "dvrk_drake.cli", "record"]
-    started = [(start(*command, path, "--arm", arm, *options), arm) for path, arm in zip(paths, arms, strict=False)]
+    started = [
+        (start(*command, "--arm", arm, "--output", path, *options), arm) for path, arm in zip(paths, arms, strict=False)
+    ]
     for process, arm in started:
         line = process.stdout.readline()
         assert line.startswith(f"recording {arm.upper()} on LCM udpm://239.255.76.67:76"), line

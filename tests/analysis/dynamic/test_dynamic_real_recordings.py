@@ -88,10 +88,10 @@ def test_the_verbs_take_a_real_motion(case, tmp_path):
     path, model = folder / "motion.csv", folder / "model.yaml"
     errors, tau = tmp_path / "errors.json", tmp_path / "tau.csv"
     assert {p.name for p in (folder / "plots").iterdir()} == {"efforts.png", "residuals.png", "error_budget.png"}
-    assert main(["validate", str(model), str(path), "--json", str(errors)]) == 0
+    assert main(["validate", str(path), "--model", str(model), "--json", str(errors)]) == 0
     found = json.loads(errors.read_text())
     assert found["coordinates"] == "actuator" and found["mean_relative_error"] < TARGET[name] / 100
-    assert main(["predict", str(model), str(path), "--output", str(tau)]) == 0
+    assert main(["predict", str(path), "--model", str(model), "--output", str(tau)]) == 0
     predicted = arm.transmission.inverse.pull_back_effort(np.loadtxt(tau, delimiter=",", skiprows=1))
     measured = recording.in_actuator_coordinates(arm).tau
     ratio = np.linalg.norm((predicted - measured)[200:-200], axis=0) / np.linalg.norm(measured[200:-200], axis=0)

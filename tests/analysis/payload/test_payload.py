@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from command_output import messages
 from loaded_arm import two_days
 from pydrake.multibody.tree import MultibodyForces
 
@@ -197,7 +198,7 @@ def test_from_the_command_line(tmp_path, capsys):
     assert main(["payload", *paths, "--arm", name, "--link", "nose"]) == 2
     assert main(["payload", *paths, "--arm", name, "--json", paths[0]]) == 2
     assert main(["payload", paths[0], str(tmp_path / "none.csv"), "--arm", name]) == 2
-    errors = capsys.readouterr().err.splitlines()
+    errors = messages(capsys.readouterr().err)
     assert len(errors) == 3 and 'unknown link "nose"' in errors[0] and "is an input" in errors[1]
 
 
@@ -212,12 +213,13 @@ def test_a_named_link_is_compared_with_all_others(tmp_path, capsys):
     command = ["payload", *paths, "--model", str(tmp_path / "model.yaml"), "--link"]
     assert main([*command, "insertion_link"]) == 0
     said = capsys.readouterr()
-    assert said.err.startswith("dvrk-drake: warning: insertion_link: does not explain the change best")
-    assert said.err.count("\n") == 1 and "end_link" in said.err
+    (warning,) = messages(said.err)
+    assert warning.startswith("dvrk-drake: warning: insertion_link: does not explain the change best")
+    assert "end_link" in warning
     assert "Where the payload may be" in said.out and "below" not in said.out
     assert main([*command, link]) == 0
     said = capsys.readouterr()
-    assert not said.err and f"Payload on {link}" in said.out and "Where" not in said.out
+    assert not messages(said.err) and f"Payload on {link}" in said.out and "Where" not in said.out
 
 
 #: File, link, mass [kg], height above the remote centre [m]: its README, and docs/payload.md for how places are read.

@@ -73,13 +73,13 @@ def test_cli_writes_the_recording_and_the_errors(tmp_path, monkeypatch, capsys):
     short = partial(play_teleoperation, duration=0.6)
     monkeypatch.setattr("dvrk_drake.experiments.demo.teleoperation.play_teleoperation", short)
     page = tmp_path / "teleop.html"
-    assert main(["teleop", "--html", str(page)]) == 0
+    assert main(["teleop", "--output", str(page)]) == 0
     assert "<html" in page.read_text()
     assert "position [mm]" in capsys.readouterr().out
 
 
 def test_cli_refuses_a_place_that_cannot_be_written(tmp_path, capsys):
-    assert main(["teleop", "--html", str(tmp_path / "nowhere" / "x.html")]) == 2
+    assert main(["teleop", "--output", str(tmp_path / "nowhere" / "x.html")]) == 2
     assert "its folder does not exist" in capsys.readouterr().err
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from command_output import refusal
 from repository import ROOT
 
 from dvrk_drake.cli import main
@@ -23,14 +24,11 @@ def study(tmp_path):
     return path
 
 
-def refusal(capsys, path, *options):
+def study_refusal(capsys, path, *options):
     output = path.parent / "results.csv"
     assert main(["study", str(path), "--output", str(output), *options]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("dvrk-drake: error: ")
-    assert error.count("\n") == 1, error
     assert not output.exists()
-    return error
+    return refusal(capsys.readouterr().err)
 
 
 @pytest.mark.parametrize(
@@ -77,13 +75,13 @@ def refusal(capsys, path, *options):
 )
 def test_nonsense_is_refused_in_one_line(change, message, study, capsys):
     study.write_text(STUDY.replace(*change))
-    assert message in refusal(capsys, study)
+    assert message in study_refusal(capsys, study)
 
 
 def test_files_and_places_that_do_not_work_are_refused(study, tmp_path, capsys):
-    assert "no such file" in refusal(capsys, tmp_path / "other.yaml")
-    assert "--set duration: must be key=value" in refusal(capsys, study, "--set", "duration")
-    assert "cannot be made a folder" in refusal(capsys, study, "--plots", str(study))
+    assert "no such file" in study_refusal(capsys, tmp_path / "other.yaml")
+    assert "--set duration: must be key=value" in study_refusal(capsys, study, "--set", "duration")
+    assert "cannot be made a folder" in study_refusal(capsys, study, "--plots", str(study))
     (tmp_path / "folder.csv").mkdir()
     for output, message in (
         (tmp_path / "none" / "r.csv", "cannot be written: "),
@@ -91,25 +89,22 @@ def test_files_and_places_that_do_not_work_are_refused(study, tmp_path, capsys):
         (tmp_path / "r.txt", "must end in .csv or .parquet"),
     ):
         assert main(["study", str(study), "--output", str(output)]) == 2
-        error = capsys.readouterr().err
-        assert message in error
-        assert error.count("\n") == 1
+        assert message in refusal(capsys.readouterr().err)
     assert study.read_text() == STUDY
 
 
 def test_numbers_of_workers_that_are_none_are_refused(study, capsys):
     for workers in ("0", "-1", "many"):
-        with pytest.raises(SystemExit) as end:
-            main(["study", str(study), "--output", "r.csv", "--workers", workers])
-        assert end.value.code == 2
-        assert "is not a number of processes" in capsys.readouterr().err
+        assert "--workers" in study_refusal(capsys, study, "--workers", workers)
 
 
 def test_schedulers_that_are_none_are_refused(study, capsys, monkeypatch):
     monkeypatch.setattr("dvrk_drake.experiments.study.study.PATIENCE", 0.3)
     pytest.importorskip("distributed", reason="needs the extra dask")
-    assert "is no address of a scheduler; allowed: tcp://HOST:PORT" in refusal(capsys, study, "--scheduler", "here")
-    assert "no Dask scheduler answers there" in refusal(capsys, study, "--scheduler", "tcp://127.0.0.1:1")
+    assert "is no address of a scheduler; allowed: tcp://HOST:PORT" in study_refusal(
+        capsys, study, "--scheduler", "here"
+    )
+    assert "no Dask scheduler answers there" in study_refusal(capsys, study, "--scheduler", "tcp://127.0.0.1:1")
 
 
 def test_the_example_is_a_study():

@@ -1,0 +1,140 @@
+"""The arguments of the commands: help, refusals, renamed options, completion of a shell."""
+
+import subprocess
+import sys
+
+import pytest
+from command_output import refusal
+
+from dvrk_drake.cli import main
+from dvrk_drake.cli.app import app
+from dvrk_drake.cli.program import RENAMED
+
+COMMANDS = [name for name in app if not name.startswith("-")]
+
+#: Arguments that a command requires.
+REQUIRED = {
+    "model": ["--arm", "mtml"],
+    "view": ["--arm", "mtml"],
+    "validate": ["r.csv", "--model", "m.yaml"],
+    "predict": ["r.csv", "--model", "m.yaml", "--output", "o.csv"],
+    "recalibrate": ["r.csv", "--model", "m.yaml", "--output", "o.yaml"],
+    "convert": ["r.csv", "--output", "o.csv"],
+    "record": ["--arm", "mtml", "--output", "o.csv"],
+    "key": ["--output", "o.key"],
+    "identify": ["r.csv", "--arm", "mtml", "--output", "o.yaml"],
+    "compare-gc": ["gc.json", "--arm", "mtml"],
+    "demo": [],
+    "reproduce": [],
+    "teleop": [],
+    "run": ["--arm", "mtml"],
+}
+
+
+def refused(capsys, *arguments):
+    """The one line on stderr of a command that is refused."""
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert not captured.out
+    assert captured.err.count("\n") == 1
+    return refusal(captured.err).removeprefix("dvrk-drake: error: ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["modl"], 'Unknown command "modl". Did you mean "model"?; see dvrk-drake --help'),
+        (["identify", "--nonsense"], "Unknown option: --nonsense; see dvrk-drake identify --help"),
+        (["identify", "a.csv", "--arm", "psm"], "--output is required; see dvrk-drake identify --help"),
+        (["identify", "a.csv", "b.csv", "--arm", "psm", "--output", "m.yaml"], "Unexpected argument: b.csv; see"),
+        (["tune", "--arm", "psm", "--method", "guess"], 'Invalid value "guess" for --method. Choose from: "paper"'),
+        (["demo", "--seed", "-1"], 'Invalid value "-1" for --seed: must be a whole number from 0; see'),
+        (["demo", "--seed", "1.5"], "--seed"),
+        (["study", "s.yaml", "--output", "r.csv", "--workers", "0"], "--workers: must be a number of processes"),
+        (["record", "--arm", "psm", "--output", "r.csv", "--duration", "nan"], "must be a number of seconds above 0"),
+        (["export", "--sdf", "out.sdf"], "give one of --model, --arm; see dvrk-drake export --help"),
+        (["export", "--arm", "psm", "--model", "m.yaml", "--sdf", "o"], "give one of --model, --arm; see"),
+        (["collect", "--arm", "psm", "--poses", "p.yaml"], "give one of --output, --teach, --random; see"),
+        (["study", "s.yaml", "--output", "r.csv", "--workers", "1", "--scheduler", "x"], "give at most one of"),
+        (["simulate", "psm"], "psm is an arm, not a scenario; name it with --arm psm"),
+        (["export", "--model", "psm", "--sdf", "o"], "psm is an arm, not a model; name it with --arm psm"),
+        (["model", "--arm", "mtmx"], 'unknown arm "mtmx"; did you mean "mtm'),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(arguments, message, capsys):
+    assert message in refused(capsys, *arguments)
+
+
+def test_too_few_numbers_are_refused(capsys):
+    assert "--gravity requires 3" in refused(capsys, "model", "--arm", "psm", "--gravity", "1", "2")
+
+
+@pytest.mark.parametrize(("command", "old"), [(command, old) for command in RENAMED for old in RENAMED[command]])
+def test_an_old_option_names_the_new_one(command, old, capsys):
+    """With "", the old argument had a place instead of a name."""
+    new = RENAMED[command][old]
+    options = {name for argument in app[command].assemble_argument_collection() for name in argument.names}
+    assert new.split()[0] in options and old not in options
+    if old:
+        for given in ([old], [old, "value"], [f"{old}=value"]):
+            error = refused(capsys, command, *REQUIRED[command], *given)
+            assert error == f"{old} is now {new}; see dvrk-drake {command} --help"
+    else:
+        required = REQUIRED[command]
+        at = required.index(new)
+        assert f"{new} is required" in refused(capsys, command, *required[:at], *required[at + 2 :])
+
+
+IMPORTS = """
+import sys
+from dvrk_drake.cli import main
+code = main(sys.argv[1:])
+slow = {"pydrake", "numpy", "numba", "scipy", "sympy", "matplotlib", "lcm", "pandas"} & sys.modules.keys()
+sys.exit(f"imported: {slow}" if slow else code)
+"""
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help_imports_nothing_slow_and_fits_80_columns(command, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    arguments = [sys.executable, "-c", IMPORTS, *command.split(), "--help"]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"Usage: dvrk-drake {command}".rstrip() in done.stdout
+    assert max(map(len, done.stdout.splitlines())) <= 80
+    assert "…" not in done.stdout
+
+
+def test_commands_are_in_groups(capsys):
+    assert main(["--help"]) == 0
+    printed = capsys.readouterr().out
+    headings = [line.strip("╭╮─ ") for line in printed.splitlines() if line.startswith("╭")]
+    assert headings == ["Model", "Identify", "Simulate", "Hardware", "Paper", "Options"]
+    assert all(f"│ {command} " in printed for command in COMMANDS)
+    assert main([]) == 0
+    assert capsys.readouterr().out == printed
+
+
+def test_one_thing_has_one_name():
+    """The options that the commands share; each other one is of its command."""
+    names = {
+        command: {name for argument in app[command].assemble_argument_collection() for name in argument.names}
+        for command in COMMANDS
+    }
+    for command, options in names.items():
+        assert not options & {"--plot", "--tables", "--html", "--out", "--save-to", "--force", "--quiet"}, command
+        if options & {"--plots", "--json", "--folder"}:
+            assert "--overwrite" in options, command
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_is_installed(shell, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("SHELL", f"/bin/{shell}")
+    for variable in ("XDG_DATA_HOME", "XDG_CONFIG_HOME", "ZDOTDIR"):
+        monkeypatch.delenv(variable, raising=False)
+    assert main(["--install-completion", "--shell", shell]) == 0
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    text = "".join(path.read_text() for path in files)
+    assert "dvrk" in text and "recalibrate" in text
+    capsys.readouterr()
