@@ -150,8 +150,8 @@ class IdentifiedModel(_Identified):
 
     Attributes:
         arm: the arm, mounted as it was when its base parameters were identified.
-        base_parameters: in the order of `gravity_parameters(arm).base.names`. Of a model identified from a motion, those
-            of the links in `dynamics`.
+        base_parameters: in the order of `gravity_parameters(arm).base`. Of a model identified from a motion, those of
+            the links in `dynamics`.
         effects: of position alone, of a model identified from poses; a model with `dynamics` has all effects there.
         joints: how each joint was fitted.
         provenance: where the model came from.
