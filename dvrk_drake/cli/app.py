@@ -7,11 +7,12 @@ else is an option: --arm, --model, --output (a file), --folder, --plots (a folde
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from cyclopts import App, ArgumentCollection, Group, Parameter
+from cyclopts import App, ArgumentCollection, Group, Parameter, Token
 
 app = App(
     name="dvrk-drake",
@@ -38,6 +39,14 @@ def _complete_arm(_: Any) -> list[str]:
 def _check_seconds(_: object, value: float | None) -> None:
     if value is not None and not (math.isfinite(value) and value > 0):
         raise ValueError("must be a number of seconds above 0")
+
+
+def whole_number(_: object, tokens: Sequence[Token]) -> int:
+    """Converts a text to an integer. Cyclopts' own conversion rounds 1.5."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f'must be a whole number, not "{tokens[0].value}"') from None
 
 
 def _check_seed(_: object, value: int) -> None:
@@ -70,9 +79,9 @@ Overwrite = Annotated[bool, Parameter(show_default=False, help="Replace files th
 Verbose = Annotated[bool, Parameter(alias="-v", show_default=False, help="Print all details, not only the summary.")]
 Plots = Annotated[str | None, Parameter(metavar="FOLDER", help="Write figures into this folder, new or empty.")]
 Json = Annotated[str | None, Parameter(metavar="FILE", help="Write the results as JSON.")]
-Seed = Annotated[int, Parameter(validator=_check_seed, help="Seed of random numbers.")]
+Seed = Annotated[int, Parameter(converter=whole_number, validator=_check_seed, help="Seed of random numbers.")]
 Seconds = Annotated[float, Parameter(metavar="S", validator=_check_seconds)]
-Port = Annotated[int | None, Parameter(help="Port of the page. Without it: a free one.")]
+Port = Annotated[int | None, Parameter(converter=whole_number, help="Port of the page. Without it: a free one.")]
 LcmUrl = Annotated[
     str, Parameter(metavar="URL", show_default=False, help="LCM network. Without it: LCM_DEFAULT_URL, or LCM's own.")
 ]

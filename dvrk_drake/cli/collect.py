@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import HARDWARE, Arm, Key, LcmUrl, Seconds, Seed, app, one_of
+from dvrk_drake.cli.app import HARDWARE, Arm, Key, LcmUrl, Seconds, Seed, app, one_of, whole_number
 from dvrk_drake.cli.lcm import ControlledArm, ready_controller
 from dvrk_drake.cli.support import check_output, interrupt_ends_process, load_key, print_notes, print_written
 from dvrk_drake.errors import CollectionError
@@ -65,7 +65,7 @@ def collect(
     poses: Annotated[str, Parameter(metavar="POSES.yaml")],
     output: Annotated[str | None, Parameter(metavar="POSES.csv", group=_TASK)] = None,
     teach: Annotated[bool, Parameter(show_default=False, group=_TASK)] = False,
-    random: Annotated[int | None, Parameter(metavar="N", group=_TASK)] = None,
+    random: Annotated[int | None, Parameter(metavar="N", group=_TASK, converter=whole_number)] = None,
     at_rest: Annotated[bool, Parameter(show_default=False)] = False,
     seed: Seed = 0,
     both_sides: Annotated[bool, Parameter(negative="--no-both-sides")] = True,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import SIMULATE, Arm, Coordinates, Overwrite, Plots, Set, Verbose, app, one_of
+from dvrk_drake.cli.app import SIMULATE, Arm, Coordinates, Overwrite, Plots, Set, Verbose, app, one_of, whole_number
 from dvrk_drake.cli.support import Steps, check_output, plots_folder, print_written, quiet_drake, until_stopped
 from dvrk_drake.errors import ModelError, ScenarioError, StudyError
 from dvrk_drake.progress import step_progress
@@ -83,7 +83,9 @@ def study(
     *,
     output: Annotated[str, Parameter(metavar="RESULTS.csv")],
     set: Set = None,
-    workers: Annotated[int | None, Parameter(metavar="N", group=_WHERE, validator=_check_workers)] = None,
+    workers: Annotated[
+        int | None, Parameter(metavar="N", group=_WHERE, converter=whole_number, validator=_check_workers)
+    ] = None,
     scheduler: Annotated[str | None, Parameter(metavar="ADDRESS", group=_WHERE)] = None,
     plots: Plots = None,
     overwrite: Overwrite = False,

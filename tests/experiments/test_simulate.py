@@ -178,7 +178,7 @@ def test_a_recording_of_it_is_read_by_the_other_verbs(tmp_path, capsys, monkeypa
         ("effects=[{coordinate: elbow, kind: offset}]", 'effects[0].coordinate is "elbow"; allowed: actuator.yaw'),
         ("effects=[{coordinate: joint.yaw, kind: viscous}]", 'effects[0].kind is "viscous"; allowed: offset, spring'),
         ("seed=-1", "seed is -1"),
-        ("arm=psm9", 'unknown arm "psm9"; known arms: mtml, mtmr, psm'),
+        ("arm=psm9", 'unknown arm "psm9"; did you mean "psm"? known arms: mtml, mtmr, psm'),
         ("duration", "--set duration: must be key=value"),
         ("start=[0,", "--set start=[0,: not YAML"),
     ],

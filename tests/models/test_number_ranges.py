@@ -130,9 +130,9 @@ def test_an_arm_with_a_number_outside_its_range_is_refused(name, value):
     arm = load_arm("mtml")
     effects = dataclasses.replace(arm.effects, stretch={"outer_yaw": Cable(1000.0, 1.0)})
     whole = dataclasses.replace(arm, effects=effects, friction_coordinates={"pulley": np.eye(7)[0]})
-    with pytest.raises(ArmError, match=r"allowed: |gravity \(") as refusal:
+    with pytest.raises(ArmError, match=r"allowed: |gravity \(") as refused:
         changed(whole, IN_OBJECTS[name][0], value)
-    assert "\n" not in str(refusal.value)
+    assert "\n" not in str(refused.value)
 
 
 def changed(owner, path, value):
@@ -262,9 +262,9 @@ LIMITS, COUPLED = "position_limits", "coupled_limits"
 )
 def test_absurd_numbers_in_the_files_of_an_arm_are_refused(file, keys, value, message, own_psm, capsys):
     path = own_psm([(file, keys, value)])
-    with pytest.raises(ArmError, match=message) as refusal:
+    with pytest.raises(ArmError, match=message) as refused:
         load_arm(str(path))
-    assert "\n" not in str(refusal.value) and str(path.parent) in str(refusal.value)
+    assert "\n" not in str(refused.value) and str(path.parent) in str(refused.value)
     assert main(["model", "--arm", str(path)]) == 2
     assert refusal(capsys.readouterr().err)
 
