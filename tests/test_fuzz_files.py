@@ -307,7 +307,7 @@ COMMANDS = {
     "compare-gc gc.json --model mtml.yaml --json out.json": ("gc.json", "mtml.yaml"),
     "compare-gc kinematic.json --arm mtml --json out.json": ("kinematic.json",),
     "simulate scenario.yaml --output out.csv": ("scenario.yaml", "gains.yaml"),
-    "simulate --arm psm --set arm=arm.yaml --output out.csv": ("arm.yaml", "mechanism.yaml", "mechanism.sdf"),
+    "simulate --arm arm.yaml --output out.csv": ("arm.yaml", "mechanism.yaml", "mechanism.sdf"),
     "simulate --arm psm --set controller.model=psm.yaml --output out.csv": ("psm.yaml",),
     "study study.yaml --output results.csv": ("study.yaml", "results.csv"),
     "tune --arm arm.yaml --output out.yaml": ("arm.yaml",),

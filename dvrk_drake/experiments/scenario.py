@@ -223,7 +223,7 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
     """Reads a scenario file, or makes the scenario of an arm that holds its home pose; changes it, and checks it.
 
     Args:
-        arm_or_file: path of a YAML file, or the name of an arm.
+        arm_or_file: path of a scenario's YAML file, or the name of an arm or the path of its YAML file.
         settings: "key=value" in YAML; a dot goes into a group: "controller.mode=gravity", "targets=[...]".
 
     Raises:
@@ -239,7 +239,7 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
     if path.suffix in (".yaml", ".yml"):
         content = load_yaml(path, ScenarioError)
         if isinstance(content, dict) and "mechanism" in content:
-            raise ScenarioError(f"{path}: is an arm's file, not a scenario; give an arm's name and --set arm={path}")
+            content = {"arm": arm_or_file}
     else:
         content = {"arm": arm_or_file}
     if isinstance(content, dict):

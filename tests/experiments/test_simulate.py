@@ -11,6 +11,7 @@ from dvrk_drake.errors import ScenarioError
 from dvrk_drake.experiments.scenario import Scenario, Target, load_scenario
 from dvrk_drake.experiments.simulation import simulate
 from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.recordings.recording import read_recording
 
@@ -202,6 +203,14 @@ def test_files_that_are_no_scenarios_are_refused(tmp_path):
         path.write_text(text)
         with pytest.raises(ScenarioError, match=message):
             load_scenario(str(path))
+
+
+def test_an_arm_can_be_a_file(tmp_path):
+    path = tmp_path / "ours.yaml"
+    path.write_text((MODELS_FOLDER / "arms/mtml.yaml").read_text().replace("name: MTML", "name: OURS"))
+    scenario = load_scenario(str(path), ["duration=0.02"])
+    assert scenario.mounted_arm.name == "OURS"
+    assert main(["simulate", "--arm", str(path), "--set", "duration=0.02"]) == 0
 
 
 def test_an_unknown_instrument_is_named(tmp_path):

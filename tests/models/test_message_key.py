@@ -62,7 +62,7 @@ def test_a_key_is_the_content_of_its_file(tmp_path, size):
         (KEY, 0o640, r"a\.key: other users may access this key \(mode 0640\); run: chmod 600 .*a\.key"),
         (KEY, 0o604, r"a\.key: other users may access this key \(mode 0604\)"),
         (KEY, 0o602, r"a\.key: other users may access this key \(mode 0602\)"),
-        (KEY[:15], 0o600, r"a\.key: not a key of 16 to 64 bytes, it has 15; make one: dvrk-drake key FILE"),
+        (KEY[:15], 0o600, r"a\.key: not a key of 16 to 64 bytes, it has 15; make one: dvrk-drake key --output FILE"),
         (b"", 0o600, r"a\.key: not a key of 16 to 64 bytes, it has 0"),
         (bytes(65), 0o600, r"a\.key: not a key of 16 to 64 bytes, it has more"),
         (None, 0o600, r"a\.key: no such file"),
