@@ -14,7 +14,7 @@ BIN := $(VENV)/bin
 .PHONY: demo test test-busy test-fast test-udp test-recordings mutants lint benchmark clean
 
 demo: $(VENV)/.installed
-	$(BIN)/dvrk-drake demo --output demo_output
+	$(BIN)/dvrk-drake demo --folder demo_output --overwrite
 
 test: test-fast test-udp
 

@@ -9,7 +9,7 @@ state, in which the answer then acts.
 
 Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo that decodes a status and encodes a
 command and does nothing else. Each is measured quiet, with `dvrk-drake view --live` and a client of its page, and with
-a busy process on every core; without and with real-time scheduling (`--realtime` of both verbs, a core each).
+a busy process on every core; without and with real-time scheduling (`--realtime` of both commands, a core each).
 
 A tick without a fresh command is a status that was not answered when the next one went out. The echo's lines show how
 many of them are the machine's.

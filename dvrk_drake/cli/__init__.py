@@ -1,4 +1,4 @@
-"""The command line: one verb a command. Bad input gives one line on stderr and exit code 2.
+"""The command line. Bad input gives one line on stderr and exit code 2.
 
 Nothing is imported here that takes time, so that Ctrl-C ends the program in order as early as possible.
 """
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one verb; returns the exit code: 0, or 2 for bad input.
+    """Runs one command; returns the exit code: 0, or 2 for bad input.
 
     Without `arguments` those of the process are taken, and its handling of Ctrl-C.
     """

@@ -31,7 +31,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 #: Their import adds the commands to the application.
 COMMANDS = model, recordings, identify, export, simulate, demo, lcm, collect
 
-#: Options that were renamed in version 0.2, by command. "" is an argument that became an option.
+#: Options that were renamed in version 0.1, by command. "" is an argument that became an option.
 RENAMED = {
     "model": {"": "--arm", "--latex": "--format latex", "--python": "--format python", "--c": "--format c"},
     "view": {"": "--arm"},
@@ -96,5 +96,5 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
         suggestion = re.search(r"Did you mean .*", message)
         message = f"{error.argument.name} is required{'. ' + suggestion[0] if suggestion else ''}"
         if error.argument.name == renamed.get(""):
-            message += " (since version 0.2 it is an option)"
+            message += ": it is an option now"
     return f"dvrk-drake: error: {message}; see {f'dvrk-drake {name}'.rstrip()} --help"

@@ -61,7 +61,8 @@ class MessageKey:
         except KeyFileError as error:
             more = "more" if len(key) > _LONGEST else str(len(key))
             raise KeyFileError(
-                f"{path}: not a key of {_SHORTEST} to {_LONGEST} bytes, it has {more}; make one: dvrk-drake key --output FILE"
+                f"{path}: not a key of {_SHORTEST} to {_LONGEST} bytes, it has {more}; "
+                "make one: dvrk-drake key --output FILE"
             ) from error
 
     def sign(self, data: bytes) -> bytes:

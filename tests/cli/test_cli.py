@@ -330,13 +330,13 @@ sys.exit(main())
 """
 
 
-@pytest.mark.parametrize("verb", ["arm", "run", "collect", "teach"])
-def test_an_interrupt_is_not_lost_where_numba_compiles(verb, tmp_path):
+@pytest.mark.parametrize("command", ["arm", "run", "collect", "teach"])
+def test_an_interrupt_is_not_lost_where_numba_compiles(command, tmp_path):
     poses, out = str(tmp_path / "poses.yaml"), str(tmp_path / "out.csv")
-    words = [verb]
-    if verb in ("collect", "teach"):
+    words = [command]
+    if command in ("collect", "teach"):
         assert main(["collect", "--arm", "mtml", "--poses", poses, "--random", "1"]) == 0
-        words = ["collect", "--poses", poses, *(["--output", out] if verb == "collect" else ["--teach"])]
+        words = ["collect", "--poses", poses, *(["--output", out] if command == "collect" else ["--teach"])]
     code = LOST_INTERRUPT.format(words=["dvrk-drake", *words, "--arm", "mtml", "--lcm-url", "memq://"])
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert process.stderr.splitlines()[-1] == "dvrk-drake: interrupted"

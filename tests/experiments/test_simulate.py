@@ -11,8 +11,8 @@ from dvrk_drake.errors import ScenarioError
 from dvrk_drake.experiments.scenario import Scenario, Target, load_scenario
 from dvrk_drake.experiments.simulation import simulate
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.recordings.recording import read_recording
 
 EXAMPLE = ROOT / "examples" / "psm_reach.yaml"

@@ -1,4 +1,4 @@
-"""Gains: what is found on a joint whose equations are known, and what the files and the verb refuse."""
+"""Gains: what is found on a joint whose equations are known, and what the files and the command refuse."""
 
 import dataclasses
 import io
@@ -356,7 +356,7 @@ def test_what_is_no_file_of_gains_is_refused(tmp_path, text, said):
 
 
 def refused(capsys, *arguments):
-    """The one line that the verb says before it ends with 2."""
+    """The one line of the command before it ends with 2."""
     assert main(arguments) == 2
     return refusal(capsys.readouterr().err)
 

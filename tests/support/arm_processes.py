@@ -82,7 +82,7 @@ def run_forked(main, arguments, path):
 
 
 def dvrk_drake(*arguments):
-    """A verb of the command line, with its options."""
+    """A command of the command line, with its options."""
     return Forked(cli.main, *map(str, arguments))
 
 

@@ -1,4 +1,4 @@
-"""The scene of a master and a PSM: the played hand, the live controls, the verb."""
+"""The scene of a master and a PSM: the played hand, the live controls, the command."""
 
 from functools import partial
 
