@@ -258,8 +258,9 @@ class Steps:
         """Shows a step and its finished share, 0..1."""
         if step not in self._tasks:
             self._begin(step)
-        if share > 0:  # before, how long it takes is not known
-            self._progress.update(self._tasks[step], total=1.0, completed=share)
+        task = next(task for task in self._progress.tasks if task.id == self._tasks[step])
+        if share > task.completed:  # of a step that comes again, the clock goes on
+            self._progress.update(task.id, total=1.0, completed=share)
 
     def _begin(self, step: str) -> None:
         name = step.partition(": ")[0]
@@ -272,7 +273,8 @@ class Steps:
         for task in self._progress.tasks:
             self._progress.update(task.id, total=1.0, completed=1.0)
         if len(self._progress.tasks) >= MOST_BARS:
-            self._progress.remove_task(self._progress.task_ids[0])
+            oldest = next(iter(self._tasks))
+            self._progress.remove_task(self._tasks.pop(oldest))
         self._tasks[step] = self._progress.add_task(text, total=None)
 
     def __exit__(self, *_: object) -> None:
