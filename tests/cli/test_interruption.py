@@ -3,6 +3,7 @@
 import importlib
 
 import pytest
+from command_output import messages
 
 from dvrk_drake.cli import main
 from dvrk_drake.errors import DvrkDrakeError
@@ -41,7 +42,7 @@ def interrupted(monkeypatch, tmp_path):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_nothing_is_left(command, interrupted, tmp_path, capsys):
     assert interrupted(command, KeyboardInterrupt(), lambda: (tmp_path / "new/p").is_dir() or pytest.fail("made later"))
-    assert capsys.readouterr().err == "dvrk-drake: interrupted\n"
+    assert messages(capsys.readouterr().err) == ["dvrk-drake: interrupted"]
     assert interrupted(command, KeyboardInterrupt()) == 130
     assert [p.name for p in tmp_path.iterdir()] == ["study.yaml"]
     assert interrupted(command, DvrkDrakeError("no")) == 2

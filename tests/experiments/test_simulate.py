@@ -130,10 +130,10 @@ def test_a_recording_of_it_is_read_by_the_other_verbs(tmp_path, capsys, monkeypa
         "--output",
         recording,
         "--plots",
-        str(tmp_path),
+        str(tmp_path / "plots"),
     ]
     assert main(command) == 0
-    assert (tmp_path / "positions.png").stat().st_size > 10_000
+    assert (tmp_path / "plots/positions.png").stat().st_size > 10_000
     assert "error at the end" in capsys.readouterr().out
     assert main(["validate", recording, "--model", model, "--json", errors]) == 0
     held = read_recording(recording, PSM)

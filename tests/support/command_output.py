@@ -2,8 +2,8 @@
 
 import re
 
-#: A line of progress off a terminal, e.g. "1 of 3: reading".
-STEP = re.compile(r"\d+ of \d+: .+")
+#: A line of progress off a terminal, e.g. "1 of 3: reading", or "simulating" where there is one step.
+STEP = re.compile(r"\d+ of \d+: .+|[a-z][^:]*")
 
 
 def messages(errors):
