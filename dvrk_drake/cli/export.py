@@ -95,6 +95,7 @@ def export(
     for format, path in outputs.items():
         exports[format].write(path)
         print_export(make_console(), path, exports[format], verbose=verbose)
+        print_written(path)
     if diff:
         bodies = model_bodies(loaded)
         sys.stdout.write(sdf_difference(loaded.arm, bodies.links, bodies.rotors))

@@ -45,6 +45,7 @@ def check(
     print_report(make_console(), report, arm=arm, verbose=verbose)
     if json is not None:
         write_json(json, report.as_dict())
+        print_written(json)
     if folder is not None:
         from dvrk_drake.reports.figures.recording_check import plot_report
 

@@ -230,6 +230,27 @@ def test_a_folder_with_files_is_kept_without_overwrite(command, tmp_path, monkey
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "mine.txt"]
 
 
+@pytest.mark.parametrize(
+    ("command", "written"),
+    [
+        ("check {0}/poses.csv --arm mtmr --json o.json", ["o.json"]),
+        ("convert {0}/poses.csv --coordinates joint --output o.csv", ["o.csv"]),
+        ("predict {0}/poses.csv --model {0}/model.yaml --output o.csv", ["o.csv"]),
+        ("validate {0}/other.csv --model {0}/model.yaml --json o.json --plots p", ["o.json", "p"]),
+        ("export --model {0}/model.yaml --sdf o.sdf --urdf o.urdf", ["o.sdf", "o.urdf"]),
+        ("simulate --arm psm --set duration=0.02 --output o.csv --plots p", ["o.csv", "p"]),
+        ("collect --arm psm --poses o.yaml --random 3", ["o.yaml"]),
+        ("key --output o.key", ["o.key"]),
+    ],
+)
+def test_commands_print_what_they_wrote(command, written, folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(command.format(folder).split()) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("wrote ")]
+    assert sorted(line.split()[1].rstrip(":") for line in lines) == written
+    assert {path.name for path in tmp_path.iterdir()} >= set(written)
+
+
 def test_validate_keeps_a_folder_with_files(folder, capsys):
     validate = ["validate", f"{folder}/other.csv", "--model", f"{folder}/model.yaml", "--plots", f"{folder}/plots"]
     before = {path: path.read_bytes() for path in (folder / "plots").iterdir()}
