@@ -210,5 +210,5 @@ class NonNegativeFit:
         return np.asarray(nnls(L.T, _solve_lower(L, b))[0])
 
 
-def _solve_lower(L: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _solve_lower(L: NDArray, b: NDArray) -> NDArray[np.float64]:
     return np.asarray(scipy.linalg.solve_triangular(L, b, lower=True, check_finite=False))
