@@ -9,7 +9,6 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 from scipy.linalg import matmul_toeplitz
-from scipy.signal import correlate
 
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
@@ -148,6 +147,8 @@ def error_covariance(
     Up to `MEMORY` it is the error's own, tapered (Parzen's window); whole periods later that of the part of it that
     repeats, which is what the first repetition shows.
     """
+    from scipy.signal import correlate  # takes 0.3 s, see `low_pass`
+
     count = len(seen)
     both = correlate(seen, unseen, method="fft")
     lags = (both + both[::-1])[count - 1 :] / 2 / np.arange(count, 0, -1)
