@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import matmul_toeplitz
-from scipy.signal import correlate
 
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
@@ -150,6 +149,8 @@ def error_covariance(
     Up to `MEMORY` it is the error's own, tapered (Parzen's window); whole periods later that of the part of it that
     repeats, which is what the first repetition shows.
     """
+    from scipy.signal import correlate  # takes 0.3 s, see `low_pass`
+
     count = len(seen)
     both = correlate(seen, unseen, method="fft")
     lags = (both + both[::-1])[count - 1 :] / 2 / np.arange(count, 0, -1)

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import require_usable
@@ -305,7 +305,7 @@ def _estimate(link: LinkInertia, columns: NDArray[np.float64], difference: Motio
     spread = _jackknife([[part.mass, *part.place] for part in parts], errors)
     at_com, at_com_error = problem.mass_at_com(weights)
     at_com_spread = _jackknife([[problem.mass_at_com(weights, fold)[0]] for fold in folds], np.array([at_com_error]))
-    quantile = float(student_t.ppf((1 + CONFIDENCE) / 2, len(folds) - 1))
+    quantile = float(stdtrit(len(folds) - 1, (1 + CONFIDENCE) / 2))
     rows, arm = len(difference.tau), difference.grid.arm
     rms = np.sqrt(np.stack(plain.budget(body, problems.plain_weights)) / rows)
     actuators = [
