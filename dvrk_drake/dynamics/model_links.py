@@ -191,7 +191,7 @@ def _static_effects(model: IdentifiedModel) -> list[str]:
     if effects := [f"{ActuatorEffect.of(e)} {e.coefficient:+.4g}" for e in model.effects]:
         remarks.append(f"effects [N m; N if prismatic]: {', '.join(effects)}")
     if doubted := [f"{j.name} {j.trust:g}" for j in model.joints if j.trust != 1.0]:
-        remarks.append(f"trust below 1: {', '.join(doubted)}")
+        remarks.append(f"feedforward scale below 1: {', '.join(doubted)}")
     return remarks
 
 

@@ -13,9 +13,7 @@ from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
 from dvrk_drake.reports.identification import print_static_parameters
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
-NEXT_STEPS = """
-Open {folder}/arm.html in a browser: the arm is held, released, and driven home.
-
+WITH_A_REAL_ARM = """
 With a real arm:
 1. Record 40 or more varied poses at rest (dvrk-drake collect, or
    docs/public_recordings.md for other programs).
@@ -47,7 +45,7 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
         console,
         f"Released under gravity compensation, {arm.name} drifts by at most {identified} with the identified model, "
         f"and by {drawn} with that of the SDF.",
-        f"identify POSES.csv --arm {arm.source} --output model.yaml",
+        f"open {folder}/arm.html in a browser",
     )
     table = make_table(
         f"RMS torque error at {result.fresh.poses} fresh poses [N m; N], drift and step error [rad; m]",
@@ -60,34 +58,32 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
     console.print()
     print_note(console, NO_DRY_FRICTION)
     if not verbose:
+        console.print(f"With a real arm: dvrk-drake identify POSES.csv --arm {arm.source} --output MODEL.yaml")
         return
     print_static_parameters(console, result.identification.model)
+    console.print(WITH_A_REAL_ARM.format(arm=arm.source), markup=False)
     if arm.coupled_limits:
         print_note(
             console,
             "The simulated arm has no stops in q2 + q3: the step, and the release with the SDF's model, pass where a "
             "real arm would hit them.",
         )
-    console.print(NEXT_STEPS.format(folder=folder, arm=arm.source), markup=False, soft_wrap=True)
 
 
-def print_teleoperation(
-    console: Console, result: TeleoperationResult, file: str, *, arm: str = "psm", verbose: bool = False
-) -> None:
+def print_teleoperation(console: Console, result: TeleoperationResult, file: str, *, verbose: bool = False) -> None:
     """Prints how well the tip followed the handle.
 
     Args:
         console: to print to.
         result: to print.
         file: page with the recorded motion.
-        arm: name of the arm that followed, for the next command.
         verbose: also print how the errors are computed.
     """
     print_answer(
         console,
         f"The tip follows the handle within {1e3 * result.max_position_error:.3f} mm "
         f"(RMS {1e3 * result.rms_position_error:.3f} mm).",
-        "teleop",
+        f"open {file} in a browser",
     )
     table = make_table("Error of the tip", "", "RMS", "largest")
     table.add_row(
@@ -98,8 +94,8 @@ def print_teleoperation(
     )
     table.add_row(escape("motion with an open clutch [mm]"), "", f"{1e3 * result.max_motion_held:.1g}")
     console.print(table)
-    console.print(f"\nOpen {file} in a browser.", markup=False, soft_wrap=True)
     if verbose:
+        console.print()
         print_note(
             console,
             "Error: motion of the tip less the scaled motion of the handle since the clutch closed, over "

@@ -45,7 +45,7 @@ def _print_bodies(console: Console, arm: Arm, export: ModelExport, bodies: Model
     if changes:
         before, after = (sum(getattr(c, which).parameters[0] for c in changes) for which in ("before", "after"))
         answer = f"{len(changes)} links differ from the arm's own SDF, their total mass by {after - before:+.4f} kg."
-    print_answer(console, answer, f"export --model {export.origin} --diff")
+    print_answer(console, answer, f"dvrk-drake export --model {export.origin} --diff")
     if changes:
         console.print(_mass_table(changes))
     if changes and verbose:
@@ -60,7 +60,8 @@ def _print_bodies(console: Console, arm: Arm, export: ModelExport, bodies: Model
 
 def _mass_table(changes: Sequence[LinkChange]) -> Table:
     """Mass and centre of mass of every changed link; the latter in the link's frame."""
-    table = make_table("Links", "", "mass in the SDF [kg]", "mass [kg]", "centre in the SDF [mm]", "centre [mm]")
+    columns = ("mass, SDF [kg]", "mass [kg]", "centre of mass, SDF [mm]", "centre of mass [mm]")
+    table = make_table("Links in the arm's SDF and as exported", "", *columns)
     for change in changes:
         bodies = [inertia.to_spatial_inertia() for inertia in (change.before, change.after)]
         masses = [f"{body.get_mass():.4f}" for body in bodies]
@@ -70,7 +71,7 @@ def _mass_table(changes: Sequence[LinkChange]) -> Table:
 
 def _inertia_table(changes: Sequence[LinkChange]) -> Table:
     title = "Principal moments of inertia [kg cm^2]"
-    table = make_table(title, "", "in the SDF", "now")
+    table = make_table(title, "", "arm's SDF", "exported")
     for change in changes:
         cells = []
         for inertia in (change.before, change.after):
@@ -95,7 +96,7 @@ def _print_compensation(
     print_answer(
         console,
         f"The file differs from the model by at most {off[j]:.1e} N m ({MTM_JOINTS[j]}), at rest.",
-        f"compare-gc {path} --model {export.origin}",
+        f"dvrk-drake compare-gc {path} --model {export.origin}",
     )
     columns = ("largest difference*", "clip", "friction", "friction ratio", "dead band [rad/s]", "saturation [rad/s]")
     table = make_table("Torques [N m]", "", *(columns if verbose else columns[:3]))
@@ -109,7 +110,7 @@ def _print_compensation(
     largest = np.maximum(np.abs(file.torque_lower), np.abs(file.torque_upper))
     if short := [name for name, at_limit in zip(MTM_JOINTS, largest >= arm.effort_limits, strict=True) if at_limit]:
         console.print(f"Clipped at the motor's limit somewhere in the joint box: {', '.join(short)}")
-    console.print('Enter the file as "gravity_compensation" in the JSON file of the arm.')
+    console.print('Name the file as "gravity_compensation" in the JSON file of the arm.')
 
 
 def _print_kinematic_compensation(
@@ -121,7 +122,7 @@ def _print_kinematic_compensation(
     print_answer(
         console,
         f"The file differs from the model by at most {file.error[j]:.1e} {units[j]} ({ARM_JOINTS[j]}), at rest.",
-        f"simulate {export.model.arm.source}",
+        "name the file in the JSON file of the arm",
     )
     table = make_table("Largest difference from the model", "", "instrument straight", "more with the wrist bent", "")
     for name, error, wrist, unit in zip(ARM_JOINTS, file.error, file.wrist, units, strict=True):
@@ -155,12 +156,12 @@ def print_comparison(
         console,
         f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). At {wrong:.0f} % of "
         f"the poses a joint is at its clip, runs away or opposes the model.",
-        f"export --model {model_name} --dvrk-gc NEW.json",
+        f"dvrk-drake export --model {model_name} --dvrk-gc NEW.json",
         "yellow" if wrong else "green",
     )
     table = make_table(
         f"File less model [N m] at {len(comparison.q)} poses of the joint box, at rest",
-        *("", "largest", "RMS in the sweep", "RMS outside", "at its clip", "runaway", "opposed"),
+        *("", "largest", "RMS, in sweep", "RMS, outside", "at its clip", "runaway", "opposed"),
     )
     for joint, largest in zip(joints, difference, strict=True):
         shares = (f"{100 * x:.0f} %" if x else "" for x in (joint.clipped, joint.runaway, joint.opposed))

@@ -45,9 +45,9 @@ def print_identification(
         verbose: also print every parameter with its standard error, and the excluded measurements.
     """
     verdicts = cross_validated_verdicts(result.model)
-    next_command = f"validate OTHER.csv --model {model_path} --save"
+    next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
     if worst(verdicts)[0] == "do not use":
-        next_command = f"check {result.recording.source or 'RECORDING.csv'} --arm {result.model.arm.source}"
+        next_command = f"dvrk-drake check {result.recording.source or 'RECORDING.csv'} --arm {result.model.arm.source}"
     if isinstance(result, DynamicIdentification):
         actuators = result.model.dynamic_model.section.actuators
         fit, held_out = (
@@ -83,13 +83,13 @@ def print_validation(
     """
     verdicts, model = validation.verdicts, validation.model
     source = validation.recording.source or "RECORDING.csv"
-    next_command = f"run --arm {model.arm.source} --model {model_path} --mode gravity"
+    next_command = f"dvrk-drake run --arm {model.arm.source} --model {model_path} --mode gravity"
     if validation.of_same_recording:
-        next_command = f"validate OTHER.csv --model {model_path} --save"
+        next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
     elif validation.verdict == "do not use":
-        next_command = f"check {source} --arm {model.arm.source}"
+        next_command = f"dvrk-drake check {source} --arm {model.arm.source}"
         if model.dynamics is not None:
-            next_command = f"recalibrate {source} --model {model_path} --output NEW.yaml"
+            next_command = f"dvrk-drake recalibrate {source} --model {model_path} --output NEW.yaml"
     if isinstance(validation, DynamicValidation):
         error = f"Mean effort error {_percent(validation.mean_relative_error)}."
         _print_verdict(console, verdicts, error, next_command)
@@ -119,7 +119,7 @@ def print_recalibration(
         console,
         f"Mean effort error {_percent(before)} before and {_percent(after)} after the refit, cross-validated; "
         f"{kept} of {len(result.actuators)} actuators refitted.",
-        f"validate OTHER.csv --model {model_path} --save",
+        f"dvrk-drake validate OTHER.csv --model {model_path} --save",
     )
     table = make_table(
         f"{result.model.arm.name}, {result.seconds:.1f} s of motion: effort error, and change of friction and offset",
@@ -130,7 +130,7 @@ def print_recalibration(
             "dry friction factor",
             "viscous factor",
             "offset change [N m; N]",
-            "unchanged: why",
+            "unchanged because",
         ),
     )
     for a in result.actuators:

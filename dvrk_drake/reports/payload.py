@@ -37,7 +37,7 @@ def print_payload(
             answer += f" These recordings do not distinguish it from a payload on {names}: name the link with --link."
     command += " --json FILE" if payload.found and not others else " --link LINK"
     style = "green" if payload.found and not others else "yellow"
-    print_answer(console, answer, f"payload REFERENCE LOADED {command}", style)
+    print_answer(console, answer, f"dvrk-drake payload REFERENCE LOADED {command}", style)
     if payload.found:
         console.print(_estimate_table(payload))
     if verbose:

@@ -41,16 +41,16 @@ def _print_verdict(console: Console, report: RecordingReport, arm: str) -> None:
     what = f"{report.rows} rows of {report.kind}"
     if report.rate is not None and report.duration is not None:
         what = f"motion of {report.rows} rows, {report.duration:.2f} s at {report.rate:.4g} Hz"
-    next_command = f"identify {report.source} --arm {arm} --output MODEL.yaml"
+    next_command = f"dvrk-drake identify {report.source} --arm {arm} --output MODEL.yaml"
     verdict, style, found = "usable", "green", report.warnings
     if report.refusals:
         verdict, style, found = "unusable", "red", report.refusals
-        next_command = f"check OTHER.csv --arm {arm}"
+        next_command = f"dvrk-drake check OTHER.csv --arm {arm}"
     elif report.warnings:
         verdict, style = f"usable with {_count(len(report.warnings), 'warning')}", "yellow"
     kinds = ", ".join(dict.fromkeys(finding.kind for finding in found))
     verdict += f" ({kinds})" if kinds and kinds != verdict else ""
-    print_answer(console, f"Verdict: {verdict}. The recording is {what} of {report.arm}.", next_command, style)
+    print_answer(console, f"Verdict: {verdict}. {report.arm}, {what}.", next_command, style)
 
 
 def _print_joints(console: Console, report: RecordingReport) -> None:

@@ -31,8 +31,8 @@ def print_simulation(
     unit = "m" if arm.prismatic[j] else "rad"
     print_answer(
         console,
-        f"{what} {error[:, j].max():.5f} {unit} ({arm.joint_names[j]}), at the end {error[-1, j]:.5f} {unit}.",
-        f"simulate {scenario} --plots FOLDER",
+        f"{what} {error[:, j].max():.2g} {unit} ({arm.joint_names[j]}), at the end {error[-1, j]:.2g} {unit}.",
+        f"dvrk-drake simulate {scenario} --plots FOLDER",
     )
     kind = "motion" if desired is None else "error"
     table = make_table(

@@ -33,7 +33,7 @@ def print_study(
     first = study.measures[0]
     found = "; ".join(f"{s.variation}: {_headline(first, s)}" for s in summaries)
     answer = f"{first.column} {found}. {len(rows)} of {len(study.cases)} runs, {len(failed)} failed."
-    command = f"study {study_path} --output RESULTS.csv --plots FOLDER"
+    command = f"dvrk-drake study {study_path} --output RESULTS.csv --plots FOLDER"
     print_answer(console, answer, command, "yellow" if failed else "green")
     table = make_table(
         f"{study.arm.name}, {len(rows)} runs",

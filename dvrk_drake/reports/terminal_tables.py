@@ -28,9 +28,12 @@ class TableConsole(Console):
         """As rich's Console does."""
         width = self.width
         for table in (thing for thing in objects if isinstance(thing, Table)):
-            if self._least_width(table) > width:
-                for column in table.columns:
-                    column.header = Text(_stack(str(column.header), [str(cell) for cell in column.cells]))
+            headings = [str(column.header) for column in table.columns]
+            for lines in range(2, 6):
+                if self._least_width(table) <= width:
+                    break
+                for column, heading in zip(table.columns, headings, strict=True):
+                    column.header = Text(_stack(heading, lines))
             self.width = max(self.width, self._least_width(table))
         try:
             super().print(*objects, **options)
@@ -47,12 +50,12 @@ class TableConsole(Console):
         return least
 
 
-def _stack(heading: str, cells: list[str]) -> str:
-    """A heading on as few lines as fit the width of its longest word or of the cells; units stay on one line."""
+def _stack(heading: str, lines: int) -> str:
+    """A heading on at most so many lines, if its words allow it; a unit in brackets stays on one line."""
     text = _IN_UNIT.sub(_NO_BREAK_SPACE, heading)
-    words = textwrap.wrap(text, 1, break_long_words=False)
-    width = max(map(len, [*words, *cells]), default=1)
-    return "\n".join(textwrap.wrap(text, width)).replace(_NO_BREAK_SPACE, " ")
+    least = max(map(len, textwrap.wrap(text, 1, break_long_words=False)), default=1)
+    stacked = (textwrap.wrap(text, width) for width in range(least, len(text) + 2))
+    return "\n".join(next(rows for rows in stacked if len(rows) <= lines)).replace(_NO_BREAK_SPACE, " ")
 
 
 def make_console() -> Console:
@@ -63,17 +66,17 @@ def make_console() -> Console:
     return console
 
 
-def print_answer(console: Console, answer: str, next_command: str, style: str = "green") -> None:
-    """Prints what a command found and what to run next; details follow below.
+def print_answer(console: Console, answer: str, next_step: str, style: str = "green") -> None:
+    """Prints what a command found and what to do next; details follow below.
 
     Args:
         console: to print to.
         answer: one or two sentences.
-        next_command: the next command without "dvrk-drake"; it is not wrapped, so that it can be copied.
+        next_step: usually a command; it is not wrapped, so that it can be copied.
         style: of the answer.
     """
     console.print(answer, style=style, markup=False)
-    console.print(f"Next: dvrk-drake {next_command}\n", markup=False, soft_wrap=True)
+    console.print(f"Next: {next_step}\n", markup=False, soft_wrap=True)
 
 
 def print_note(console: Console, text: str) -> None:

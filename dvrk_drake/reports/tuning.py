@@ -31,7 +31,7 @@ def print_tuning(console: Console, tuning: Tuning, *, verbose: bool = False) -> 
     print_answer(
         console,
         f"Gains of method {best} are {verdict} {OWN}: settled steps and mean settling time {found}; {OWN}: {own}.",
-        f"tune --arm {name} --output GAINS.yaml",
+        f"dvrk-drake tune --arm {name} --output GAINS.yaml",
         "green" if verdict == "better than" else "yellow",
     )
     _print_summary(console, comparison)

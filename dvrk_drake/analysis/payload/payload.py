@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import require_usable
@@ -305,7 +305,7 @@ def _estimate(link: LinkInertia, columns: NDArray[np.float64], difference: Motio
     spread = _jackknife([[part.mass, *part.place] for part in parts], errors)
     at_com, at_com_error = problem.mass_at_com(weights)
     at_com_spread = _jackknife([[problem.mass_at_com(weights, fold)[0]] for fold in folds], np.array([at_com_error]))
-    quantile = float(student_t.ppf((1 + CONFIDENCE) / 2, len(folds) - 1))
+    quantile = float(stdtrit(len(folds) - 1, (1 + CONFIDENCE) / 2))
     rows, arm = len(difference.tau), difference.grid.arm
     rms = np.sqrt(np.stack(plain.budget(body, problems.plain_weights)) / rows)
     actuators = [
@@ -369,7 +369,9 @@ def _problem(
     grid, rows = difference.grid, np.flatnonzero(difference.rows)[whitening.lost :]
     fold, edge = phase_folds(grid, difference.period)
     tau = np.column_stack([whitening(x, i) for i, x in enumerate(difference.tau.T)])
-    equations = NormalEquations.of([whitening(x, i) for i, x in enumerate(both)], tau, fold[rows], edge[rows])
+    size = both[0].shape[1]
+    columns = ((np.arange(size), whitening(x, i)) for i, x in enumerate(both))
+    equations = NormalEquations.of(columns, size, tau, fold[rows], edge[rows])
     # A low-passed effort has two independent values a period of the cut-off. What repeats with the motion has fewer:
     # the jackknife over its phases sees to that.
     independent = 2 * grid.settings.effort_cut_off / grid.rate

@@ -1,11 +1,12 @@
-"""Filtering without delay, and derivatives of what is left."""
+"""Filtering without delay, and derivatives of what is left.
+
+scipy.signal and scipy.interpolate are imported where they are used: they take 0.3 s, and poses need neither.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import PchipInterpolator
-from scipy.signal import butter, sosfiltfilt
 
 #: Order of the Butterworth low-pass; run forwards and backwards, so that it halves the amplitude at the cut-off.
 ORDER = 6
@@ -21,6 +22,8 @@ def low_pass(x: NDArray[np.float64], rate: float, cut_off: ArrayLike, order: int
             stays as it is.
         order: of the filter that runs each way.
     """
+    from scipy.signal import butter, sosfiltfilt
+
     columns = np.atleast_2d(x.T)
     cut_offs = np.broadcast_to(np.asarray(cut_off, dtype=float), len(columns))
     filtered = np.array(columns, dtype=float)
@@ -37,4 +40,6 @@ def central_difference(x: NDArray[np.float64], rate: float) -> NDArray[np.float6
 
 def resample(t: NDArray[np.float64], x: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
     """x (m, ...), known at increasing times t (m,), at `times` (k,): piecewise cubic, without overshoot (PCHIP)."""
+    from scipy.interpolate import PchipInterpolator
+
     return np.asarray(PchipInterpolator(t, x, axis=0)(np.clip(times, t[0], t[-1])), dtype=float)

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
-from scipy.signal import welch
 
 #: Length of the pieces whose periodograms are averaged [s]; 1 / it is the resolution [Hz].
 PIECE = 2.56
@@ -48,6 +47,8 @@ def spectra(x: NDArray[np.float64], rate: float, period: float | None) -> Spectr
         rate: samples a second [Hz].
         period: of the motion [s], or None.
     """
+    from scipy.signal import welch  # takes 0.3 s, see `low_pass`
+
     length = min(int(PIECE * rate), len(x) // 4)
     frequency, power = welch(x, rate, nperseg=length, axis=0)
     if period is None:

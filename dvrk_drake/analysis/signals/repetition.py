@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import correlate
 
 from dvrk_drake.analysis.signals.low_pass import low_pass
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid
@@ -37,6 +36,8 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
     if not np.any(moving):
         return None
     x = (q[:, moving] - np.mean(q[:, moving], axis=0)) / deviation[moving]
+    from scipy.signal import correlate  # takes 0.3 s, see `low_pass`
+
     count = len(x)
     squares = np.cumsum(np.sum(x**2, axis=1))
     lags = np.arange(count)

@@ -15,7 +15,6 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
-from pydrake.visualization import MeshcatPoseSliders
 
 from dvrk_drake.experiments.simulation import recorded_in
 from dvrk_drake.models.arm import load_arm
@@ -112,6 +111,8 @@ def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
 
     A lamp above the master is green while the follower follows.
     """
+    from pydrake.visualization import MeshcatPoseSliders  # imports matplotlib
+
     arms = _make_arms(meshcat)
     simulator = Simulator(arms)
     context = simulator.get_mutable_context()

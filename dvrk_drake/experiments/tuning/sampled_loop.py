@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import cont2discrete
 
 from dvrk_drake.models.arm_schema import Gains
 
@@ -66,6 +65,8 @@ class SampledLoop:
 
     def __init__(self, M: ArrayLike, sampling: Sampling, viscous: ArrayLike = 0.0) -> None:
         """Of M (n, n) [kg m^2; kg] and `viscous` (n,) [N m s/rad; N s/m]."""
+        from scipy.signal import cont2discrete  # takes 0.3 s
+
         self._M = np.atleast_2d(np.asarray(M, float))
         n = self._n = len(self._M)
         self._sampling = sampling
