@@ -87,14 +87,16 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
     if old := sorted(options & renamed.keys()):
         message = "; ".join(f"{option} is now {renamed[option]}" for option in old)
     elif isinstance(error, UnknownCommandError):
-        message = message.partition(" Available commands")[0]
+        message = message.partition(" Available commands")[0].rstrip(".")
     elif isinstance(error, ValidationError):
         message = error.exception_message if error.group else message.replace(". must", ": must")
     elif isinstance(error, UnusedCliTokensError):
         message = f"Unexpected argument: {' '.join(error.unused_tokens or [])}"
     elif isinstance(error, MissingArgumentError) and error.argument and error.argument.name not in options:
         suggestion = re.search(r"Did you mean .*", message)
-        message = f"{error.argument.name} is required{'. ' + suggestion[0] if suggestion else ''}"
-        if error.argument.name == renamed.get(""):
+        message = f"{error.argument.name} is required"
+        if suggestion:
+            message += f". {suggestion[0]}"
+        elif error.argument.name == renamed.get(""):
             message += ": it is an option now"
     return f"dvrk-drake: error: {message}; see {f'dvrk-drake {name}'.rstrip()} --help"

@@ -44,6 +44,10 @@ def refused(capsys, *arguments):
     ("arguments", "message"),
     [
         (["modl"], 'Unknown command "modl". Did you mean "model"?; see dvrk-drake --help'),
+        (["--overwrite"], 'Unknown command "--overwrite"; see dvrk-drake --help'),
+        (["predict", "r.csv", "--mdel", "m.yaml"], "--model is required. Did you mean --model instead of --mdel?; see"),
+        (["check", "r.csv", "--arm", "psm", "--arm", "psm"], "Parameter --arm specified multiple times; see"),
+        (["arm", "--arm", "psm", "--pose", "-0.1", "-2e-1"], "a pose of PSM is 7 finite numbers"),
         (["identify", "--nonsense"], "Unknown option: --nonsense; see dvrk-drake identify --help"),
         (["identify", "a.csv", "--arm", "psm"], "--output is required; see dvrk-drake identify --help"),
         (["identify", "a.csv", "b.csv", "--arm", "psm", "--output", "m.yaml"], "Unexpected argument: b.csv; see"),
@@ -83,7 +87,8 @@ def test_an_old_option_names_the_new_one(command, old, capsys):
     else:
         required = REQUIRED[command]
         at = required.index(new)
-        assert f"{new} is required" in refused(capsys, command, *required[:at], *required[at + 2 :])
+        error = refused(capsys, command, *required[:at], *required[at + 2 :])
+        assert error == f"{new} is required: it is an option now; see dvrk-drake {command} --help"
 
 
 IMPORTS = """
