@@ -1,0 +1,45 @@
+"""The commands in the documentation can be typed: whole lines are accepted, and all options exist."""
+
+import re
+import shlex
+
+import pytest
+from cyclopts import CycloptsError
+from repository import ROOT
+
+from dvrk_drake.cli.app import app
+from dvrk_drake.cli.program import COMMANDS  # noqa: F401  (adds the commands)
+
+NAMES = [name for name in app if not name.startswith("-")]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "examples").glob("*.*")]
+#: A line of a code block, or of an example's comment.
+LINE = re.compile(r"^[ #$]*(?:[A-Z_]+=\S+ )*dvrk-drake (?P<words>[a-z].*)$", re.MULTILINE)
+#: A command with an option in a sentence; it may be incomplete.
+INLINE = re.compile(rf"`(?:dvrk-drake )?(?P<words>(?:{'|'.join(NAMES)}) [^`]*--[^`]*)`")
+
+
+def options_of(command):
+    return {name for argument in app[command].assemble_argument_collection() for name in argument.names}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_documented_commands_can_be_typed(page):
+    text = page.read_text()
+    for found in LINE.finditer(text):
+        words = shlex.split(found["words"], comments=True)
+        words = words[: words.index("|")] if "|" in words else words
+        if "..." in words or any(word.startswith("[") for word in words):
+            continue  # a pattern, whose options are checked below
+        try:
+            app.parse_args(words, print_error=False, exit_on_error=False)
+        except CycloptsError as error:
+            pytest.fail(f"dvrk-drake {found['words']}: {error}")
+    for found in [*LINE.finditer(text), *INLINE.finditer(text)]:
+        command, _, rest = found["words"].partition("#")[0].partition(" ")
+        unknown = set(re.findall(r"(?<!\S)\[?(--[a-z][a-z-]*)", rest)) - options_of(command)
+        assert not unknown, f"dvrk-drake {found['words']}"
+
+
+def test_the_documentation_has_every_command():
+    text = "".join(page.read_text() for page in PAGES)
+    assert {found["words"].split()[0] for found in LINE.finditer(text)} >= set(NAMES) - {"demo"}
