@@ -233,10 +233,13 @@ def _keys(schema: Any) -> str:
 
 
 def meant(name: object, known: Iterable[str]) -> str:
-    """Returns "did you mean ...? " with the known name that is most like a wrong one, or ""."""
+    """Returns "did you mean ...? " with the known name that is most like a wrong one, or "" without one or with two."""
     of_lower_case = {key.lower(): key for key in known}
-    near = difflib.get_close_matches(str(name)[:_LONGEST].lower(), of_lower_case, 1)
-    return f'did you mean "{of_lower_case[near[0]]}"? ' if near else ""
+    given = str(name)[:_LONGEST].lower()
+    near = difflib.get_close_matches(given, of_lower_case, 2)
+    likeness = [difflib.SequenceMatcher(None, other, given).ratio() for other in near]
+    unique = len(set(likeness)) == len(likeness) > 0
+    return f'did you mean "{of_lower_case[near[0]]}"? ' if unique else ""
 
 
 def _quoted(value: Any) -> str:

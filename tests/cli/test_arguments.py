@@ -63,7 +63,8 @@ def refused(capsys, *arguments):
         (["study", "s.yaml", "--output", "r.csv", "--workers", "1", "--scheduler", "x"], "give at most one of"),
         (["simulate", "psm"], "psm is an arm, not a scenario; name it with --arm psm"),
         (["export", "--model", "psm", "--sdf", "o"], "psm is an arm, not a model; name it with --arm psm"),
-        (["model", "--arm", "mtmx"], 'unknown arm "mtmx"; did you mean "mtm'),
+        (["model", "--arm", "mtmrr"], 'unknown arm "mtmrr"; did you mean "mtmr"'),
+        (["model", "--arm", "mtmx"], 'unknown arm "mtmx"; known arms'),
     ],
 )
 def test_bad_arguments_are_refused_in_one_line(arguments, message, capsys):
