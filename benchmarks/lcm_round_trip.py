@@ -215,7 +215,7 @@ def be_the_arm(peer: list[str], simulated: bool, condition: str, seconds: float,
         load = [["-c", "while True: pass"]] * (os.cpu_count() or 1)
     port = str(free_port())
     if condition == "Meshcat client":
-        load = [["-m", "dvrk_drake.cli", "view", ARM.name.lower(), "--live", "--port", port]]
+        load = [["-m", "dvrk_drake.cli", "view", "--arm", ARM.name.lower(), "--live", "--port", port]]
     begins: list[int] = []
     times = arm.times
 
