@@ -221,10 +221,10 @@ def print_notes(path: str, notes: Sequence[str]) -> None:
 def write_tables(path: str, print_to: Callable[[Console], object]) -> None:
     """Writes what `print_to` prints into a text file."""
     from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.reports.terminal_tables import TABLE_WIDTH, TableConsole
+    from dvrk_drake.reports.terminal_tables import WIDTH_OF_FILES, TableConsole
 
     with atomic_write(path) as stream:
-        print_to(TableConsole(file=stream, highlight=False, width=TABLE_WIDTH))
+        print_to(TableConsole(file=stream, highlight=False, width=WIDTH_OF_FILES))
 
 
 def add_recording(verb: argparse.ArgumentParser) -> None:

@@ -13,8 +13,10 @@ from rich.table import Table
 from rich.text import Text
 
 TABLE_WIDTH = 80
-#: A space inside of a unit in brackets.
-_IN_UNIT = re.compile(r" (?=[^\[]*\])")
+#: Of tables in a file, where names of base parameters are not broken.
+WIDTH_OF_FILES = 120
+#: A space inside of a unit in brackets, or before a unit.
+_IN_UNIT = re.compile(r" (?=[^\[]*\]|%)")
 _NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
 
 

@@ -175,7 +175,7 @@ def test_from_the_command_line(tmp_path, capsys):
     assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], "--output", paths["new.yaml"]]) == 0
     assert IdentifiedModel.load(paths["new.yaml"]).provenance.method.endswith(f"recalibrated on {paths['short.csv']}")
     table = capsys.readouterr().out
-    assert all(name in table for name in ("before", "refit", "wrist_yaw", "kept", "motions like the recalibration"))
+    assert all(name in table for name in ("before", "after the refit", "wrist_yaw", "motions like the recalibration"))
     again = ["--output", paths["new.yaml"], "--overwrite"]
     assert main(["recalibrate", paths["static.yaml"], paths["short.csv"], *again]) == 2
     assert main(["recalibrate", paths["model.yaml"], paths["short.csv"], "--output", paths["model.yaml"]]) == 2

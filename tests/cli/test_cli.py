@@ -72,7 +72,7 @@ def test_validate_writes_json(folder, capsys):
         assert joint["rms_torque"] == pytest.approx(np.sqrt(np.mean(recording.tau[:, j] ** 2)))
         assert joint["relative_error"] == pytest.approx(joint["rms_error"] / joint["rms_torque"])
     table = capsys.readouterr().out
-    assert "[N m; N if prismatic]" in table
+    assert "[N m; N]" in table
     assert "…" not in table
 
 

@@ -24,7 +24,7 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_c
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.reports.export import plot_compensation
+from dvrk_drake.reports.figures.export import plot_compensation
 
 pytestmark = pytest.mark.slow
 
