@@ -11,7 +11,7 @@ from dvrk_drake.experiments.study.study_file import Study
 from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
-#: Failed runs that are printed without `verbose`.
+#: Variations in the answer, and failed runs that are printed without `verbose`.
 _MOST = 3
 
 
@@ -30,7 +30,7 @@ def print_study(
     summaries = summarise(study, rows)
     failed = [case for case in study.cases if case.index in rows and rows[case.index].error]
     first = study.measures[0]
-    found = "; ".join(f"{s.variation}: {_headline(first, s)}" for s in summaries)
+    found = "; ".join(f"{s.variation}: {_headline(first, s)}" for s in summaries[:_MOST])
     answer = f"{first.column} {found}. {len(rows)} of {len(study.cases)} runs, {len(failed)} failed."
     command = f"dvrk-drake study {study_path} --output RESULTS.csv --plots FOLDER"
     print_answer(console, answer, command, "yellow" if failed else "green")
