@@ -68,7 +68,7 @@ def test_imports_are_found_wherever_they_are():
 import numpy, dvrk_drake.models.arm
 from dvrk_drake.cli import main
 if TYPE_CHECKING:
-    from dvrk_drake.reports.figures import save_figure as save
+    from dvrk_drake.reports.figures.style import save_figure as save
 def late():
     from dvrk_drake import errors
 """

@@ -98,15 +98,19 @@ def _print_compensation(
         f"The file differs from the model by at most {off[j]:.1e} N m ({MTM_JOINTS[j]}), at rest.",
         f"dvrk-drake compare-gc {path} --model {export.origin}",
     )
-    columns = ("largest difference*", "clip", "friction", "friction ratio", "dead band [rad/s]", "saturation [rad/s]")
-    table = make_table("Torques [N m]", "", *(columns if verbose else columns[:3]))
+    table = make_table("Torques [N m]", "", "largest difference*", "clip", "dry friction")
     friction = np.append((file.positive - file.negative)[10::5] / 2, 0.0)
     for j, name in enumerate(MTM_JOINTS):
         clip = f"{file.torque_lower[j]:+.4f}..{file.torque_upper[j]:+.4f}"
-        rates = (f"{x[j]:g}" for x in (file.friction_ratio, file.dead_band, file.saturation))
-        table.add_row(name, f"{off[j]:.1e}", clip, f"{friction[j]:.4f}", *(rates if verbose else ()))
+        table.add_row(name, f"{off[j]:.1e}", clip, f"{friction[j]:.4f}")
     console.print(table)
     print_note(console, "* at 4000 random poses of the joint box")
+    if verbose:
+        table = make_table("Friction compensation", "", "ratio", "dead band [rad/s]", "saturation [rad/s]")
+        for j, name in enumerate(MTM_JOINTS):
+            table.add_row(name, *(f"{x[j]:g}" for x in (file.friction_ratio, file.dead_band, file.saturation)))
+        console.print(table)
+        console.print()
     largest = np.maximum(np.abs(file.torque_lower), np.abs(file.torque_upper))
     if short := [name for name, at_limit in zip(MTM_JOINTS, largest >= arm.effort_limits, strict=True) if at_limit]:
         console.print(f"Clipped at the motor's limit somewhere in the joint box: {', '.join(short)}")

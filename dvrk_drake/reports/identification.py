@@ -294,7 +294,7 @@ def _print_effects(console: Console, section: DynamicSection) -> None:
 
 
 def _effect_cells(e: DriveEffect) -> tuple[str, ...]:
-    scale = f"{e.scale:g}" if e.scale else ""
+    scale = f"{e.scale:.2g}" if e.scale else ""
     return e.coordinate, e.kind, scale, f"{e.coefficient:+.3g}", f"{e.standard_error:.1g}", EFFECT_KINDS[e.kind].unit
 
 

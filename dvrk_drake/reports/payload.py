@@ -8,7 +8,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from dvrk_drake.analysis.payload.payload import CONFIDENCE, Payload, PayloadIdentification, as_good, shown_elsewhere
+from dvrk_drake.analysis.payload.payload import (
+    CONFIDENCE,
+    Payload,
+    PayloadIdentification,
+    as_good,
+    better_links,
+    shown_elsewhere,
+)
 from dvrk_drake.analysis.payload.point_mass import LARGEST_MASS
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
@@ -25,19 +32,20 @@ def print_payload(
         verbose: also print the estimate on every link, and the efforts that the payload explains.
     """
     payload, estimates = result.payload, result.estimates
-    command = f"--arm {result.model.arm.source}" if model_path is None else f"--model {model_path}"
-    # A named link is compared with the others by a warning.
-    others = [] if result.link else [other.link for other in as_good(estimates) if other is not payload]
+    others = as_good(estimates) if result.link is None else better_links(payload, estimates)
+    names = [other.link for other in others if other is not payload]
     if not payload.found:
         answer = _none_found(payload, shown_elsewhere(payload, estimates))
     else:
         answer = f"Payload: {payload.body.mass:.4f} +- {payload.mass_error:.4f} kg on {payload.link}."
-        if others:
-            names = " or ".join(others)
-            answer += f" These recordings do not distinguish it from a payload on {names}: name the link with --link."
-    command += " --json FILE" if payload.found and not others else " --link LINK"
-    style = "green" if payload.found and not others else "yellow"
-    print_answer(console, answer, f"dvrk-drake payload REFERENCE LOADED {command}", style)
+    if payload.found and names and result.link is None:
+        answer += f" These recordings do not distinguish it from a payload on {' or '.join(names)}: name the link."
+    elif payload.found and names:
+        answer += f" A payload on {names[0]} explains the change better."
+    clear = payload.found and not names
+    command = f"--arm {result.model.arm.source}" if model_path is None else f"--model {model_path}"
+    command = f"dvrk-drake payload REFERENCE LOADED {command} " + ("--json FILE" if clear else "--link LINK")
+    print_answer(console, answer, command, "green" if clear else "yellow")
     if payload.found:
         console.print(_estimate_table(payload))
     if verbose:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from rich.console import Console
-from rich.markup import escape
 
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import Study
 from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
-#: Failed runs that are printed without `verbose`.
+#: Variations in the answer, and failed runs that are printed without `verbose`.
 _MOST = 3
 
 
@@ -31,15 +30,15 @@ def print_study(
     summaries = summarise(study, rows)
     failed = [case for case in study.cases if case.index in rows and rows[case.index].error]
     first = study.measures[0]
-    found = "; ".join(f"{s.variation}: {_headline(first, s)}" for s in summaries)
+    found = "; ".join(f"{s.variation}: {_headline(first, s)}" for s in summaries[:_MOST])
     answer = f"{first.column} {found}. {len(rows)} of {len(study.cases)} runs, {len(failed)} failed."
     command = f"dvrk-drake study {study_path} --output RESULTS.csv --plots FOLDER"
     print_answer(console, answer, command, "yellow" if failed else "green")
     table = make_table(
         f"{study.arm.name}, {len(rows)} runs",
-        *("", "variation", "share", "95 % interval", "median", "95th percentile", "largest", "unit"),
+        *("", "variation", "share or median", "95 % interval or percentile", "largest"),
     )
-    table.columns[1].justify = "left"
+    table.columns[1].justify, table.columns[1].no_wrap = "left", False
     for measure in study.measures:
         for k, summary in enumerate(summaries):
             table.add_row(measure.column if k == 0 else "", summary.variation, *_cells(measure, summary))
@@ -48,7 +47,11 @@ def print_study(
     if failed:
         print_note(console, "A run that failed counts as the worst result.")
     if verbose:
-        print_note(console, "95 % interval: Wilson's interval of the share, for independent runs.")
+        print_note(
+            console,
+            "Yes or no: share of the runs and Wilson's 95 % interval, for independent runs. Numbers: median and 95th "
+            "percentile of the runs.",
+        )
     if len(study.seeds) > 1:
         print_note(console, "Several seeds per pose: runs are not independent, so the intervals are too narrow.")
     for case in failed if verbose else failed[:_MOST]:
@@ -69,6 +72,5 @@ def _cells(measure: Measure, summary: Summary) -> list[str]:
     value = summary.measures[measure.column]
     if isinstance(value, Share):
         share = f"{100 * value.yes / value.runs:.1f} %"
-        return [share, f"{100 * value.lower:.1f}..{100 * value.upper:.1f} %", "", "", "", ""]
-    numbers = [f"{number:.4g}" for number in (value.median, value.percentile_95, value.largest)]
-    return ["", "", *numbers, escape(measure.unit)]
+        return [share, f"{100 * value.lower:.1f}..{100 * value.upper:.1f} %", ""]
+    return [f"{number:.4g} {measure.unit}".strip() for number in (value.median, value.percentile_95, value.largest)]

@@ -13,8 +13,10 @@ from rich.table import Table
 from rich.text import Text
 
 TABLE_WIDTH = 80
-#: A space inside of a unit in brackets.
-_IN_UNIT = re.compile(r" (?=[^\[]*\])")
+#: Of tables in a file, where names of base parameters are not broken.
+WIDTH_OF_FILES = 120
+#: A space inside of a unit in brackets, or before a unit.
+_IN_UNIT = re.compile(r" (?=[^\[]*\]|%)")
 _NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
 
 
@@ -30,24 +32,24 @@ class TableConsole(Console):
         for table in (thing for thing in objects if isinstance(thing, Table)):
             headings = [str(column.header) for column in table.columns]
             for lines in range(2, 6):
-                if self._least_width(table) <= width:
+                if self._width_of(table) <= width:
                     break
                 for column, heading in zip(table.columns, headings, strict=True):
                     column.header = Text(_stack(heading, lines))
-            self.width = max(self.width, self._least_width(table))
+            self.width = max(self.width, self._width_of(table, folded=True))
         try:
             super().print(*objects, **options)
         finally:
             self.width = width
 
-    def _least_width(self, table: Table) -> int:
-        """With the numbers on one line each. Rich's own measure breaks them between words."""
+    def _width_of(self, table: Table, folded: bool = False) -> int:
+        """With the numbers on one line each, and with names if not `folded`. Rich's own measure breaks numbers."""
         free = self.options.update(max_width=10 * TABLE_WIDTH)
-        least = 2 * (len(table.columns) - 1)
+        width = 2 * (len(table.columns) - 1)
         for column in table.columns:
             sizes = [Measurement.get(self, free, cell) for cell in (column.header, *column.cells)]
-            least += max(size.maximum if column.no_wrap else size.minimum for size in sizes)
-        return least
+            width += max(size.minimum if folded and not column.no_wrap else size.maximum for size in sizes)
+        return width
 
 
 def _stack(heading: str, lines: int) -> str:

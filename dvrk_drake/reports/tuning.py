@@ -120,14 +120,14 @@ def _print_joints(console: Console, comparison: Comparison) -> None:
     print_note(
         console,
         "Settling time [s]: afterwards the joint stays inside its band, 2 % of the step or a count of its encoder; "
-        f"the slowest pose; n/{poses}: from n poses it has not settled in {DURATION - REST:g} s. Overshoot, residual, "
-        "oscillation (peak to peak of the effort at rest over its limit): the worst pose, arm as modelled.",
+        f"the slowest pose; n/{poses}: from n poses it has not settled in {DURATION - REST:g} s. Overshoot, error "
+        "at rest, ripple (peak to peak of the effort at rest over its limit): the worst pose, arm as modelled.",
     )
     for j, joint in enumerate(arm.joint_names):
         unit, size = ("mm", step_size(arm)[j]) if arm.prismatic[j] else ("mrad", step_size(arm)[j])
         title = f"{joint}, step {1e3 * size:g} {unit}, band {1e3 * band(arm)[j]:.2g} {unit}"
         names = [condition.name for condition in comparison.conditions]
-        table = make_table(title, "", *names, "overshoot", f"residual [{unit}]", "oscillation")
+        table = make_table(title, "", *names, "overshoot", f"error [{unit}]", "ripple")
         for which in comparison.gains:
             settling = comparison.table(which, "settling")[:, :, j]
             worst = [comparison.table(which, name)[0, :, j].max() for name in ("overshoot", "steady_error", "unrest")]

@@ -176,7 +176,7 @@ def test_from_the_command_line(tmp_path, capsys):
     assert main(["recalibrate", paths["short.csv"], "--model", paths["model.yaml"], "--output", paths["new.yaml"]]) == 0
     assert IdentifiedModel.load(paths["new.yaml"]).provenance.method.endswith(f"recalibrated on {paths['short.csv']}")
     table = capsys.readouterr().out
-    assert all(name in table for name in ("before", "refit", "wrist_yaw", "kept", "motions like the recalibration"))
+    assert all(name in table for name in ("before", "after the refit", "wrist_yaw", "motions like the recalibration"))
     again = ["--output", paths["new.yaml"], "--overwrite"]
     assert main(["recalibrate", paths["short.csv"], "--model", paths["static.yaml"], *again]) == 2
     command = ["recalibrate", paths["short.csv"], "--model", paths["model.yaml"]]

@@ -42,7 +42,8 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.arm_schema import Gains, load_gains, save_gains
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, DriveEffect
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.reports.tuning import plot_steps, print_tuning
+from dvrk_drake.reports.figures.tuning import plot_steps
+from dvrk_drake.reports.tuning import print_tuning
 
 #: The lags of the sampling make a loop of second order only far below 1 / (9 ms).
 FAR_BELOW = 15.0
@@ -401,7 +402,7 @@ def test_the_designed_gains_settle_every_joint_of_a_psm(tmp_path, monkeypatch):
     assert np.all(np.isfinite(settling))
     assert tuning.found == {"model": tuning.design.gains}
     console = Console(record=True, width=120, file=io.StringIO())
-    print_tuning(console, tuning)
+    print_tuning(console, tuning, verbose=True)
     said = console.export_text()
     assert all(name in said for name in (*tuning.arm.joint_names, "the arm's own", "[s]", "[kg m^2; kg]"))
     plot_steps(tmp_path / "steps.png", tuning.comparison)

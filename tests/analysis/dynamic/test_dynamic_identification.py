@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from command_output import refusal
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
-from rich.console import Console
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
@@ -21,8 +20,8 @@ from dvrk_drake.models import plant
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.recordings.recording import Recording, write_recording
-from dvrk_drake.reports.identification import print_dynamics
-from dvrk_drake.reports.terminal_tables import TABLE_WIDTH
+from dvrk_drake.reports.identification import print_identification
+from dvrk_drake.reports.terminal_tables import TABLE_WIDTH, TableConsole
 
 NOISE = 0.05
 RATE = 1000.0
@@ -86,23 +85,16 @@ def test_base_parameters_of_the_motion_lie_in_their_intervals(case):
     assert all(0 <= p.told <= 1 for p in found) and min(p.told for p in found) < 0.2
 
 
-def test_all_that_is_printed_fits_a_hundred_columns(case):
-    """The short form counts what it leaves out; the full one names every parameter."""
+def test_every_parameter_is_printed_on_request(case):
     _, _, _, result = case
-    texts = []
-    for full in (False, True):
-        console = Console(file=StringIO(), highlight=False, width=TABLE_WIDTH)
-        print_dynamics(console, result, full)
-        texts.append(console.file.getvalue())
-    short, whole = texts
-    rows = [line for line in short.splitlines() if not line.startswith(("*", "+-:", "not told", "gravity"))]
-    assert max(map(len, rows)) <= 100
-    count = len(result.model.dynamics.base_parameters)
-    assert f"of {count}: " in short and len(short.splitlines()) < 0.7 * len(whole.splitlines())
+    console = TableConsole(file=StringIO(), highlight=False, width=TABLE_WIDTH)
+    print_identification(console, result, verbose=True)
+    text = console.file.getvalue()
+    assert max(map(len, text.splitlines())) <= TABLE_WIDTH
     section = result.model.dynamics
-    folded = "".join(whole.split())
-    assert all("".join(p.name.split()) in folded for p in section.base_parameters if len(p.name) < 60)
-    assert all(link.link in short and link.link in whole for link in section.links)
+    folded = "".join(text.split())
+    assert all("".join(p.name.split()) in folded for p in section.base_parameters if len(p.name) < 30)
+    assert all(link.link in text for link in section.links)
 
 
 def test_true_friction_is_found(case):

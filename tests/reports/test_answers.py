@@ -1,0 +1,244 @@
+"""What the commands print: the answer first, then the next step, then tables of at most 80 columns."""
+
+import os
+import re
+import tempfile
+from dataclasses import replace
+from functools import cache
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from loaded_arm import two_days
+
+import dvrk_drake as dvrk
+from dvrk_drake.dynamics.gravity_regressor import derive_gravity
+from dvrk_drake.experiments.demo.demo import DemoResult
+from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
+from dvrk_drake.experiments.study.measures import Measure
+from dvrk_drake.experiments.study.study_file import RandomPoses, Study, Variation
+from dvrk_drake.experiments.study.table import Row
+from dvrk_drake.experiments.transparency import Felt
+from dvrk_drake.experiments.tuning.model_based import ArmDesign, JointDesign, JointFacts
+from dvrk_drake.experiments.tuning.procedure import JointProcedure, Ultimate
+from dvrk_drake.experiments.tuning.sampled_loop import Margins
+from dvrk_drake.experiments.tuning.tuning import CONDITIONS, OWN, PUBLISHED, Comparison, StepMeasures, Tuning
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.reports import (
+    demo,
+    export,
+    identification,
+    model,
+    payload,
+    recording_check,
+    simulation,
+    study,
+    transparency,
+    tuning,
+)
+from dvrk_drake.reports.terminal_tables import TABLE_WIDTH, TableConsole
+
+pytestmark = pytest.mark.slow
+
+
+@cache
+def poses():
+    """A static model, and errors of it on other poses, where one joint's effort is wrong."""
+    arm, recordings, generator = dvrk.load_arm("mtml"), [], np.random.default_rng(0)
+    for _ in range(2):
+        q = arm.sample_poses(40, generator)
+        tau = dvrk.IdentifiedModel.from_arm(arm).holding_torque(q)
+        tau += 0.003 * arm.effort_limits * generator.normal(size=q.shape)
+        recordings.append(dvrk.Recording(q=q, tau=tau, source="poses.csv"))
+    recordings[0].tau[:3, 1] += 1.0  # outliers
+    recordings[1].tau[:, 2] *= 0.3
+    identified = dvrk.identify(recordings[0], arm)
+    return identified, dvrk.validate(identified.model, recordings[1])
+
+
+@cache
+def motions():
+    """Two recordings of a motion, without and with a payload, and the model of the first."""
+    _, reference, loaded = two_days("psm", "end_link", 0.2, [0.02, 0.02, 0.39], 0)
+    return reference, loaded, dvrk.identify(reference, dvrk.load_arm("psm"))
+
+
+@cache
+def payloads():
+    reference, loaded, identified = motions()
+    return dvrk.payload(reference, loaded, identified.model)
+
+
+def on_insertion_link(found):
+    named = next(one for one in found.estimates if one.link == "insertion_link")
+    return replace(found, payload=named, link=named.link)
+
+
+def exported(console, verbose, model, name, **options):
+    with tempfile.TemporaryDirectory() as folder:
+        before = os.getcwd()
+        os.chdir(folder)
+        try:
+            written = dvrk.export_model(model, name, origin="model.yaml", **options)
+            export.print_export(console, name, written, verbose=verbose)
+        finally:
+            os.chdir(before)
+
+
+def compared(console, verbose):
+    identified = poses()[0].model
+    with tempfile.TemporaryDirectory() as folder:
+        dvrk.export_model(identified, f"{folder}/gc.json", "dvrk-gc", tolerance=1.0)
+        file = GravityCompensationFile.load(f"{folder}/gc.json")
+    file.torque_upper[1] = 0.3
+    export.print_comparison(console, "gc.json", "model.yaml", compare_compensation(file, identified), verbose=verbose)
+
+
+def checked(console, verbose, **changes):
+    reference = motions()[0]
+    report = dvrk.check(replace(reference, **changes), dvrk.load_arm("psm"))
+    recording_check.print_report(console, report, arm="psm", verbose=verbose)
+
+
+def simulated(console, verbose, settings):
+    scenario = dvrk.load_scenario("psm", ["duration=0.1", *settings])
+    simulation.print_simulation(console, dvrk.simulate(scenario), scenario.mounted_arm, scenario="psm", verbose=verbose)
+
+
+def studied(console, verbose):
+    what = Study(
+        scenario="mtml",
+        random_poses=RandomPoses(6, seed=3),
+        seeds=[1, 2],
+        variations=[Variation("exact"), Variation("another one", ["controller.parameter_error=0.2"])],
+        measures=[Measure("held"), Measure("drift"), Measure("effort_share")],
+    )
+    rows = {c.index: Row({"held": c.index % 3 > 0, "drift": 1e-3 * c.index, "effort_share": 0.1}) for c in what.cases}
+    rows[5] = Row({}, "RuntimeError: the solver failed")
+    study.print_study(console, what, rows, verbose=verbose)
+
+
+def tuned(console, verbose):
+    arm = dvrk.load_arm("psm")
+    names = (OWN, PUBLISHED, "paper", "model")
+    settling = {name: k for k, name in enumerate(reversed(names))}
+    n, q = arm.num_joints, arm.sample_poses(6, np.random.default_rng(0))
+    measures = {
+        name: [
+            [StepMeasures(np.where(np.arange(n) < settling[name], np.inf, 0.5), *np.full((3, n), 0.12)) for _ in q]
+            for _ in CONDITIONS
+        ]
+        for name in names
+    }
+    compared = Comparison(arm, dict.fromkeys(names, arm.gains), CONDITIONS, q, measures, {})
+    procedure = JointProcedure(1.2, 0.3, 0.5, Ultimate(1234.5, 0.123, 1.01, False), 1.0, False, 1.234e-3)
+    facts = JointFacts((1.23e-4, 4.56e-3), 0.1, 0.1, 1.0, 1e-4, 1e-3, 3.0)
+    design = JointDesign(1.2, 0.3, 0.5, 123.4, (Margins(0.7, 100.0, 2.3),) * 2, "phase margin")
+    found = Tuning(arm, (procedure,) * n, ArmDesign(arm.gains, (facts,) * n, (design,) * n), compared)
+    tuning.print_tuning(console, found, verbose=verbose)
+
+
+def felt(console, verbose):
+    t = np.linspace(0.0, 12.0, 100)
+    vectors = np.random.default_rng(0).normal(size=(100, 3))
+    names = ("nothing", "model A", "model A, friction 0.5")
+    off = np.abs(vectors[:, 0]) / 100
+    results = [Felt(name, t, vectors / 10, (4 - k) * vectors, off) for k, name in enumerate(names)]
+    transparency.print_transparency(console, dvrk.load_arm("mtml"), results, verbose=verbose)
+
+
+def demonstrated(console, verbose):
+    identified, validation = poses()
+    t, q = np.arange(3.0), np.zeros((3, 7))
+    drift = {"identified": np.full(7, 0.0123), "as drawn": np.full(7, 1.234)}
+    result = DemoResult(
+        identified.model.arm, identified, validation, validation, t, q, q, drift, t, q, np.full(7, 1.2e-4)
+    )
+    demo.print_demo(console, result, Path("demo_output"), verbose=verbose)
+
+
+VERDICT = r"Verdict: (good|usable|do not use) ?[(.]"
+#: Case -> how the answer begins, and what prints it.
+CASES = {
+    "identify poses": (VERDICT, lambda c, v: identification.print_identification(c, poses()[0], verbose=v)),
+    "identify motion": (VERDICT, lambda c, v: identification.print_identification(c, motions()[2], verbose=v)),
+    "validate poses": (
+        r"Verdict: do not use \(elbow_pitch\)\. Largest error: \d+\.\d % of the effort limit",
+        lambda c, v: identification.print_validation(c, poses()[1], verbose=v),
+    ),
+    "validate motion": (
+        VERDICT,
+        lambda c, v: identification.print_validation(c, dvrk.validate(motions()[2].model, motions()[1]), verbose=v),
+    ),
+    "recalibrate": (
+        r"Mean effort error \d+\.\d % before and \d+\.\d % after the refit",
+        lambda c, v: identification.print_recalibration(
+            c, dvrk.recalibrate(motions()[2].model, motions()[1]), verbose=v
+        ),
+    ),
+    "check": (r"Verdict: usable", checked),
+    "check, refused": (
+        r"Verdict: unusable \(wrong time\)\.",
+        lambda c, v: checked(c, v, t=1000 * motions()[0].t),
+    ),
+    "payload": (
+        r"Payload: 0\.\d{4} \+- 0\.\d{4} kg on \w+\.",
+        lambda c, v: payload.print_payload(c, payloads(), verbose=v),
+    ),
+    "payload, none": (
+        r"No payload found on insertion_link",
+        lambda c, v: payload.print_payload(c, on_insertion_link(payloads()), model_path="m.yaml", verbose=v),
+    ),
+    "export SDF": (r"\d+ links differ", lambda c, v: exported(c, v, poses()[0].model, "out.sdf")),
+    "export URDF": (r"\d+ links differ", lambda c, v: exported(c, v, motions()[2].model, "out.urdf")),
+    "export dVRK, MTM": (
+        r"The file differs from the model by at most \d\.\de-\d+ N m \(\w+\)",
+        lambda c, v: exported(c, v, poses()[0].model, "gc.json", format="dvrk-gc", tolerance=1.0),
+    ),
+    "export dVRK, PSM": (
+        r"The file differs from the model by at most \d\.\de-\d+ N",
+        lambda c, v: exported(
+            c, v, dvrk.IdentifiedModel.from_arm(dvrk.load_arm("psm")), "psm.json", format="dvrk-kinematic-gc"
+        ),
+    ),
+    "compare-gc": (r"Largest difference between file and model: \d\.\d{3} N m \(\w+\)", compared),
+    "simulate, hold": (r"Largest tracking error \S+ \w+ \(\w+\)", lambda c, v: simulated(c, v, [])),
+    "simulate, gravity": (
+        r"Largest motion from the start \S+ \w+ \(\w+\)",
+        lambda c, v: simulated(c, v, ["controller.mode=gravity"]),
+    ),
+    "study": (r"held exact: \d+ of 12 runs; another one: \d+ of 12 runs\.", studied),
+    "tune": (r"Gains of method model are better than the arm's own: ", tuned),
+    "transparency": (r"Smallest interaction force at the handle: \d+\.\d\d N RMS with model A, friction 0\.5", felt),
+    "demo": (r"Released under gravity compensation, MTML drifts by at most 0\.0123 rad", demonstrated),
+    "teleop": (
+        r"The tip follows the handle within 0\.500 mm",
+        lambda c, v: demo.print_teleoperation(
+            c, TeleoperationResult(1.2, 1e-4, 5e-4, 1e-3, 2e-3, 1e-6), "page.html", verbose=v
+        ),
+    ),
+    "model": (
+        r"The gravity torque of MTML depends on 12 base parameters\.",
+        lambda c, v: model.print_symbolic_model(c, derive_gravity(dvrk.load_arm("mtml")), verbose=v),
+    ),
+}
+
+
+def printed(case, verbose):
+    console = TableConsole(file=StringIO(), highlight=False, width=TABLE_WIDTH)
+    CASES[case][1](console, verbose)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_answer_comes_first_and_all_fits_80_columns(case):
+    short, whole = printed(case, False), printed(case, True)
+    for text in (short, whole):
+        answer, _, rest = text.partition("\nNext: ")
+        assert re.match(CASES[case][0], " ".join(answer.split())), text
+        assert answer.count("\n") < 3 and rest.split("\n")[1] == ""
+        assert max(len(line.rstrip()) for line in text.splitlines()) <= 80, text
+        assert "…" not in text
+    assert whole.startswith(short.split("\n\n")[0]) and len(whole) >= len(short)
