@@ -27,7 +27,7 @@ def print_report(console: Console, report: RecordingReport, *, arm: str = "ARM",
         console.print(str(finding), style=_STYLES[finding.severity], markup=False)
     if notes and not verbose:
         console.print(f"{_count(len(notes), 'note')}: --verbose prints {'it' if len(notes) == 1 else 'them'}.")
-    if findings or notes:
+    if report.warnings or notes:
         console.print()
     if not report.joints:
         return
