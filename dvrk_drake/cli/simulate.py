@@ -57,7 +57,8 @@ def simulate(
         print(f"{loaded.mounted_arm.name} at {page.web_url()}", flush=True)
     with Steps("simulating") as steps:
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
-    print_simulation(make_console(), simulation, loaded.mounted_arm, verbose=verbose)
+    named = scenario or f"--arm {arm}"
+    print_simulation(make_console(), simulation, loaded.mounted_arm, scenario=named, verbose=verbose)
     if output is not None:
         dvrk.write_recording(simulation.recording, output)
         print_written(output, f"{len(simulation.recording)} rows")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.model_links import ModelBodies
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import MTM_JOINTS, largest_differences
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import CompensationComparison
@@ -39,13 +40,18 @@ def print_export(console: Console, path: str, export: ModelExport, *, verbose: b
         _print_compensation(console, path, export, written, verbose)
 
 
+def _source(model: IdentifiedModel, origin: str) -> str:
+    """Returns the option that names a model: --arm if it is what the arm's SDF states."""
+    return f"--{'arm' if origin == model.arm.source else 'model'} {origin}"
+
+
 def _print_bodies(console: Console, arm: Arm, export: ModelExport, bodies: ModelBodies, verbose: bool) -> None:
     changes = changed_links(arm, bodies.links)
     answer = f"The {export.format.upper()} states the inertias of the arm's own SDF."
     if changes:
         before, after = (sum(getattr(c, which).parameters[0] for c in changes) for which in ("before", "after"))
         answer = f"{len(changes)} links differ from the arm's own SDF, their total mass by {after - before:+.4f} kg."
-    print_answer(console, answer, f"dvrk-drake export --model {export.origin} --diff")
+    print_answer(console, answer, f"dvrk-drake export {_source(export.model, export.origin)} --diff")
     if changes:
         console.print(_mass_table(changes))
     if changes and verbose:
@@ -96,7 +102,7 @@ def _print_compensation(
     print_answer(
         console,
         f"The file differs from the model by at most {off[j]:.1e} N m ({MTM_JOINTS[j]}), at rest.",
-        f"dvrk-drake compare-gc {path} --model {export.origin}",
+        f"dvrk-drake compare-gc {path} {_source(export.model, export.origin)}",
     )
     table = make_table("Torques [N m]", "", "largest difference*", "clip", "dry friction")
     friction = np.append((file.positive - file.negative)[10::5] / 2, 0.0)
@@ -160,7 +166,7 @@ def print_comparison(
         console,
         f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). At {wrong:.0f} % of "
         f"the poses a joint is at its clip, runs away or opposes the model.",
-        f"dvrk-drake export --model {model_name} --dvrk-gc NEW.json",
+        f"dvrk-drake export {_source(comparison.model, model_name)} --dvrk-gc NEW.json",
         "yellow" if wrong else "green",
     )
     table = make_table(

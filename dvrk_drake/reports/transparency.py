@@ -26,7 +26,7 @@ def print_transparency(console: Console, arm: Arm, felt: Sequence[Felt], *, verb
     best, without = min(felt, key=lambda one: one.rms_force), felt[0]
     answer = f"Smallest interaction force at the handle: {best.rms_force:.2f} N RMS with {best.name}"
     answer += "." if best is without else f", {without.rms_force:.2f} N with {without.name}."
-    print_answer(console, answer, f"dvrk-drake transparency --arm {arm.source} --model NAME=MODEL.yaml --folder FOLDER")
+    print_answer(console, answer, f"dvrk-drake transparency --arm {arm.source} --model MODEL.yaml --plots FOLDER")
     headings = ("RMS force [N]", "95 % force [N]", "RMS torque [mN m]", "95 % torque [mN m]", "largest deviation [mm]")
     title = f"{arm.name}, simulated: a hand moves the handle for {felt[0].time[-1]:.3g} s"
     table = make_table(title, "compensation", *headings)

@@ -134,7 +134,7 @@ def test_a_recording_of_it_is_read_by_the_other_verbs(tmp_path, capsys, monkeypa
     ]
     assert main(command) == 0
     assert (tmp_path / "plots/positions.png").stat().st_size > 10_000
-    assert "error at the end" in capsys.readouterr().out
+    assert "Largest tracking error" in capsys.readouterr().out
     assert main(["validate", recording, "--model", model, "--json", errors]) == 0
     held = read_recording(recording, PSM)
     np.testing.assert_allclose(held.tau, IdentifiedModel.load(model).holding_torque(held.q), atol=1e-3)

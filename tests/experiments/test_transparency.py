@@ -99,7 +99,7 @@ def test_the_verb_writes_its_table(tmp_path, capsys, monkeypatch):
     assert [row["compensation"] for row in rows] == ["nothing", "ours", "ours, friction 0.5"]
     assert float(rows[0]["rms_force"]) > 1.0 > float(rows[1]["rms_force"])
     assert (tmp_path / "plots/transparency.png").stat().st_size > 10_000
-    assert "interaction force at the handle" in capsys.readouterr().out
+    assert "Smallest interaction force at the handle: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
