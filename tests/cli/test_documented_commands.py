@@ -43,7 +43,7 @@ def test_documented_commands_can_be_typed(page):
 def test_printed_commands_have_these_options():
     """In messages, docstrings and what commands print to be typed next."""
     for path in (ROOT / "dvrk_drake").rglob("*.py"):
-        for found in re.finditer(rf"dvrk-drake ({'|'.join(NAMES)})\b([^\"`;,]*)", path.read_text()):
+        for found in re.finditer(rf"dvrk-drake ({'|'.join(NAMES)})\b([^\"`;,\n]*)", path.read_text()):
             unknown = set(re.findall(r"(?<!\S)(--[a-z][a-z-]*)", found[2])) - options_of(found[1])
             assert not unknown, f"{path.name}: {found[0]}"
 

@@ -46,7 +46,11 @@ def test_the_files_themselves_are_read(tmp_path):
             ("\n  kp:", "\n  Kp:"),
             'gains: key "Kp" is unknown; did you mean "kp"? allowed in gains: kp, kd, ki',
         ),
-        ("mechanism", ("{frame_a:", "{frame_c:"), 'loop_closures[0]: key "frame_c" is unknown; did you mean "frame_'),
+        (
+            "mechanism",
+            ("{frame_a:", "{frame_c:"),
+            'loop_closures[0]: key "frame_c" is unknown; allowed in loop_closures: frame_a',
+        ),
         (
             "mechanism",
             ("\n  delay:", "\n  dealy:"),
