@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numba
 import numpy as np
 import sympy
 from numpy.typing import NDArray
+
+from dvrk_drake.dynamics.trigonometry import cos, sin
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,11 @@ def share_terms(array: sympy.NDimArray | sympy.MatrixBase) -> SharedTerms:
 
 
 def python_source(
-    name: str, arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms, docstring: str = ""
+    name: str,
+    arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]],
+    terms: SharedTerms,
+    docstring: str = "",
+    functions: Mapping[str, str] | None = None,
 ) -> str:
     """A Python function `name(*arguments, out)` that fills the array `out`; needs only the standard library's math.
 
@@ -48,24 +55,29 @@ def python_source(
         arguments: (name, symbols) each; a one-element tuple of the same name is a scalar, else symbols are unpacked.
         terms: what to compute.
         docstring: first statement of the function.
+        functions: names of sympy's functions, where others than those of math are to be called.
     """
     lines = [f"def {name}({', '.join(n for n, _ in arguments)}, out):"]
     if docstring:
         lines.append(f'    """{docstring}"""')
     lines += unpacking(arguments, terms, "    {symbol} = {array}[{index}]")
-    lines += [f"    {symbol} = {sympy.pycode(e)}" for symbol, e in terms.assignments]
+    code = partial(sympy.pycode, user_functions=dict(functions or {}))
+    lines += [f"    {symbol} = {code(e)}" for symbol, e in terms.assignments]
     if len(terms.entries) < math.prod(terms.shape):
         lines.append("    out[:] = 0.0")
-    lines += [f"    out[{', '.join(map(str, index))}] = {sympy.pycode(e)}" for index, e in terms.entries]
+    lines += [f"    out[{', '.join(map(str, index))}] = {code(e)}" for index, e in terms.entries]
     return "\n".join(lines) + "\n"
 
 
 def compile_function(
     name: str, arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms
 ) -> Callable[..., None]:
-    """The function of `python_source`, compiled with numba for float64; vectors and `out` must be C-contiguous."""
-    namespace: dict[str, Any] = {"math": math}
-    exec(python_source(name, arguments, terms), namespace)
+    """The function of `python_source`, compiled with numba for float64; vectors and `out` must be C-contiguous.
+
+    Sine and cosine are those of `trigonometry`.
+    """
+    namespace: dict[str, Any] = {"math": math, "sin": sin, "cos": cos}
+    exec(python_source(name, arguments, terms, functions={"sin": "sin", "cos": "cos"}), namespace)
     kinds = [numba.float64 if is_scalar(n, s) else numba.float64[::1] for n, s in arguments]
     out = (numba.float64[::1], numba.float64[:, ::1])[len(terms.shape) - 1]
     return numba.njit(numba.void(*kinds, out), fastmath=False)(namespace[name])

@@ -5,9 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -35,7 +33,7 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant
 
-#: Samples that a thread takes at a time, and that `torque` keeps a regressor of.
+#: Samples of which `torque` keeps a regressor at a time.
 _CHUNK = 256
 
 
@@ -90,8 +88,8 @@ class DynamicRegressor:
 
         Args:
             q, v, vd: (m, n) positions [rad, m], velocities and accelerations of the independent joints.
-            out: array to write to and return. The memory of a new one takes as long to get as Y takes to compute, so
-                who goes through many samples in parts keeps one.
+            out: array to write to and return. Getting the memory of a new one takes longer than computing Y, so a caller
+                that goes through many samples in parts keeps one.
 
         Raises:
             ModelError: the arrays are not of these shapes, or `out` is not C-contiguous float64.
@@ -134,36 +132,21 @@ class DynamicRegressor:
 
     def _fill(self, motion: tuple[NDArray, ...], gravity: NDArray, Y: NDArray) -> None:
         tree = self._tree
-
-        chunks = iter(range(0, len(Y), _CHUNK))  # shared: a thread that was kept waiting takes fewer
-
-        def work() -> None:
-            # A part at a time, where the caches hold it: Y itself goes to memory once and in order.
-            part = np.zeros((min(_CHUNK, len(Y)), *Y.shape[1:]))
-            for first in chunks:
-                chunk = slice(first, first + _CHUNK)
-                q, v, vd = (x[chunk] for x in motion)
-                fill_regressor(
-                    tree.joint_motion(q, v, vd),
-                    vd,
-                    gravity,
-                    tree.parents,
-                    tree.pose_terms,
-                    tree.hinges,
-                    tree.G,
-                    tree.affects,
-                    self._rotor_rows,
-                    part[: len(q)],
-                )
-                Y[chunk] = part[: len(q)]
-
-        threads = min(os.cpu_count() or 1, len(Y) // (2 * _CHUNK))
-        if threads <= 1:
-            work()
-            return
-        with ThreadPoolExecutor(threads) as pool:
-            for result in [pool.submit(work) for _ in range(threads)]:
-                result.result()
+        q, v, vd = motion
+        fill_regressor(
+            q,
+            v,
+            vd,
+            gravity,
+            tree.parents,
+            tree.pose_terms,
+            tree.hinges,
+            tree.G,
+            tree.c,
+            tree.affects,
+            self._rotor_rows,
+            Y,
+        )
 
     @cached_property
     def _rotor_rows(self) -> NDArray[np.float64]:

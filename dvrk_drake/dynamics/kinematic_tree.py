@@ -70,24 +70,6 @@ class KinematicTree:
             affects=affects,
         )
 
-    def joint_motion(
-        self, q: NDArray[np.float64], v: NDArray[np.float64], vd: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """(5, l, m) x, sin(x), 1 - cos(x), dx/dt, d2x/dt2 of the joints, for m samples (m, n) of the independent ones.
-
-        Sine and cosine are written by the tangent of half the angle, which numpy computes eight at a time.
-        """
-        motion = np.empty((5, len(self.c), len(q)))
-        x, sine, versine, rate, rate_of_rate = motion
-        np.matmul(self.G, q.T, out=x)
-        x += self.c[:, None]
-        t = np.tan(x / 2)
-        np.divide(2 * t, 1 + t * t, out=sine)
-        np.multiply(t, sine, out=versine)
-        np.matmul(self.G, v.T, out=rate)
-        np.matmul(self.G, vd.T, out=rate_of_rate)
-        return motion
-
 
 def _joints(plant: MultibodyPlant) -> list[Joint]:
     return [plant.get_joint(index) for index in plant.GetJointIndices()]

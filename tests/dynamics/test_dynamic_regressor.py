@@ -10,6 +10,7 @@ from pydrake.systems.framework import Context
 
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia
+from dvrk_drake.dynamics.regressor_kernel import BLOCK
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import make_arm_plant, tree_selector
@@ -123,17 +124,22 @@ def test_mass_matrix_is_the_plants(arm):
         assert np.linalg.eigvalsh(M[i])[0] > 0
 
 
-def test_many_samples_equal_single_ones(arm):
-    """Chunks and threads change nothing."""
+@pytest.mark.parametrize("count", [0, 1, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 7])
+def test_many_samples_equal_single_ones(arm, count):
+    """Whether the last block is full, has one sample or is missing."""
+    model = DynamicRegressor(arm)
+    motion = random_motion(arm, count)
+    Y = model.regressor(*motion)
+    assert Y.shape == (count, arm.num_joints, len(model.names))
+    ones = [model.regressor(*(x[i : i + 1] for x in motion)) for i in range(count)]
+    np.testing.assert_allclose(Y, np.reshape(ones, Y.shape), rtol=0, atol=1e-12 * np.abs(Y).max(initial=0.0))
+
+
+def test_torque_in_chunks_equals_the_regressor_times_the_parameters(arm):
     model = DynamicRegressor(arm)
     motion = random_motion(arm, 1500)
-    Y = model.regressor(*motion)
-    rounding = 1e-12 * np.abs(Y).max()
-    for i in (0, 511, 512, 1499):
-        one = model.regressor(*(x[i : i + 1] for x in motion))[0]
-        np.testing.assert_allclose(Y[i], one, rtol=0, atol=rounding)
-    np.testing.assert_allclose(model.torque(*motion, model.values), Y @ model.values, rtol=0, atol=1e-12)
-    assert model.regressor(*(x[:0] for x in motion)).shape == (0, arm.num_joints, len(model.names))
+    expected = model.regressor(*motion) @ model.values
+    np.testing.assert_allclose(model.torque(*motion, model.values), expected, rtol=0, atol=1e-12)
 
 
 def test_writes_to_memory_that_is_given(arm):

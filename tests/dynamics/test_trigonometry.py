@@ -1,0 +1,32 @@
+"""Sine and cosine of compiled code against numpy's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dvrk_drake.dynamics.trigonometry import cos, sin, sin_cos
+
+
+@pytest.mark.parametrize("size", [8.0, 1e6])
+def test_equal_numpys(size):
+    x = np.random.default_rng(0).uniform(-size, size, 20_000)
+    values = np.array([sin_cos(value) for value in x])
+    np.testing.assert_allclose(values, np.column_stack([np.sin(x), np.cos(x)]), rtol=0, atol=3e-16)
+
+
+def test_around_multiples_of_a_quarter_turn():
+    quarters = np.arange(-9, 10) * np.pi / 2
+    for x in np.concatenate([quarters, quarters - np.pi / 4, np.nextafter(quarters, 99), [1e-300, 0.0]]):
+        assert sin(x) == pytest.approx(np.sin(x), rel=1e-15, abs=3e-16)
+        assert cos(x) == pytest.approx(np.cos(x), rel=1e-15, abs=3e-16)
+
+
+def test_small_angles_keep_their_relative_accuracy():
+    x = np.logspace(-12, -1, 50)
+    np.testing.assert_allclose([sin(value) for value in x], np.sin(x), rtol=3e-16, atol=0)
+
+
+@pytest.mark.parametrize("x", [np.nan, np.inf, -np.inf])
+def test_not_finite_gives_nan(x):
+    assert np.isnan(sin_cos(x)).all()
