@@ -88,7 +88,7 @@ class DynamicRegressor:
 
         Args:
             q, v, vd: (m, n) positions [rad, m], velocities and accelerations of the independent joints.
-            out: array to write to and return. Getting the memory of a new one takes longer than computing Y, so a caller
+            out: array to write to and return. Getting memory for a new one takes longer than computing Y, so a caller
                 that goes through many samples in parts keeps one.
 
         Raises:
