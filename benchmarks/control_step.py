@@ -25,9 +25,8 @@ Euler at 1 ms. Both blocks feed through, so the cpp rows act without the period 
 from __future__ import annotations
 
 import argparse
-import json
-import time
 import xml.etree.ElementTree as ElementTree
+from functools import partial
 from importlib.metadata import version
 
 import numpy as np
@@ -37,6 +36,7 @@ from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.controllers import InverseDynamics, PidController
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import Adder, ConstantVectorSource, MatrixGain
+from timing import measured_times, median_ratio, print_table, write_json
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
@@ -151,35 +151,25 @@ def main() -> None:
     difference = np.abs(ours - np.clip(theirs, -arm.effort_limits, arm.effort_limits)).max()
     assert difference < 1e-9, f"efforts differ by {difference} N m"
 
-    times: dict[str, list[float]] = {row: [] for row in rows}
-    for repetition in range(arguments.repetitions + 1):
-        for row, (simulator, station, *_) in rows.items():
-            restart(simulator, station)
-            before = time.process_time()
-            simulator.AdvanceTo(arguments.seconds)
-            if repetition > 0:  # the first warms caches
-                times[row].append((time.process_time() - before) / arguments.seconds * 1e3)
+    times = measured_times(
+        {row: partial(simulator.AdvanceTo, arguments.seconds) for row, (simulator, *_) in rows.items()},
+        arguments.repetitions,
+        prepare=lambda row: restart(*rows[row][:2]),
+    )
     for row in ("python", "cpp"):
         simulator, station = rows[row][:2]
         q = station.GetPositions(station.GetMyContextFromRoot(simulator.get_context()))
         assert np.abs(q - GOAL).max() < 0.02, f"{row} is not where it should be: {q}"
 
-    median = {row: float(np.median(values)) for row, values in times.items()}
-    # Ratios within each repetition: what slows a moment slows both.
-    peers = ("cpp", "cpp_serial")
-    ratio = {peer: float(np.median(np.divide(times["python"], times[peer]))) for peer in peers}
-    print(f"drake {version('drake')}; CPU time per simulated ms, median of {arguments.repetitions} [us]")
-    for row, value in median.items():
-        low, high = np.percentile(times[row], [25, 75])
-        control = value - median["none"]
-        print(f"  {row:11} {value:7.1f}   (quartiles {low:.1f}..{high:.1f}; control {control:+.1f})")
-    print(f"  python / cpp        {ratio['cpp']:.3f}")
-    print(f"  python / cpp_serial {ratio['cpp_serial']:.3f}")
-    if arguments.json:
-        with open(arguments.json, "w", encoding="utf-8") as stream:
-            result = {"drake": version("drake"), "us_per_simulated_ms": median, "ratio_python_to": ratio}
-            json.dump(result, stream, indent=2)
-            stream.write("\n")
+    median = {row: 1e3 * float(np.median(values)) / arguments.seconds for row, values in times.items()}
+    ratio = {row: median_ratio(times, "python", row) for row in rows}
+    print_table(
+        f"drake {version('drake')}; CPU time per simulated ms, median of {arguments.repetitions}",
+        ["us", "control [us]", "python / this"],
+        {row: (f"{us:.1f}", f"{us - median['none']:.1f}", f"{ratio[row]:.3f}") for row, us in median.items()},
+    )
+    result = {"drake": version("drake"), "us_per_simulated_ms": median, "ratio_python_to": ratio}
+    write_json(arguments.json, result)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,9 @@
 
     python benchmarks/guard_step.py [--other CHECKOUT]
 
-With another checkout of this repository, e.g. an older commit, both are measured in turn and their ratio is printed.
-Times are of the process, and the least of many batches counts, since other programs only make them longer.
+The reference is what any driver does per tick: encode and decode the command. With another checkout of this repository,
+e.g. an older commit, both are measured in turn. Times are of the process, and the least of many batches counts, since
+other programs only make them longer.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import subprocess
 import sys
 from argparse import ArgumentParser
 from pathlib import Path
+
+from timing import print_table
 
 ROOT = Path(__file__).resolve().parents[1]
 TURNS = 5
@@ -32,7 +35,7 @@ try:
 except ImportError:
     bench = Bench(arm)
 bench.started(Command.EFFORT)
-times = []
+times, messages = [], []
 for _ in range(60):
     commands, start = [], bench.utime
     for k in range(100):
@@ -45,16 +48,22 @@ for _ in range(60):
         bench.utime += 1000
         bench.step()
     times.append((time.process_time() - begin) / len(commands))
+    begin = time.process_time()
+    for command in commands:
+        Command.decode(command.encode())
+    messages.append((time.process_time() - begin) / len(commands))
 assert bench.guard.state == 4, bench.guard.fault_text
-print(1e6 * min(times))
+print(1e6 * min(times), 1e6 * min(messages))
 """
 
 
-def cost(checkout: Path, arm: str) -> float:
-    """Returns the least time of a tick [us]."""
+def cost(checkout: Path, arm: str) -> tuple[float, float]:
+    """Returns the least times of a tick and of encoding and decoding its command [us]."""
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
     command = [sys.executable, "-c", WORKER, arm]
-    return float(subprocess.run(command, cwd=checkout, env=environment, check=True, capture_output=True).stdout)
+    output = subprocess.run(command, cwd=checkout, env=environment, check=True, capture_output=True).stdout
+    tick, message = map(float, output.split())
+    return tick, message
 
 
 def main() -> None:
@@ -62,11 +71,14 @@ def main() -> None:
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("--other", type=Path)
     other = parser.parse_args().other
+    rows = {}
     for arm in ("mtml", "psm"):
-        turns = [(cost(ROOT, arm), cost(other, arm) if other else float("nan")) for _ in range(TURNS)]
-        own, theirs = (min(turn[i] for turn in turns) for i in (0, 1))
-        compared = f"; other checkout {theirs:.1f} us, ratio {own / theirs:.2f}" if other else ""
-        print(f"{arm}: {own:.1f} us per tick{compared}", flush=True)
+        turns = [(*cost(ROOT, arm), cost(other, arm)[0] if other else float("nan")) for _ in range(TURNS)]
+        tick, message, theirs = (min(turn[i] for turn in turns) for i in range(3))
+        compared = [f"{theirs:.1f}", f"{tick / theirs:.2f}"] if other else []
+        rows[arm] = [f"{tick:.1f}", f"{message:.1f}", f"{tick / message:.2f}", *compared]
+    headings = ["tick [us]", "message [us]", "tick / message", *(["other checkout [us]", "ratio"] if other else [])]
+    print_table("Command guard", headings, rows)
 
 
 if __name__ == "__main__":

@@ -16,15 +16,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import os
-import time
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
+from timing import measured_times, print_table, write_json
 
 from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -83,20 +82,23 @@ def main() -> None:
         "all": effects,
         f"all, {cables}": stretching,
     }
-    best = dict.fromkeys(rows, np.inf)
-    for _ in range(args.repetitions):
-        for row, of_row in rows.items():
-            simulator = start(arm, of_row, args.closure)
-            began = time.process_time()
-            simulator.AdvanceTo(0.1 + SECONDS)
-            best[row] = min(best[row], time.process_time() - began)
+    ready: dict[str, Simulator] = {}
+    times = measured_times(
+        {row: lambda row=row: ready[row].AdvanceTo(0.1 + SECONDS) for row in rows},
+        args.repetitions,
+        prepare=lambda row: ready.update({row: start(arm, rows[row], args.closure)}),
+    )
+    best = {row: float(np.min(seconds)) for row, seconds in times.items()}
     allocator = os.environ.get("LD_PRELOAD") or os.environ.get("GLIBC_TUNABLES") or "the system's"
-    print(f"{arm.name}, {args.closure}; allocator: {allocator}\n{'effects':>24}    us/step   ratio   real time")
-    for row, seconds in best.items():
-        print(f"{row:>24} {1e3 * seconds / SECONDS:10.1f} {seconds / best['ideal']:7.2f} {SECONDS / seconds:9.1f} x")
-    if args.json:
-        with open(args.json, "w", encoding="utf-8") as file:
-            json.dump({row: seconds / SECONDS for row, seconds in best.items()}, file, indent=2)
+    print_table(
+        f"{arm.name}, {args.closure}; allocator: {allocator}",
+        ["us per step", "to ideal", "real time"],
+        {
+            row: (f"{1e3 * seconds / SECONDS:.1f}", f"{seconds / best['ideal']:.2f}", f"{SECONDS / seconds:.1f} x")
+            for row, seconds in best.items()
+        },
+    )
+    write_json(args.json, {row: seconds / SECONDS for row, seconds in best.items()})
 
 
 if __name__ == "__main__":

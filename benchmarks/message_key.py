@@ -14,9 +14,10 @@ Nothing is sent.
 from __future__ import annotations
 
 import argparse
+import time
 
 import numpy as np
-from timing import measured_times
+from timing import measured_times, median_ratio, print_table
 
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
@@ -104,14 +105,19 @@ def main() -> None:
         "foreign": lambda: bare.inbox.put(foreign),
         "foreign, key": lambda: keyed.inbox.put(spoofed),
     }
-    times = {name: 1e6 * np.median(values) for name, values in measured_times(functions, options.repetitions).items()}
+    times = measured_times(functions, options.repetitions, clock=time.perf_counter)
+    count = options.repetitions + 1  # with the one that does not count
     assert bare.guard.counts.refused == keyed.guard.counts.refused == 0
-    assert bare.guard.counts.accepted == keyed.guard.counts.accepted == options.repetitions
-    assert bare_controller.statuses.last.sequence == keyed_controller.statuses.last.sequence == options.repetitions
-    print(f"{'':12}{'no key [us]':>13}{'key [us]':>10}{'ratio':>8}")
-    for name in ("arm", "controller", "foreign"):
-        without, with_key = times[name], times[f"{name}, key"]
-        print(f"{name:12}{without:13.1f}{with_key:10.1f}{with_key / without:8.2f}")
+    assert bare.guard.counts.accepted == keyed.guard.counts.accepted == count
+    assert bare_controller.statuses.last.sequence == keyed_controller.statuses.last.sequence == count
+    rows = {
+        name: [
+            *(f"{1e6 * np.median(times[work]):.1f}" for work in (name, f"{name}, key")),
+            f"{median_ratio(times, f'{name}, key', name):.2f}",
+        ]
+        for name in ("arm", "controller", "foreign")
+    }
+    print_table("Messages of one period", ["no key [us]", "key [us]", "ratio"], rows)
 
 
 if __name__ == "__main__":

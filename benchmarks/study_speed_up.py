@@ -11,6 +11,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from timing import print_table
+
 from dvrk_drake.experiments.study.study import run_study_locally
 from dvrk_drake.experiments.study.study_file import load_study
 
@@ -24,7 +26,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     options = parser.parse_args()
     study = load_study(options.study, options.set)
-    first = None
+    first, table = None, {}
     for workers in options.workers:
         with tempfile.TemporaryDirectory() as folder:
             results = Path(folder, "results.csv")
@@ -33,7 +35,8 @@ def main() -> None:
             took, content = time.perf_counter() - start, results.read_bytes()
         first = first or (took, content)
         same = "the same bytes" if content == first[1] else "OTHER BYTES"
-        print(f"{workers} workers: {len(rows)} runs in {took:.1f} s, {first[0] / took:.2f} times as fast, {same}")
+        table[f"{workers} workers"] = [len(rows), f"{took:.1f}", f"{first[0] / took:.2f}", same]
+    print_table(Path(options.study).name, ["runs", "time [s]", "times as fast", "results"], table)
 
 
 if __name__ == "__main__":

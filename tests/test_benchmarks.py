@@ -1,19 +1,53 @@
-"""What benchmarks read: the public recordings in their own coordinates, and nothing else."""
+"""What benchmarks read and how they measure: public recordings in their own coordinates, and times in turn."""
 
 import importlib.util
 
+import numpy as np
 import pytest
 from repository import ROOT
 
 from dvrk_drake.models.arm import load_arm
 
 
-@pytest.fixture(scope="module")
-def benchmark():
-    specification = importlib.util.spec_from_file_location("dynamic", ROOT / "benchmarks" / "dynamic_recordings.py")
+def load_script(name):
+    specification = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    return load_script("dynamic_recordings")
+
+
+def test_functions_are_measured_in_turn_without_the_first_call():
+    timing = load_script("timing")
+    calls, clock = [], iter(range(100))
+    functions = {name: lambda name=name: calls.append(name) for name in ("a", "b")}
+    times = timing.measured_times(
+        functions, 2, prepare=lambda name: calls.append(f"before {name}"), clock=lambda: next(clock)
+    )
+    assert calls == ["before a", "a", "before b", "b"] * 3
+    assert {name: len(values) for name, values in times.items()} == {"a": 2, "b": 2}
+
+
+def test_ratio_is_within_each_repetition():
+    timing = load_script("timing")
+    times = {"ours": np.array([1.0, 2.0, 30.0]), "peer": np.array([2.0, 4.0, 60.0])}
+    assert timing.median_ratio(times, "ours", "peer") == 0.5
+
+
+def test_table_columns_are_aligned(capsys):
+    load_script("timing").print_table(
+        "Title", ["us", "ratio"], {"ours": ["1.25", "0.10"], "the peer": ["12.50", "1.00"]}
+    )
+    assert capsys.readouterr().out.splitlines() == [
+        "Title",
+        "               us  ratio",
+        "  ours       1.25   0.10",
+        "  the peer  12.50   1.00",
+    ]
 
 
 def test_a_recording_that_is_not_there_is_one_line(benchmark, tmp_path):

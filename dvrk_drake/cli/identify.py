@@ -256,7 +256,7 @@ def payload(
             print_notes(recording.source, recording.notes)
         result = dvrk.payload(without, with_it, known or recorded_arm, link, progress=steps)
     console = make_console()
-    print_payload(console, result, verbose=verbose)
+    print_payload(console, result, model_path=model, verbose=verbose)
     print_warnings(console, [warning for warning in result.warnings if warning.kind == "other link"])
     if json is not None:
         write_json(json, result.as_dicts())

@@ -57,7 +57,7 @@ def simulate(
         print(f"{loaded.mounted_arm.name} at {page.web_url()}", flush=True)
     with Steps("simulating") as steps:
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
-    named = scenario or f"--arm {arm}"
+    named = (scenario or f"--arm {arm}") if folder is None else None
     print_simulation(make_console(), simulation, loaded.mounted_arm, scenario=named, verbose=verbose)
     if output is not None:
         dvrk.write_recording(simulation.recording, output)
@@ -122,7 +122,7 @@ def study(
         else:
             with dask_executor(scheduler) as executor:
                 rows = run_study(loaded, executor, output, show)
-    print_study(make_console(), loaded, rows, verbose=verbose)
+    print_study(make_console(), loaded, rows, study_path=study if folder is None else None, verbose=verbose)
     print_written(output, f"{len(rows)} runs")
     if folder is not None:
         from dvrk_drake.reports.figures.study import plot_study
@@ -164,7 +164,7 @@ def tune(
     step = f"tuning {tuned.name}"
     with Steps(step) as steps:
         tuning = tune_arm(arm, methods, step_progress(steps, step))
-    print_tuning(make_console(), tuning, verbose=verbose)
+    print_tuning(make_console(), tuning, gains_path=output, verbose=verbose)
     best = tuning.comparison.best(tuning.found)
     if output is not None:
         save_gains(tuning.found[best], output, f"{tuned.name}: dvrk-drake tune --arm {arm}, method {best}.")

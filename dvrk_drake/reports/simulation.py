@@ -11,7 +11,7 @@ from dvrk_drake.reports.terminal_tables import make_table, print_answer
 
 
 def print_simulation(
-    console: Console, simulation: Simulation, arm: Arm, *, scenario: str = "SCENARIO.yaml", verbose: bool = False
+    console: Console, simulation: Simulation, arm: Arm, *, scenario: str | None = None, verbose: bool = False
 ) -> None:
     """Prints the largest distance from the desired positions, over all recorded samples, or from the start.
 
@@ -19,7 +19,7 @@ def print_simulation(
         console: to print to.
         simulation: to print.
         arm: which was simulated.
-        scenario: name of the arm or of its scenario file, for the next command.
+        scenario: argument that names it, for the next command, which draws it; None: it is drawn already.
         verbose: also print positions at the start and at the end, and the effort limits.
     """
     recording, desired = simulation.recording, simulation.desired
@@ -32,7 +32,7 @@ def print_simulation(
     print_answer(
         console,
         f"{what} {error[:, j].max():.2g} {unit} ({arm.joint_names[j]}), at the end {error[-1, j]:.2g} {unit}.",
-        f"dvrk-drake simulate {scenario} --plots FOLDER",
+        scenario and f"dvrk-drake simulate {scenario} --plots FOLDER",
     )
     kind = "motion" if desired is None else "error"
     table = make_table(

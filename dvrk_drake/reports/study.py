@@ -16,7 +16,7 @@ _MOST = 3
 
 
 def print_study(
-    console: Console, study: Study, rows: Mapping[int, Row], *, study_path: str = "STUDY.yaml", verbose: bool = False
+    console: Console, study: Study, rows: Mapping[int, Row], *, study_path: str | None = None, verbose: bool = False
 ) -> None:
     """Prints the first measure of each variation, then all measures, and errors of runs that failed.
 
@@ -24,7 +24,7 @@ def print_study(
         console: to print to.
         study: whose summary is printed.
         rows: results by number of the case.
-        study_path: file of the study, for the next command.
+        study_path: file of the study, for the next command, which draws it; None: it is drawn already.
         verbose: print all failed runs, not only the first.
     """
     summaries = summarise(study, rows)
@@ -32,7 +32,7 @@ def print_study(
     first = study.measures[0]
     found = "; ".join(f"{s.variation}: {_headline(first, s)}" for s in summaries[:_MOST])
     answer = f"{first.column} {found}. {len(rows)} of {len(study.cases)} runs, {len(failed)} failed."
-    command = f"dvrk-drake study {study_path} --output RESULTS.csv --plots FOLDER"
+    command = study_path and f"dvrk-drake study {study_path} --output RESULTS.csv --plots FOLDER"
     print_answer(console, answer, command, "yellow" if failed else "green")
     table = make_table(
         f"{study.arm.name}, {len(rows)} runs",

@@ -68,17 +68,19 @@ def make_console() -> Console:
     return console
 
 
-def print_answer(console: Console, answer: str, next_step: str, style: str = "green") -> None:
+def print_answer(console: Console, answer: str, next_step: str | None, style: str = "green") -> None:
     """Prints what a command found and what to do next; details follow below.
 
     Args:
         console: to print to.
         answer: one or two sentences.
-        next_step: usually a command; it is not wrapped, so that it can be copied.
+        next_step: usually a command; it is not wrapped, so that it can be copied. None: nothing is left to do.
         style: of the answer.
     """
     console.print(answer, style=style, markup=False)
-    console.print(f"Next: {next_step}\n", markup=False, soft_wrap=True)
+    if next_step is not None:
+        console.print(f"Next: {next_step}", markup=False, soft_wrap=True)
+    console.print()
 
 
 def print_note(console: Console, text: str) -> None:

@@ -16,12 +16,13 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
 
-def print_tuning(console: Console, tuning: Tuning, *, verbose: bool = False) -> None:
+def print_tuning(console: Console, tuning: Tuning, *, gains_path: str | None = None, verbose: bool = False) -> None:
     """Prints which gains settle most often and then fastest, then how the gains compare.
 
     Args:
         console: to print to.
         tuning: to print.
+        gains_path: file that the gains are written to, for the next command.
         verbose: also print how the gains were found, and the comparison of each joint and pose.
     """
     comparison, name = tuning.comparison, tuning.arm.source
@@ -31,7 +32,9 @@ def print_tuning(console: Console, tuning: Tuning, *, verbose: bool = False) -> 
     print_answer(
         console,
         f"Gains of method {best} are {verdict} {OWN}: settled steps and mean settling time {found}; {OWN}: {own}.",
-        f"dvrk-drake tune --arm {name} --output GAINS.yaml",
+        f"dvrk-drake tune --arm {name} --output GAINS.yaml"
+        if gains_path is None
+        else f"dvrk-drake run --arm {name} --mode hold --gains {gains_path}",
         "green" if verdict == "better than" else "yellow",
     )
     _print_summary(console, comparison)
