@@ -18,7 +18,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 
 from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParameter, reduce_to_base
-from dvrk_drake.dynamics.gravity_regressor import named_lengths
+from dvrk_drake.dynamics.gravity_parameters import named_lengths
 from dvrk_drake.dynamics.inertial_parameters import (
     PARAMETER_NAMES,
     LinkInertia,

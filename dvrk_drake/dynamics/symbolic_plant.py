@@ -12,103 +12,10 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
+from dvrk_drake.dynamics.trigonometric_ring import Polynomial, TrigonometricRing, exact_half
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant, tree_selector
-
-#: Coefficients are 1 or lengths in metres: below this one is a difference of equals.
-ROUNDING = 1e-14
-
-
-def simplify_trigonometry(expression: sympy.Expr, sums: Sequence[tuple[sympy.Expr, sympy.Expr]]) -> sympy.Expr:
-    """Writes a polynomial in sin and cos of angles with the angles of parallel joints added up.
-
-    For a pair (a, b) in `sums`, in that order, products such as sin a cos b + cos a sin b become sin(a + b) where that
-    is shorter; cos^2 is eliminated, so that what is identically zero becomes 0. Coefficients of rounding's size are
-    dropped, so the result equals the expression at every pose to that. sympy's own trigsimp does the same by search and
-    takes seconds.
-    """
-    result = expression.xreplace({x: exact_half(x) for x in expression.atoms(sympy.Float) if float(2 * x).is_integer()})
-    angles = _Angles()
-    names = {function: angles.name(function) for function in result.atoms(sympy.sin, sympy.cos)}
-    result = _without_rounding(sympy.expand(result.xreplace(names)))
-    shortest = angles.without_squared_cosines(result)
-    for a, b in sums:
-        trial = angles.add_up(result, a, b)
-        shorter = angles.without_squared_cosines(trial)
-        if sympy.count_ops(shorter) <= sympy.count_ops(shortest):
-            result, shortest = trial, shorter
-    shortest = _without_rounding(shortest)
-    # What all terms have in common is taken out, e.g. S s4 s5 + S c4 c5 -> S (s4 s5 + c4 c5).
-    return (sympy.factor_terms(shortest) if shortest.is_Add else shortest).xreplace(angles.functions)
-
-
-def exact_half(x: float) -> sympy.Expr:
-    """x as an exact number if it is a multiple of one half."""
-    return sympy.Rational(int(2 * x), 2) if float(2 * x).is_integer() else sympy.Float(x)
-
-
-class _Angles:
-    """Symbols for the sine and cosine of each angle; `functions` maps them back."""
-
-    def __init__(self) -> None:
-        self._symbols: dict[sympy.Expr, tuple[sympy.Symbol, sympy.Symbol]] = {}
-        self.functions: dict[sympy.Symbol, sympy.Expr] = {}
-
-    def name(self, function: sympy.Expr) -> sympy.Symbol:
-        """The symbol of sin(angle) or cos(angle)."""
-        angle = function.args[0]
-        if angle not in self._symbols:
-            s, c = sympy.symbols(f"s{len(self._symbols)} c{len(self._symbols)}")
-            self._symbols[angle] = s, c
-            self.functions |= {s: sympy.sin(angle), c: sympy.cos(angle)}
-        s, c = self._symbols[angle]
-        return s if isinstance(function, sympy.sin) else c
-
-    def add_up(self, e: sympy.Expr, a: sympy.Expr, b: sympy.Expr) -> sympy.Expr:
-        """Puts sin(a + b) and cos(a + b) in for sin a cos b and cos a cos b in every monomial."""
-        (sign_a, angle_a), (sign_b, angle_b), (sign, angle) = map(_sign_and_angle, (a, b, a + b))
-        if angle_a not in self._symbols or angle_b not in self._symbols or angle_a == angle_b:
-            return e
-        (sa, ca), (sb, cb) = self._symbols[angle_a], self._symbols[angle_b]
-        S, C = self.name(sympy.sin(angle)), self.name(sympy.cos(angle))
-        e = _eliminate_product(e, sa, cb, sign_a * (sign * S - sign_b * ca * sb))
-        return _eliminate_product(e, ca, cb, C + sign_a * sign_b * sa * sb)
-
-    def without_squared_cosines(self, e: sympy.Expr) -> sympy.Expr:
-        """Writes 1 - s^2 for every c^2, so that equal polynomials look equal."""
-        for s, c in self._symbols.values():
-            e = _eliminate_product(e, c, c, 1 - s**2)
-        return e
-
-
-def _sign_and_angle(angle: sympy.Expr) -> tuple[int, sympy.Expr]:
-    """Such that sin(angle) = sign sin(result), the way sympy writes it."""
-    function = sympy.sin(angle)
-    return (1, function.args[0]) if isinstance(function, sympy.sin) else (-1, -angle)
-
-
-def _without_rounding(e: sympy.Expr) -> sympy.Expr:
-    """Leaves out the terms with a coefficient that is zero but for rounding, such as -0.4318 + 0.4162 + 0.0156."""
-    return sympy.Add(*(term for term in sympy.Add.make_args(e) if abs(term.as_coeff_Mul()[0]) > ROUNDING))
-
-
-def _eliminate_product(e: sympy.Expr, a: sympy.Symbol, b: sympy.Symbol, replacement: sympy.Expr) -> sympy.Expr:
-    """Replaces the product a b (a**2 if a is b) in every monomial of e, until none is left."""
-    for _ in range(8):
-        changed = sympy.Integer(0)
-        rest = sympy.Integer(0)
-        for term in sympy.Add.make_args(e):
-            powers = term.as_powers_dict()
-            has = powers.get(a, 0) >= 2 if a is b else (powers.get(a, 0) >= 1 and powers.get(b, 0) >= 1)
-            if has:
-                changed += term / (a * b) * replacement
-            else:
-                rest += term
-        if changed == 0:
-            break
-        e = sympy.expand(changed + rest)
-    return e
 
 
 class SymbolicPlant:
@@ -119,7 +26,7 @@ class SymbolicPlant:
         numeric: the same plant in numbers.
         bodies: label ("1".."7", "crank", ...) -> moving body and the frame F its parameters are written in, X_BF.
         q: the n joint positions as sympy symbols q1..qn [rad, m].
-        drake_q: the same as Drake's variables.
+        ring: of polynomials in them.
     """
 
     def __init__(self, arm: Arm, frames: str = "dh") -> None:
@@ -137,27 +44,13 @@ class SymbolicPlant:
         self.bodies = labelled_bodies(self.numeric, frames)
         self._plant = self.numeric.ToSymbolic()
         self._context = self._plant.CreateDefaultContext()
-        self.drake_q = [symbolic.Variable(f"q{i + 1}") for i in range(arm.num_joints)]
+        drake_q = [symbolic.Variable(f"q{i + 1}") for i in range(arm.num_joints)]
         self.q = tuple(sympy.Symbol(f"q{i + 1}", real=True) for i in range(arm.num_joints))
-        self._memo: dict = {}
-        self._ours = {
-            symbolic.to_sympy(symbolic.Expression(v), memo=self._memo): s
-            for v, s in zip(self.drake_q, self.q, strict=True)
-        }
-        self._sums = _parallel_sums(self.numeric, arm, self.q)
+        self._heights: dict[str, list[symbolic.Expression]] = {}
+        self.ring = TrigonometricRing(self.q, _parallel_sums(self.numeric, arm, self.q))
         q_plant = np.empty(self._plant.num_positions(), dtype=object)
-        q_plant[tree_selector(self.numeric, arm)] = _tree_positions(arm, self.drake_q)
+        q_plant[tree_selector(self.numeric, arm)] = _tree_positions(arm, drake_q)
         self._plant.SetPositions(self._context, q_plant)
-
-    def to_sympy(self, expression: symbolic.Expression | float) -> sympy.Expr:
-        """A Drake expression in q as a sympy expression in `self.q`, not simplified."""
-        if isinstance(expression, float):
-            return sympy.Float(expression)
-        return symbolic.to_sympy(expression, memo=self._memo).xreplace(self._ours)
-
-    def simplify(self, expression: sympy.Expr) -> sympy.Expr:
-        """`simplify_trigonometry` with the angles of this arm's parallel joints added up."""
-        return simplify_trigonometry(expression, self._sums)
 
     def frame_poses(self) -> dict[str, sympy.ImmutableDenseMatrix]:
         """X_0F(q), the pose of every link frame in frame 0: label -> 4 x 4 (the paper's II.A and III.B) [m]."""
@@ -167,29 +60,32 @@ class SymbolicPlant:
         poses = {}
         for label, (body, X_BF) in self.bodies.items():
             X_WB = self._plant.EvalBodyPoseInWorld(self._context, self._plant.get_body(body.index())).GetAsMatrix4()
-            X_WB_sympy = sympy.Matrix([[self.to_sympy(entry) for entry in row] for row in X_WB])
-            X_0F = sympy.Matrix(X_0W) * X_WB_sympy * sympy.Matrix(_exact_matrix(X_BF))
-            poses[label] = sympy.ImmutableDenseMatrix(X_0F.applyfunc(self.simplify))
+            X_BF_exact = _exact_matrix(X_BF)
+            X_0B = [[_dot(row, column) for column in X_WB.T] for row in X_0W]
+            poses[label] = sympy.ImmutableDenseMatrix(
+                [[self._simplified(_dot(column, row)) for column in X_BF_exact.T] for row in X_0B]
+            )
         return poses
 
-    def potential_energy(self, labels: Sequence[str]) -> list[list[symbolic.Expression]]:
-        """P per unit of mass and first moments [1, x, y, z in F] of each labelled link, as Drake expressions.
+    def _simplified(self, expression: symbolic.Expression) -> sympy.Expr:
+        return self.ring.to_sympy(self.ring.shortest(self.ring.from_drake(expression)))
+
+    def potential_energy(self, label: str, axis: str) -> Polynomial:
+        """P per unit of a labelled link's mass (`axis` "") or of its first moment along "x", "y" or "z" of F.
 
         P = -m g_W . p_WCcm is linear in m and m c: a unit of mass at the origin of F adds -g_W . p_WFo, a unit of
         first moment along an axis of F adds -g_W . that axis. Summed over the links this is the plant's own
         `CalcPotentialEnergy`, whose expanded form takes half a minute on an arm with a closed linkage.
         """
-        g_W = exact_rotation(self.arm.gravity / np.linalg.norm(self.arm.gravity))
-        energies = []
-        for label in labels:
-            body, X_BF = self.bodies[label]
-            X_WB = self._plant.EvalBodyPoseInWorld(self._context, self._plant.get_body(body.index())).GetAsMatrix4()
-            X = _exact_matrix(X_BF)
-            # Row -g_W' (R_WB, p_WBo), then times X_BF; zeros are left out so that no term of theirs is carried along.
-            up_B = [_dot(-g_W, X_WB[:3, j]) for j in range(4)]
-            up_F = [_dot(X[:, k], up_B) for k in range(4)]
-            energies.append([up_F[3], *up_F[:3]])
-        return energies
+        if label not in self._heights:
+            g_W = exact_rotation(self.arm.gravity / np.linalg.norm(self.arm.gravity))
+            X_WB = self._plant.EvalBodyPoseInWorld(
+                self._context, self._plant.get_body(self.bodies[label][0].index())
+            ).GetAsMatrix4()
+            # Row -g_W' (R_WB, p_WBo); zeros are left out so that no term of theirs is carried along.
+            self._heights[label] = [_dot(-g_W, X_WB[:3, j]) for j in range(4)]
+        column = _exact_matrix(self.bodies[label][1])[:, "xyz".index(axis) if axis else 3]
+        return self.ring.shortest(self.ring.from_drake(_dot(column, self._heights[label])))
 
 
 def _dot(numbers: NDArray[np.float64], expressions: Sequence[symbolic.Expression]) -> symbolic.Expression:

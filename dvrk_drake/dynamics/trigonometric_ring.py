@@ -1,0 +1,186 @@
+"""Polynomials in the sines and cosines of angles: what the poses of a tree of links are made of."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import pydrake.symbolic as symbolic
+import sympy
+
+#: Coefficients are 1 or lengths in metres: below this one is a difference of equals.
+ROUNDING = 1e-14
+#: Monomial -> coefficient. A monomial is the sorted indices of its variables, each as often as its power.
+Polynomial = dict[tuple[int, ...], float]
+_Kind = symbolic.ExpressionKind
+
+
+class TrigonometricRing:
+    """The variables of such polynomials: positions, and the sine and cosine of each angle.
+
+    Attributes:
+        q: the positions as sympy symbols q1..qn [rad, m].
+    """
+
+    def __init__(self, q: Sequence[sympy.Symbol], sums: Sequence[tuple[sympy.Expr, sympy.Expr]]) -> None:
+        """q: the positions; sums: pairs of angles that `shortest` adds up, in this order."""
+        self.q = tuple(q)
+        self._sums = sums
+        self._symbols: list[sympy.Symbol] = []
+        self._functions: dict[sympy.Symbol, sympy.Expr] = {}
+        self._indices: dict[sympy.Expr, int] = {}
+        self._of_drake: dict[str, tuple[float, int]] = {}
+        self._memo: dict = {}
+
+    def from_drake(self, expression: symbolic.Expression) -> Polynomial:
+        """A polynomial in Drake's variables q1..qn and in sines and cosines of their sums."""
+        polynomial: Polynomial = {}
+        for term in _arguments(expression.Expand(), _Kind.Add):
+            coefficient, monomial = 1.0, []
+            for factor in _arguments(term, _Kind.Mul):
+                if isinstance(factor, float):
+                    coefficient *= factor
+                    continue
+                base, power = factor, 1
+                if factor.get_kind() == _Kind.Pow:
+                    base, exponent = factor.Unapply()[1]
+                    power = int(exponent.Evaluate())
+                sign, index = self._variable(base)
+                coefficient *= sign**power
+                monomial += [index] * power
+            _add(polynomial, tuple(sorted(monomial)), coefficient)
+        return _without_rounding(polynomial)
+
+    def derivative(self, polynomial: Polynomial, q: sympy.Symbol) -> Polynomial:
+        """By a position."""
+        result: Polynomial = {}
+        for monomial, coefficient in polynomial.items():
+            for index, power in Counter(monomial).items():
+                rest = list(monomial)
+                rest.remove(index)
+                inner, slope = self._slope(self._functions[self._symbols[index]], q)
+                if slope:
+                    _add(result, tuple(sorted([*rest, *inner])), coefficient * power * slope)
+        return result
+
+    def shortest(self, polynomial: Polynomial) -> Polynomial:
+        """The same with the angles of parallel joints added up.
+
+        For a pair (a, b) of the ring's sums products such as sin a cos b + cos a sin b become sin(a + b) where that is
+        shorter; cos^2 is eliminated, so that what is identically zero becomes 0. Coefficients of rounding's size are
+        dropped, so the result equals the polynomial at every pose to that. sympy's own trigsimp does the same by search
+        and takes seconds.
+        """
+        result, shortest = polynomial, self._without_squared_cosines(polynomial)
+        for a, b in self._sums:
+            trial = self._add_up(result, a, b)
+            shorter = self._without_squared_cosines(trial)
+            if _operations(shorter) <= _operations(shortest):
+                result, shortest = trial, shorter
+        return _without_rounding(shortest)
+
+    def to_sympy(self, polynomial: Polynomial) -> sympy.Expr:
+        """The expression in `q`; what all terms have in common is taken out, e.g. S s4 s5 + S c4 c5."""
+        terms = [
+            sympy.Mul(exact_half(coefficient), *(self._symbols[index] ** power for index, power in Counter(m).items()))
+            for m, coefficient in polynomial.items()
+        ]
+        expression = sympy.Add(*terms)
+        return (sympy.factor_terms(expression) if expression.is_Add else expression).xreplace(self._functions)
+
+    def _variable(self, expression: symbolic.Expression) -> tuple[float, int]:
+        """Sign and variable that equal q, sin(angle) or cos(angle)."""
+        key = expression.to_string()
+        if key not in self._of_drake:
+            ours = symbolic.to_sympy(expression, memo=self._memo)
+            ours = ours.xreplace({s: self.q[int(s.name[1:]) - 1] for s in ours.free_symbols})
+            ours = ours.xreplace({x: exact_half(float(x)) for x in ours.atoms(sympy.Float)})
+            sign = -1.0 if ours.could_extract_minus_sign() else 1.0
+            self._of_drake[key] = sign, self._index(int(sign) * ours)
+        return self._of_drake[key]
+
+    def _index(self, function: sympy.Expr) -> int:
+        if function not in self._indices:
+            self._indices[function] = len(self._symbols)
+            self._symbols.append(sympy.Symbol(f"x{len(self._symbols)}"))
+            self._functions[self._symbols[-1]] = function
+        return self._indices[function]
+
+    def _slope(self, function: sympy.Expr, q: sympy.Symbol) -> tuple[list[int], float]:
+        """Variables and a number whose product is the derivative of a variable."""
+        if not function.args:
+            return [], float(function == q)
+        slope = float(function.args[0].coeff(q))
+        if isinstance(function, sympy.sin):
+            return [self._index(sympy.cos(function.args[0]))], slope
+        return [self._index(sympy.sin(function.args[0]))], -slope
+
+    def _add_up(self, p: Polynomial, a: sympy.Expr, b: sympy.Expr) -> Polynomial:
+        """Puts sin(a + b) and cos(a + b) in for sin a cos b and cos a cos b in every monomial."""
+        (sign_a, sa, ca), (sign_b, sb, cb), (sign, S, C) = (self._sine_and_cosine(angle) for angle in (a, b, a + b))
+        if sa == sb:
+            return p
+        p = _eliminate_product(p, (sa, cb), {(S,): sign_a * sign, (ca, sb): -sign_a * sign_b})
+        return _eliminate_product(p, (ca, cb), {(C,): 1.0, (sa, sb): sign_a * sign_b})
+
+    def _sine_and_cosine(self, angle: sympy.Expr) -> tuple[float, int, int]:
+        """(sign, s, c) with sin(angle) = sign s, the way sympy writes it, and cos(angle) = c."""
+        sine = sympy.sin(angle)
+        sign = 1 if isinstance(sine, sympy.sin) else -1
+        return float(sign), self._index(sign * sine), self._index(sympy.cos(angle))
+
+    def _without_squared_cosines(self, p: Polynomial) -> Polynomial:
+        """Writes 1 - s^2 for every c^2, so that equal polynomials look equal."""
+        for c in {index for monomial in p for index in monomial}:
+            function = self._functions[self._symbols[c]]
+            if isinstance(function, sympy.cos):
+                s = self._index(sympy.sin(function.args[0]))
+                p = _eliminate_product(p, (c, c), {(): 1.0, (s, s): -1.0})
+        return p
+
+
+def exact_half(x: float) -> sympy.Expr:
+    """x as an exact number if it is a multiple of one half."""
+    return sympy.Rational(int(2 * x), 2) if float(2 * x).is_integer() else sympy.Float(x)
+
+
+def _arguments(expression: symbolic.Expression | float, kind: symbolic.ExpressionKind) -> list:
+    """The summands of a sum or the factors of a product, constants as float; of anything else itself alone."""
+    if isinstance(expression, float) or expression.get_kind() not in (kind, _Kind.Constant):
+        return [expression]
+    return list(expression.Unapply()[1])
+
+
+def _add(polynomial: Polynomial, monomial: tuple[int, ...], coefficient: float) -> None:
+    polynomial[monomial] = polynomial.get(monomial, 0.0) + coefficient
+
+
+def _without_rounding(p: Polynomial) -> Polynomial:
+    """Leaves out the terms with a coefficient that is zero but for rounding, such as -0.4318 + 0.4162 + 0.0156."""
+    return {monomial: coefficient for monomial, coefficient in p.items() if abs(coefficient) > ROUNDING}
+
+
+def _eliminate_product(p: Polynomial, product: tuple[int, int], replacement: Polynomial) -> Polynomial:
+    """Replaces the product of two variables, or the square of one, in every monomial, until none is left."""
+    a, b = product
+    while True:
+        having = [m for m in p if (m.count(a) >= 2 if a == b else a in m and b in m)]
+        if not having:
+            return p
+        p = dict(p)
+        for monomial in having:
+            coefficient, rest = p.pop(monomial), list(monomial)
+            rest.remove(a)
+            rest.remove(b)
+            for by, factor in replacement.items():
+                _add(p, tuple(sorted([*rest, *by])), coefficient * factor)
+        p = {monomial: coefficient for monomial, coefficient in p.items() if coefficient}
+
+
+def _operations(p: Polynomial) -> int:
+    """Number of additions, multiplications and powers; a sum of negative terms needs one more sign."""
+    count = max(len(p) - 1, 0) + bool(p and all(coefficient < 0 for coefficient in p.values()))
+    for monomial, coefficient in p.items():
+        powers = Counter(monomial).values()
+        count += max(len(powers) + (abs(coefficient) != 1.0) - 1, 0) + sum(power > 1 for power in powers)
+    return count
