@@ -91,8 +91,8 @@ def reduce_to_base(
             columns.append(column)
             basis = np.column_stack([basis, residual / norm])
     columns.sort()
-    solution = np.linalg.lstsq(regressor[:, columns], regressor, rcond=None)[0]
-    combination = _snap(np.asarray(solution, dtype=np.float64), lengths)
+    in_basis = basis.T @ regressor
+    combination = _snap(np.asarray(np.linalg.solve(in_basis[:, columns], in_basis)), lengths)
     names = tuple(_readable(row, parameters, lengths) for row in combination)
     units = tuple(parameters[column].unit for column in columns)
     return BaseParameters(tuple(columns), combination, names, units)

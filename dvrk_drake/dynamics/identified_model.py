@@ -24,7 +24,7 @@ from dvrk_drake.dynamics.dynamic_section import (
     RotorEstimate,
     SignalSettings,
 )
-from dvrk_drake.dynamics.gravity_regressor import derive_gravity
+from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm, load_arm
@@ -150,7 +150,7 @@ class IdentifiedModel(_Identified):
 
     Attributes:
         arm: the arm, mounted as it was when its base parameters were identified.
-        base_parameters: in the order of `derive_gravity(arm).base.names`. Of a model identified from a motion, those of
+        base_parameters: in the order of `gravity_parameters(arm).base`. Of a model identified from a motion, those of
             the links in `dynamics`.
         effects: of position alone, of a model identified from poses; a model with `dynamics` has all effects there.
         joints: how each joint was fitted.
@@ -183,7 +183,7 @@ class IdentifiedModel(_Identified):
         """
         if dynamics and effects:
             raise ModelError("a model with dynamics has all effects of the arm; give either effects or dynamics")
-        gravity = derive_gravity(arm)
+        gravity = gravity_parameters(arm)
         return cls(
             arm=arm,
             base_parameters=[
@@ -252,7 +252,7 @@ class IdentifiedModel(_Identified):
         """Raises ModelError unless the parameters fit the arm."""
         if fault := schema_fault(ModelFile, asdict(self._file(self.arm.source)), "a model"):
             raise ModelError(fault)
-        names = derive_gravity(self.arm).base.names
+        names = gravity_parameters(self.arm).base.names
         if tuple(p.name for p in self.base_parameters) != names:
             raise ModelError(f"base parameters must be, in this order: {'; '.join(names)}")
         if tuple(joint.name for joint in self.joints) != self.arm.joint_names:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from functools import reduce
+from operator import and_
 
 import pydrake.symbolic as symbolic
 import sympy
@@ -81,12 +83,15 @@ class TrigonometricRing:
 
     def to_sympy(self, polynomial: Polynomial) -> sympy.Expr:
         """The expression in `q`; what all terms have in common is taken out, e.g. S s4 s5 + S c4 c5."""
+        common = reduce(and_, map(Counter, polynomial)) if len(polynomial) > 1 else Counter()
+        sign = -1 if common and all(coefficient < 0 for coefficient in polynomial.values()) else 1
         terms = [
-            sympy.Mul(exact_half(coefficient), *(self._symbols[index] ** power for index, power in Counter(m).items()))
-            for m, coefficient in polynomial.items()
+            exact_half(sign * coefficient) * self._product(Counter(m) - common) for m, coefficient in polynomial.items()
         ]
-        expression = sympy.Add(*terms)
-        return (sympy.factor_terms(expression) if expression.is_Add else expression).xreplace(self._functions)
+        return (sign * self._product(common) * sympy.Add(*terms)).xreplace(self._functions)
+
+    def _product(self, powers: Counter[int]) -> sympy.Expr:
+        return sympy.Mul(*(self._symbols[index] ** power for index, power in powers.items()))
 
     def _variable(self, expression: symbolic.Expression) -> tuple[float, int]:
         """Sign and variable that equal q, sin(angle) or cos(angle)."""

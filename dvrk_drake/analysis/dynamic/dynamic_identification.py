@@ -209,6 +209,5 @@ def _model(recording: Recording, arm: Arm, section: DynamicSection, covariance: 
         ),
         dynamics=section,
     )
-    regressor = DynamicRegressor(as_mounted)
-    model.base_parameters = base_parameter_estimates(as_mounted, section, regressor, covariance)
+    model.base_parameters = base_parameter_estimates(as_mounted, section, covariance)
     return model

@@ -10,11 +10,10 @@ from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 from rich.console import Console
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.dynamic.estimates import base_parameter_map
 from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
-from dvrk_drake.dynamics.gravity_regressor import derive_gravity
+from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
+from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models import plant
@@ -63,7 +62,7 @@ def test_cross_validation_promises_no_more_than_the_noise_allows(case):
 def test_true_base_parameters_and_rotors_lie_in_their_intervals(case):
     _, truth, _, result = case
     mounted = result.model.arm
-    B = base_parameter_map(derive_gravity(mounted), DynamicRegressor(mounted))
+    B = gravity_parameters(mounted).combination_of([link.link for link in truth.regressor.links])
     beta = B @ truth.parameters[: B.shape[1]]
     z = [(p.value - b) / p.standard_error for p, b in zip(result.model.base_parameters, beta, strict=True)]
     rotors = zip(result.model.dynamics.rotors, truth.section.rotors, strict=True)
