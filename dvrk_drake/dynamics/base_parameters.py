@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 
@@ -58,6 +59,23 @@ class BaseParameters:
     combination: NDArray[np.float64]
     names: tuple[str, ...]
     units: tuple[str, ...]
+
+
+def independent_columns(
+    regressor: NDArray[np.float64], tolerance: float = 1e-9
+) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
+    """Independent columns of a regressor (rows, p), and B (b, p) with regressor = regressor[:, columns] B.
+
+    Args:
+        regressor: stacked over random states; rows must be well over p.
+        tolerance: relative size below which a column counts as dependent.
+    """
+    R, pivots = scipy.linalg.qr(regressor, mode="r", pivoting=True)
+    rank = int(np.sum(np.abs(np.diag(R)) > tolerance * abs(R[0, 0])))
+    order = np.argsort(pivots[:rank])
+    B = np.empty((rank, regressor.shape[1]))
+    B[:, pivots] = np.linalg.solve(R[:rank, :rank], R[:rank])[order]
+    return pivots[:rank][order], np.where(np.abs(B) > tolerance, B, 0.0)
 
 
 def reduce_to_base(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, named_effects
-from dvrk_drake.analysis.dynamic.normal_equations import solve, squared_errors
+from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalEquations
 from dvrk_drake.analysis.signals.low_pass import low_pass, resample
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of
@@ -172,27 +172,26 @@ class ChannelFit:
         extra = 0 if column is None else 1
         precision, mean = np.append(self._precision, np.ones(extra)), np.append(self._mean, np.zeros(extra))
         non_negative = np.append(self._non_negative, np.zeros(extra, dtype=bool))
-        products = []
-        for i in self.used:
-            left = tau[:, [i]] - self._nominal[:, [i]]
-            full = np.hstack([self._columns[i], *([] if column is None else [column[:, [i]]]), left])
-            products.append(full.T @ full)
-        # `solve` takes priors about zero: the means are one more measurement of all unknowns.
-        prior = np.sqrt(precision)[:, None] * np.column_stack([np.eye(len(mean)), mean])
-        products.append(prior.T @ prior)
-        stacked = np.array(products)
+        columns, size = [self._columns[i] for i in self.used], len(mean)
+        if column is not None:
+            columns = [np.hstack([X, column[:, [i]]]) for i, X in zip(self.used, columns, strict=True)]
+        left = (tau - self._nominal)[:, self.used]
+        total = NormalEquations.of(((np.arange(size), X) for X in columns), size, left).total
+        # The priors' means are one more measurement of all unknowns.
+        prior = np.zeros((size + 1, size + 1))
+        prior[:-1, -1] = prior[-1, :-1] = precision * mean
         efforts = np.sum(tau[:, self.used] ** 2, axis=0)
         weights = self._independent / (0.1**2 * efforts)
         for _ in range(4):
-            x = solve(stacked, np.append(weights, 1.0), np.full(len(mean), 1e-9), non_negative)
-            errors = np.maximum(squared_errors(stacked[:-1], x), LEAST_ERROR**2 * efforts)
+            x = NonNegativeFit(total.weighted(weights) + prior, precision, non_negative, np.arange(size)).solve()
+            errors = np.maximum(total.squared_errors(x), LEAST_ERROR**2 * efforts)
             weights = self._independent / errors
         at_rest = tau[:, self.resting]
         constants = np.sum((at_rest - np.mean(at_rest, axis=0)) ** 2, axis=0)
         errors = np.append(errors, np.maximum(constants, LEAST_ERROR**2 * np.sum(at_rest**2, axis=0)))
         likelihood = -0.5 * self._independent * float(np.sum(np.log(errors)))
         likelihood -= 0.5 * float(np.sum(precision * (x - mean) ** 2))
-        return likelihood, x, np.tensordot(weights, stacked[:-1, :-1, :-1], axes=(0, 0)) + np.diag(precision)
+        return likelihood, x, total.weighted(weights)[:-1, :-1] + np.diag(precision)
 
     def _offset_column(self, channel: int) -> NDArray[np.float64]:
         """(r, n) change of the fitted efforts per unit by which a position channel is too large."""

@@ -17,6 +17,7 @@ from dvrk_drake.dynamics.actuator_effects import (
     slides,
     spring_over,
 )
+from dvrk_drake.dynamics.base_parameters import independent_columns
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import ArmError
@@ -33,18 +34,21 @@ NAMED_EFFECTS = {"spring": 0.0, "cable 1": 1.0, "cable 2": 2.0, ASYMMETRIC: 0.0}
 
 @dataclass(frozen=True, eq=False)
 class DynamicColumns:
-    """tau ~ rigid phi + effects c, at r rows behind the filter, actuator by actuator.
+    """tau ~ rigid (base phi) + effects c, at r rows behind the filter, actuator by actuator.
 
     Attributes:
         tau: (r, n) measured efforts of the actuators.
-        rigid: (r, n, p) of the rigid bodies' parameters, links first, then one rotor an actuator.
-        tilts: (2, r, n, p) derivative of `rigid` by the x and y component of gravity [s^2/m].
+        base: (b, p) base parameters of the rigid bodies, whatever gravity's direction, from all p of them: links first,
+            then one rotor an actuator.
+        rigid: (r, n, b) of the base parameters.
+        tilts: (2, r, n, b) derivative of `rigid` by the x and y component of gravity [s^2/m].
         effects: the candidate effects, in the order of the columns.
         shapes: (r, e) of each effect along its coordinate, one column a block of actuators.
         rows: (e, n) coordinate of each effect: its column of actuator i is shapes[i] * rows[:, i].
     """
 
     tau: NDArray[np.float64]
+    base: NDArray[np.float64]
     rigid: NDArray[np.float64]
     tilts: NDArray[np.float64]
     effects: tuple[ActuatorEffect, ...]
@@ -136,29 +140,36 @@ def dynamic_columns(
     """
     arm, n = grid.arm, grid.arm.num_joints
     p = len(regressor.values) - len(regressor.rotors) + n
-    rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd)[..., :p])
-    tilts = []
-    if arm.identification.base_may_tilt:
-        rest = np.zeros_like(grid.q)
-        for axis in np.eye(3)[:2]:
-            # Efforts are linear in gravity: those at rest under a gravity of one are the derivative.
-            lying = regressor.with_gravity(axis.tolist())
-            tilts.append(_filtered(grid, lying.regressor(grid.q, rest, rest)[..., :p]))
+    # Efforts are linear in gravity: those at rest under a gravity of one are the derivative.
+    lying = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]) if arm.identification.base_may_tilt]
+    independent, base = independent_columns(
+        np.concatenate([_at_random_states(regressor), *map(_at_random_states, lying)])[:, :p]
+    )
+    rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd), independent)
+    rest = np.zeros_like(grid.q)
+    tilts = [_filtered(grid, r.regressor(grid.q, rest, rest), independent) for r in lying]
     on_grid = np.column_stack(list(effect_shapes(regressor, effects, grid.q, grid.v)))
     rows = np.array([arm.effect_coordinates[effect.coordinate] for effect in effects])
     by_delay = {d: grid.behind_filter(grid.at_rows(on_grid, i)) for i, d in enumerate(grid.settings.effort_delay)}
     shapes = tuple(by_delay[d] for d in grid.settings.effort_delay)
     return DynamicColumns(
-        grid.behind_filter(tau), rigid, np.array(tilts).reshape(-1, *rigid.shape), tuple(effects), shapes, rows
+        grid.behind_filter(tau), base, rigid, np.array(tilts).reshape(-1, *rigid.shape), tuple(effects), shapes, rows
     )
 
 
-def _filtered(grid: MotionGrid, Y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(r, n, p) of the actuators behind the filter, from a regressor (m, n, p) of the joints on the grid."""
+def _at_random_states(regressor: DynamicRegressor) -> NDArray[np.float64]:
+    """(rows, p), many more than columns."""
+    generator = np.random.default_rng(0)
+    q, v, vd = generator.normal(0, 2, (3, len(regressor.values) // 2, regressor.arm.num_joints))
+    return regressor.regressor(q, v, vd).reshape(-1, len(regressor.values))
+
+
+def _filtered(grid: MotionGrid, Y: NDArray[np.float64], independent: NDArray[np.int_]) -> NDArray[np.float64]:
+    """(r, n, b) independent columns of the actuators behind the filter, from a regressor (m, n, p) of the joints."""
     J_inverse = grid.arm.transmission.inverse.matrix
-    out = np.zeros((len(range(*grid.inner.indices(len(grid.row_times)))), *Y.shape[1:]))
+    out = np.zeros((len(range(*grid.inner.indices(len(grid.row_times)))), Y.shape[1], len(independent)))
     for i in range(Y.shape[1]):
-        of_actuator = sum(J_inverse[j, i] * Y[:, j] for j in np.flatnonzero(J_inverse[:, i]))
+        of_actuator = sum(J_inverse[j, i] * Y[:, j, independent] for j in np.flatnonzero(J_inverse[:, i]))
         moved = np.flatnonzero(np.any(of_actuator, axis=0))
         out[:, i, moved] = grid.behind_filter(grid.at_rows(of_actuator[:, moved], i))
     return out

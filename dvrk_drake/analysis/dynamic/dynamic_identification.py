@@ -146,7 +146,7 @@ def residuals(problem: DynamicProblem, chosen: NDArray[np.int_], fit: Consistent
     drive = np.column_stack(
         [columns.shapes[i][:, chosen] @ (columns.rows[chosen, i] * fit.x[p:]) for i in range(columns.tau.shape[1])]
     )
-    return columns.tau - problem.rigid @ fit.x[:p] - drive
+    return columns.tau - problem.rigid @ (columns.base @ fit.x[:p]) - drive
 
 
 def _section(

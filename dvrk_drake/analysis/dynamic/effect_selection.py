@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, squared_errors
+from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
 from dvrk_drake.analysis.dynamic.problem import ConsistentProgram, DynamicProblem
 from dvrk_drake.analysis.dynamic.stepwise_selection import EffectSelection
 
@@ -55,7 +55,7 @@ def choose_effects(problem: DynamicProblem, progress: Callable[[float], object] 
     # The tilt times the links' parameters is no linear unknown.
     for turn in range(TURNS if tilts else 0):
         progress(0.5 * turn / TURNS)
-        x = problem.selection(phi).fit(start)
+        x = problem.selection(phi, folds=False).fit(start)
         phi = problem.rigid_parameters(x)
         problem = replace(problem, tilt=x[-tilts:])
     selection = problem.selection(phi)
@@ -87,22 +87,21 @@ def left_out_errors(
         parts.append(_part(choice, first))
         progress(0.3 * len(parts) / len(firsts))
     used = np.unique(np.concatenate([chosen for chosen, _, _ in parts]))
-    leaning = ((problem.columns.tilts[:, :, i] @ phi).T for i in range(len(problem.efforts)))
-    stacked = (np.hstack([problem.chosen_columns(i, used), X]) for i, X in enumerate(leaning))
-    equations = NormalEquations.of(stacked, problem.columns.tau, problem.fold, problem.edge)
+    leaning = problem.columns.tilts @ (problem.columns.base @ phi)
+    columns = (problem.chosen_columns(i, used, leaning) for i in range(len(problem.efforts)))
+    size, b = problem.rigid.shape[2] + len(used) + tilts, problem.rigid.shape[2]
+    equations = NormalEquations.of(columns, size, problem.columns.tau, problem.fold, problem.edge)
     errors = np.zeros(len(problem.efforts))
     for first, (chosen, weights, tilt) in zip(firsts, parts, strict=True):
         progress(0.4 + 0.6 * first / equations.folds)
-        kept = np.append(np.arange(problem.num_rigid), problem.num_rigid + np.searchsorted(used, chosen))
         # What gravity does that leans as these phases say, is taken from the efforts.
-        change = tilt - problem.tilt[:tilts]
-        T = np.zeros((equations.products.shape[-1], len(kept) + 1))
-        T[kept, np.arange(len(kept))] = 1.0
-        T[-1 - tilts :, -1] = np.append(-change, 1.0)
-        learnt = T.T @ equations.without_fold(first, TOGETHER) @ T
-        predicted = T.T @ equations.of_fold(first, TOGETHER) @ T
-        y = ConsistentProgram(problem, chosen).solve(learnt, weights)
-        errors += squared_errors(predicted, y)
+        T = np.zeros((size + 1, problem.num_rigid + len(chosen) + 1))
+        T[:b, : problem.num_rigid] = problem.columns.base
+        T[b + np.searchsorted(used, chosen), problem.num_rigid + np.arange(len(chosen))] = 1.0
+        T[-1 - tilts :, -1] = np.append(problem.tilt[:tilts] - tilt, 1.0)
+        learnt = equations.without_fold(first, TOGETHER).weighted(weights)
+        y = ConsistentProgram(problem, chosen).solve(T.T @ learnt @ T)
+        errors += equations.of_fold(first, TOGETHER).squares(T @ np.append(-y, 1.0))
     return errors
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import matmul_toeplitz
 from scipy.signal import correlate
 
+from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.dynamics.dynamic_section import (
@@ -108,32 +109,34 @@ def parameter_covariance(
     step = max(1, int(rate / (2 * cut_off * _OVERSAMPLING)))
     rows = slice(None, None, step)
     A = _inverse(fit.information + fit.prior_precision)
-    middle = fit.prior_precision.copy()
-    unseen = _unseen_residuals(problem, fit, residuals)
-    for i, weight in enumerate(fit.weights):
+    to_base = problem.to_base(len(fit.chosen))
+    middle = np.zeros((len(to_base),) * 2)
+    columns = [problem.chosen_columns(i, fit.chosen) for i in range(len(fit.weights))]
+    unseen = _unseen_residuals(problem, fit, residuals, columns, to_base)
+    for i, (weight, (own, X)) in enumerate(zip(fit.weights, columns, strict=True)):
         covariance = error_covariance(residuals[rows, i], unseen[rows, i], rate / step, period)
-        X = problem.chosen_columns(i, fit.chosen)[rows]
-        moved = np.flatnonzero(np.any(X, axis=0))
-        X = X[:, moved]
-        middle[np.ix_(moved, moved)] += (weight * step) ** 2 * (X.T @ matmul_toeplitz(covariance, X))
-    return np.asarray(A @ middle @ A, dtype=np.float64)
+        middle[own[:, None], own] += (weight * step) ** 2 * (X[rows].T @ matmul_toeplitz(covariance, X[rows]))
+    return np.asarray(A @ (to_base.T @ middle @ to_base + fit.prior_precision) @ A, dtype=np.float64)
 
 
 def _unseen_residuals(
-    problem: DynamicProblem, fit: ConsistentFit, residuals: NDArray[np.float64]
+    problem: DynamicProblem,
+    fit: ConsistentFit,
+    residuals: NDArray[np.float64],
+    columns: Sequence[OwnColumns],
+    to_base: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """(r, n) what is left of each fold by the fit to the others: one step of Newton's, exact but for inequalities."""
     unseen = residuals.copy()
     free = np.flatnonzero(fit.x > fit.lower)
-    columns = [problem.chosen_columns(i, fit.chosen)[:, free] for i in range(residuals.shape[1])]
+    to_free = to_base[:, free]
     known = (fit.information + fit.prior_precision)[np.ix_(free, free)]
     for fold in range(int(problem.fold.max()) + 1):
-        rows = problem.fold == fold
-        X, e = [x[rows] for x in columns], residuals[rows].T
-        own = sum(weight * x.T @ x for weight, x in zip(fit.weights, X, strict=True))
-        slope = sum(weight * x.T @ left for weight, x, left in zip(fit.weights, X, e, strict=True))
-        step = _inverse(known - own) @ slope
-        unseen[rows] += np.column_stack([x @ step for x in X])
+        rows = np.flatnonzero(problem.fold == fold)
+        sums = NormalEquations.of(((own, X[rows]) for own, X in columns), len(to_base), residuals[rows]).total
+        own_sums = sums.weighted(fit.weights)
+        step = to_free @ (_inverse(known - to_free.T @ own_sums[:-1, :-1] @ to_free) @ (to_free.T @ own_sums[:-1, -1]))
+        unseen[rows] += np.column_stack([X[rows] @ step[own] for own, X in columns])
     return unseen
 
 

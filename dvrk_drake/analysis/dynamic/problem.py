@@ -6,10 +6,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DynamicColumns
-from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, squared_errors
+from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
 from dvrk_drake.analysis.dynamic.stepwise_selection import EffectSelection
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -63,7 +64,7 @@ class DynamicProblem:
     @property
     def num_rigid(self) -> int:
         """Number of the rigid body's parameters, one rotor an actuator included."""
-        return self.columns.rigid.shape[2]
+        return self.columns.base.shape[1]
 
     @property
     def num_effects(self) -> int:
@@ -82,7 +83,7 @@ class DynamicProblem:
 
     @cached_property
     def rigid(self) -> NDArray[np.float64]:
-        """(r, n, p) columns of the rigid body, tilted."""
+        """(r, n, b) columns of the rigid body's base parameters, tilted."""
         tilts = self.columns.tilts
         return self.columns.rigid + np.tensordot(self.tilt[: len(tilts)], tilts, axes=(0, 0))
 
@@ -127,43 +128,62 @@ class DynamicProblem:
         """Number of rows."""
         return len(self.columns.tau)
 
-    def selection(self, phi: NDArray[np.float64] | None = None) -> EffectSelection:
+    def selection(self, phi: NDArray[np.float64] | None = None, *, folds: bool = True) -> EffectSelection:
         """The choice of effects, with the rigid body reduced to what the recording can tell.
 
         Args:
             phi: (p,) the parameters about which the tilt is linearised: if the arm's base may tilt, it is two unknowns
                 more, which follow the effects'. By default the tilt stays as it is.
+            folds: False: for fits to the whole motion only.
         """
-        columns = (self._reduced_columns(i, phi) for i in range(len(self.efforts)))
-        left = self.columns.tau - self.rigid @ self.prior
-        tilts = len(self.columns.tilts) if phi is not None else 0
-        if phi is not None and tilts:
-            left += np.tensordot(self.tilt, self.columns.tilts @ phi, axes=(0, 0))
-        informative = self._informative.shape[1]
+        base, tilts = self.columns.base, len(self.columns.tilts) if phi is not None else 0
+        left = self.columns.tau - self.rigid @ (base @ self.prior)
+        leaning = self.columns.tilts[:tilts] @ (base @ (self.prior if phi is None else phi))
+        left += np.tensordot(self.tilt[:tilts], leaning, axes=(0, 0))
+        directions = base @ (self.deviation[:, None] * self._informative)
+        informative = directions.shape[1]
+        columns = (
+            self._own_columns(i, self.rigid[:, i] @ directions, np.arange(self.num_effects), leaning)
+            for i in range(len(self.efforts))
+        )
+        fold, edge = (self.fold, self.edge) if folds else (np.zeros_like(self.fold), None)
         precision = [np.ones(informative), self.effect_precision, np.full(tilts, 1 / (9.81 * TILT_DEVIATION) ** 2)]
         non_negative = [effect.dissipative for effect in self.columns.effects]
-        folds = int(self.fold.max()) + 1
         return EffectSelection(
-            equations=NormalEquations.of(columns, left, self.fold, self.edge),
-            efforts=np.array([np.sum(self.columns.tau[self.fold == f] ** 2, axis=0) for f in range(folds)]),
-            rows=np.bincount(self.fold),
+            equations=NormalEquations.of(columns, informative + self.num_effects + tilts, left, fold, edge),
+            efforts=np.array([np.sum(self.columns.tau[fold == f] ** 2, axis=0) for f in range(fold.max() + 1)]),
+            rows=np.bincount(fold),
             num_rigid=informative,
             precision=np.concatenate(precision),
             non_negative=np.array([False] * informative + non_negative + [False] * tilts),
             independent=self.independent / self.num_rows,
         )
 
-    def _reduced_columns(self, i: int, phi: NDArray[np.float64] | None) -> NDArray[np.float64]:
-        """(r, k) columns of one actuator: informative directions, effects, and the tilts about phi."""
-        columns = self.columns
-        blocks = [(self.rigid[:, i] * self.deviation) @ self._informative, columns.shapes[i] * columns.rows[:, i]]
-        if phi is not None:
-            blocks.append((columns.tilts[:, :, i] @ phi).T)
-        return np.hstack(blocks)
+    def _own_columns(
+        self, i: int, rigid: NDArray[np.float64], chosen: NDArray[np.int_], leaning: NDArray[np.float64]
+    ) -> OwnColumns:
+        """Columns of one actuator: of the rigid body (r, k), of the chosen effects on it, and by tilts (2, r, n)."""
+        moved = np.flatnonzero(np.any(rigid, axis=0))
+        acting = np.flatnonzero(self.columns.rows[chosen, i])
+        effects = self.columns.shapes[i][:, chosen[acting]] * self.columns.rows[chosen[acting], i]
+        first = rigid.shape[1]
+        own = np.concatenate([moved, first + acting, first + len(chosen) + np.arange(len(leaning))])
+        return own, np.column_stack([rigid[:, moved], effects, *(x[:, i] for x in leaning)])
 
-    def chosen_columns(self, i: int, chosen: NDArray[np.int_]) -> NDArray[np.float64]:
-        """(r, p + e) columns of one actuator: the rigid body's parameters, then the chosen effects."""
-        return np.hstack([self.rigid[:, i], self.columns.shapes[i][:, chosen] * self.columns.rows[chosen, i]])
+    def chosen_columns(
+        self, i: int, chosen: NDArray[np.int_], leaning: NDArray[np.float64] | None = None
+    ) -> OwnColumns:
+        """Columns of one actuator among b + e: of the rigid body's base parameters, then of the chosen effects.
+
+        With `leaning` (t, r, n), what the tilts change per unit, these are t more.
+        """
+        return self._own_columns(
+            i, self.rigid[:, i], chosen, np.empty((0, *self.columns.tau.shape)) if leaning is None else leaning
+        )
+
+    def to_base(self, num_effects: int) -> NDArray[np.float64]:
+        """(b + e, p + e) base parameters and effects from all parameters and the effects."""
+        return scipy.linalg.block_diag(self.columns.base, np.eye(num_effects))
 
     def rigid_parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """(p,) phi of a selection's unknowns x (k,)."""
@@ -190,12 +210,10 @@ class DynamicProblem:
     @cached_property
     def _informative(self) -> NDArray[np.float64]:
         """(p, k) orthonormal directions of the scaled rigid body's parameters that the recording says something of."""
-        H = np.zeros((self.num_rigid, self.num_rigid))
         weights = self.independent / self.num_rows / (self.efforts / self.num_rows * _FIRST_ERROR**2)
-        for i, weight in enumerate(weights):
-            X = self.rigid[:, i] * self.deviation
-            H += weight * X.T @ X
-        values, vectors = np.linalg.eigh(H)
+        H = sum(weight * self.rigid[:, i].T @ self.rigid[:, i] for i, weight in enumerate(weights))
+        scaled = self.columns.base * self.deviation
+        values, vectors = np.linalg.eigh(scaled.T @ H @ scaled)
         return np.asarray(vectors[:, values > _NEGLIGIBLE])
 
 
@@ -216,13 +234,14 @@ class ConsistentFit:
         self.chosen, self.weights = chosen, weights
         program = ConsistentProgram(problem, chosen)
         self.lower = program.lower
-        full = [
-            np.column_stack([problem.chosen_columns(i, chosen), tau]) for i, tau in enumerate(problem.columns.tau.T)
-        ]
-        total = np.array([X.T @ X for X in full])
-        self.x = program.solve(total, weights)
-        self.errors = squared_errors(total, self.x)
-        self.information = np.tensordot(weights, total[:, :-1, :-1], axes=(0, 0))
+        tau, effects = problem.columns.tau, len(chosen)
+        columns = (problem.chosen_columns(i, chosen) for i in range(tau.shape[1]))
+        total = NormalEquations.of(columns, problem.rigid.shape[2] + effects, tau).total
+        to_base = problem.to_base(effects + 1)
+        sums = to_base.T @ total.weighted(weights) @ to_base
+        self.x = program.solve(sums)
+        self.errors = total.squared_errors(to_base[:-1, :-1] @ self.x)
+        self.information = sums[:-1, :-1]
         self.prior_precision = np.diag(program.precision) + log_det_curvature(self.x, problem.regressor.links)
 
 
@@ -244,8 +263,8 @@ class ConsistentProgram:
         self.precision = np.concatenate([problem.deviation**-2, problem.effect_precision[chosen]])
         self._mean = np.concatenate([problem.prior, np.zeros(len(chosen))])
 
-    def solve(self, products: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """x (p + e,) from (n, p + e + 1, p + e + 1) sums of squares, the measured effort last.
+    def solve(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
+        """x (p + e,) from (p + e + 1, p + e + 1) weighted sums of squares, the measured effort last.
 
         The sums of squares are compressed to a triangle by Cholesky's decomposition in units of the prior's deviation,
         where no eigenvalue is below 1: as exact as the QR decomposition of the rows, and a hundred times shorter.
@@ -254,7 +273,6 @@ class ConsistentProgram:
             IdentificationError: the solver did not converge.
         """
         scale = 1 / np.sqrt(self.precision)
-        sums = np.tensordot(weights, products, axes=(0, 0))
         H = sums[:-1, :-1] + np.diag(self.precision)
         R = np.linalg.cholesky(H * np.outer(scale, scale)).T
         b = np.linalg.solve(R.T, (sums[:-1, -1] + self.precision * self._mean) * scale)

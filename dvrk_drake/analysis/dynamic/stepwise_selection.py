@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, solve, squared_errors
+from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalEquations
 
 #: An effect must lower the cross-validated error, relative and averaged over the actuators, by this much. What gains
 #: less is chosen by chance: on the public motions other phases choose others, which predict the left-out phases worse.
@@ -43,7 +44,7 @@ class EffectSelection:
 
     def __post_init__(self) -> None:
         equations = self.equations
-        self._total = equations.total()
+        self._total = equations.total
         self._learnt = [equations.without_fold(fold) for fold in range(equations.folds)]
         self._predicted = [equations.of_fold(fold) for fold in range(equations.folds)]
         self._efforts = np.sum(self.efforts, axis=0)
@@ -59,21 +60,26 @@ class EffectSelection:
     def fit(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:
         """(k,) all unknowns, 0 where an effect is not chosen; weighs every actuator by the error that is left."""
         for _ in range(3):
-            x = self._solve(self._total, effects)
-            self.weights = self._weights(squared_errors(self._total, x) / self._efforts)
+            x = self._fit_to(self._total.weighted(self.weights), effects).solve()
+            self.weights = self._weights(self._total.squared_errors(x) / self._efforts)
         return x
 
     def relative_error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n,) |tau - X x| / |tau|."""
-        return np.asarray(np.sqrt(squared_errors(self._total, x) / self._efforts))
+        return np.asarray(np.sqrt(self._total.squared_errors(x) / self._efforts))
 
-    def cross_validated(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:
-        """(n,) relative error of folds that are predicted from the others, with the current weights."""
-        errors = [
-            squared_errors(predicted, self._solve(learnt, effects))
-            for learnt, predicted in zip(self._learnt, self._predicted, strict=True)
-        ]
-        return np.asarray(np.sqrt(np.sum(errors, axis=0) / self._efforts))
+    def cross_validated(self, effects: NDArray[np.int_], candidates: Sequence[int] = ()) -> tuple[float, list[float]]:
+        """Error of folds that are predicted from the others, with the current weights; with each candidate added.
+
+        It is relative, and the mean over the actuators.
+        """
+        squares = np.zeros((1 + len(candidates), len(self._efforts)))
+        added = [None, *(self.num_rigid + k for k in candidates)]
+        for learnt, predicted in zip(self._learnt, self._predicted, strict=True):
+            fit = self._fit_to(learnt.weighted(self.weights), effects, np.array(candidates, dtype=int))
+            squares += [predicted.squared_errors(fit.solve(k)) for k in added]
+        error, *errors = np.mean(np.sqrt(squares / self._efforts), axis=1).tolist()
+        return error, errors
 
     def choose(
         self, start: NDArray[np.int_], candidates: NDArray[np.int_], report: Callable[[float], object] = lambda _: None
@@ -85,32 +91,26 @@ class EffectSelection:
             report: told the share of the work that is done, a guess.
         """
         chosen = start
-        self.fit(chosen)
-        best = float(np.mean(self.cross_validated(chosen)))
-        for step in range(len(candidates)):
+        for step in itertools.count():
             report(1 - 0.85**step)
-            open_ = np.setdiff1d(candidates, chosen)
-            tries = [np.union1d(chosen, [k]) for k in self._promising(chosen, open_)]
-            errors = [float(np.mean(self.cross_validated(t))) for t in tries]
+            self.fit(chosen)
+            tries = self._promising(chosen, np.setdiff1d(candidates, chosen))
+            best, errors = self.cross_validated(chosen, tries.tolist())
             if not errors or min(errors) > best - LEAST_GAIN:
                 break
-            chosen = tries[int(np.argmin(errors))]
-            self.fit(chosen)
-            best = float(np.mean(self.cross_validated(chosen)))
+            chosen = np.union1d(chosen, tries[[np.argmin(errors)]])
         for k in np.intersect1d(candidates, chosen):
             without = np.setdiff1d(chosen, [k])
-            error = float(np.mean(self.cross_validated(without)))
+            error, _ = self.cross_validated(without)
             if error < best + LEAST_GAIN / 2:
                 chosen, best = without, error
         return chosen
 
     def _promising(self, chosen: NDArray[np.int_], open_: NDArray[np.int_]) -> NDArray[np.int_]:
         """The open effects that would lower the sum of squares most, were all signs free."""
-        if not len(open_):
-            return open_
         used, new = self._index(chosen), self.num_rigid + open_
-        sums = np.tensordot(self.weights, self._total, axes=(0, 0))
-        x = self._solve(self._total, chosen)
+        sums = self._total.weighted(self.weights)
+        x = self._fit_to(sums, chosen).solve()
         residual = (sums[:-1, -1] - sums[:-1, :-1] @ x)[new]
         H = sums[np.ix_(used, used)] + np.diag(self.precision[used])
         explained = np.einsum("ij,ij->j", sums[np.ix_(used, new)], np.linalg.solve(H, sums[np.ix_(used, new)]))
@@ -120,17 +120,12 @@ class EffectSelection:
     def _index(self, effects: NDArray[np.int_]) -> NDArray[np.int_]:
         return np.concatenate([np.arange(self.num_rigid), self.num_rigid + np.sort(effects)])
 
-    def _solve(self, products: NDArray[np.float64], effects: NDArray[np.int_]) -> NDArray[np.float64]:
-        index = self._index(effects)
-        with_effort = np.append(index, products.shape[-1] - 1)
-        x = np.zeros(len(self.precision))
-        x[index] = solve(
-            products[:, with_effort[:, None], with_effort],
-            self.weights,
-            self.precision[index],
-            self.non_negative[index],
-        )
-        return x
+    def _fit_to(
+        self, sums: NDArray[np.float64], effects: NDArray[np.int_], others: NDArray[np.int_] | None = None
+    ) -> NonNegativeFit:
+        """To weighted sums; `others`: effects that may be added."""
+        new = None if others is None else self.num_rigid + others
+        return NonNegativeFit(sums, self.precision, self.non_negative, self._index(effects), new)
 
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         """One over the variance of an independent measurement, from the squared relative errors."""

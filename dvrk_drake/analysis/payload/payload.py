@@ -369,7 +369,9 @@ def _problem(
     grid, rows = difference.grid, np.flatnonzero(difference.rows)[whitening.lost :]
     fold, edge = phase_folds(grid, difference.period)
     tau = np.column_stack([whitening(x, i) for i, x in enumerate(difference.tau.T)])
-    equations = NormalEquations.of([whitening(x, i) for i, x in enumerate(both)], tau, fold[rows], edge[rows])
+    size = both[0].shape[1]
+    columns = ((np.arange(size), whitening(x, i)) for i, x in enumerate(both))
+    equations = NormalEquations.of(columns, size, tau, fold[rows], edge[rows])
     # A low-passed effort has two independent values a period of the cut-off. What repeats with the motion has fewer:
     # the jackknife over its phases sees to that.
     independent = 2 * grid.settings.effort_cut_off / grid.rate

@@ -63,7 +63,7 @@ class PointMassProblem:
         rows: int,
     ) -> None:
         self.equations, self.com = equations, com
-        self._total = equations.total()
+        self._total = equations.total.dense()
         self._count, self._precision = rows * independent, precision
 
     def fit(self, start: PointMass | None = None) -> tuple[PointMass, NDArray[np.float64], NDArray[np.float64]]:
@@ -93,7 +93,7 @@ class PointMassProblem:
 
     def without_fold(self, fold: int, weights: NDArray[np.float64], start: PointMass) -> PointMass:
         """The point mass as the other folds see it."""
-        others = self._total - self.equations.of_fold(fold)
+        others = self._total - self.equations.of_fold(fold).dense()
         return self._refine(self._reduced(others, weights), weights, start)
 
     def mass_at_com(self, weights: NDArray[np.float64], fold: int | None = None) -> tuple[float, float]:
@@ -103,7 +103,7 @@ class PointMassProblem:
             weights: of the actuators.
             fold: which is left out; None: none.
         """
-        products = self._total if fold is None else self._total - self.equations.of_fold(fold)
+        products = self._total if fold is None else self._total - self.equations.of_fold(fold).dense()
         H, b = _weighted(self._reduced(products, weights), weights)
         unit = point_mass_parameters(1.0, self.com)
         information = max(float(unit @ H @ unit), _TINY)
@@ -118,7 +118,7 @@ class PointMassProblem:
 
         None as `start`: without a point mass.
         """
-        others, own = self.equations.without_fold(fold), self.equations.of_fold(fold)
+        others, own = self.equations.without_fold(fold).dense(), self.equations.of_fold(fold).dense()
         phi = np.zeros(_RIGID)
         if start is not None:
             phi = self._refine(self._reduced(others, weights), weights, start).parameters
