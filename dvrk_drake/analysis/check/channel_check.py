@@ -211,7 +211,9 @@ def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _gain_of(other: Recording, fit: ChannelFit) -> float:
-    return ChannelFit(other, fit.arm).log_likelihood - fit.log_likelihood
+    """Of exchanged, inverted or shifted channels. Where these are the actuators' own, they keep the times."""
+    clock = fit.clock if fit.recording.coordinates == "actuator" else None
+    return ChannelFit(other, fit.arm, clock).log_likelihood - fit.log_likelihood
 
 
 def _limit_margin(arm: Arm) -> NDArray[np.float64]:

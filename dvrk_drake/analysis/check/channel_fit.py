@@ -8,12 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, named_effects
+from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, at_random_states, named_effects
 from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalEquations
 from dvrk_drake.analysis.signals.low_pass import low_pass, resample
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of
+from dvrk_drake.analysis.signals.true_time import TrueTime
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect
+from dvrk_drake.dynamics.base_parameters import independent_columns
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.physical_consistency import LinkScale
@@ -49,24 +51,30 @@ class ChannelFit:
 
     Attributes:
         recording, arm: what is fitted.
+        clock: times of a motion's rows.
         moves: whether it is a motion.
         used: (k,) indices of the actuators that move and have an effort; the model explains these.
         resting: (l,) indices of those with an effort that do not move: a constant explains it.
         log_likelihood: of the recording as it is, up to a constant.
     """
 
-    def __init__(self, recording: Recording, arm: Arm) -> None:
+    def __init__(self, recording: Recording, arm: Arm, clock: TrueTime | None = None) -> None:
         """Prepares the columns and fits them.
+
+        Args:
+            recording, arm: what to fit.
+            clock: `true_time` of the recording in actuator coordinates, if it is known.
 
         Raises:
             RecordingError: the recording does not fit the arm, or is a motion that is too short or too coarse.
         """
-        self.recording, self.arm = recording, arm
+        self.recording, self.arm, self.clock = recording, arm, clock
         self._to_joint = arm.transmission.inverse
-        self._regressor, self._tilted = _regressors(arm)
+        self._regressor, self._tilted, self._base = _regressors(arm)
         self.moves = bool(recording.motion(arm))
         if self.moves:
-            grid = motion_grid(recording, arm, default_settings(arm))
+            grid = motion_grid(recording, arm, default_settings(arm), clock)
+            self.clock = grid.clock
             self._cut_off = min(arm.identification.effort_cut_off, 0.4 * grid.rate)
             self._half_step = max(int(GRID_RATE / (2 * OVERSAMPLING * self._cut_off)), 1)
             self._q, self._v, self._vd = grid.q, grid.v, grid.vd
@@ -117,7 +125,7 @@ class ChannelFit:
         friction = np.array([effect.kind not in POSITION_KINDS for effect in self._drive.effects])
         carrying = np.append(self._x[: self._num_rigid], np.where(friction, 0.0, self._x[self._num_rigid :]))
         stated = np.where(friction, self._drive.mean, 0.0)
-        power = np.full(len(self._columns), np.nan)
+        power = np.full(self.arm.num_joints, np.nan)
         for i in self.used:
             if expected := float(self._effect_columns[i] @ stated @ v[:, i]):
                 left = self._tau[:, i] - self._nominal[:, i] - self._columns[i] @ carrying
@@ -131,33 +139,45 @@ class ChannelFit:
         return self._sampled(resample(times, low_pass(tau, grid.rate, self._cut_off)[rows], grid.t))
 
     def _make_columns(self) -> None:
-        regressor, n = self._regressor, self.arm.num_joints
+        regressor, (independent, base) = self._regressor, self._base
         q, v, vd = (x[:: self._half_step] for x in (self._q, self._v, self._vd))
         num_links = 10 * len(regressor.links)
-        prior = regressor.values[: num_links + n]
+        prior = regressor.values[: base.shape[1]]
         deviations = [LINK_DEVIATION * LinkScale.of(link).deviations for link in regressor.links]
         rotors = np.maximum(LINK_DEVIATION * prior[num_links:], LEAST_ROTOR_DEVIATION)
-        Y = np.einsum("ji,mjp->mip", self._to_joint.matrix, regressor.regressor(q, v, vd)[..., : len(prior)])
-        self._nominal = self._filtered(Y @ prior)
-        Y = self._filtered(Y * np.concatenate([*deviations, rotors]))
+        deviation = np.concatenate([*deviations, rotors])
+        Y = regressor.regressor(q, v, vd)
         effort = np.sqrt(np.mean(self._tau**2, axis=0))
-        information = sum(Y[:, i].T @ Y[:, i] / (len(Y) * effort[i] ** 2) for i in self.used)
+        rigid, information = {}, np.zeros((len(prior), len(prior)))
+        self._nominal = np.zeros_like(self._tau)
+        for i in self.used:
+            drives = self._to_joint.matrix[:, i]
+            own = sum(drives[j] * Y[:, j, independent] for j in np.flatnonzero(drives))
+            moved = np.flatnonzero(np.any(own, axis=0))
+            filtered, to_base = self._filtered(own[:, moved]), base[moved]
+            rigid[i] = filtered, to_base
+            self._nominal[:, i] = filtered @ (to_base @ prior)
+            scaled = to_base * deviation
+            information += scaled.T @ (filtered.T @ filtered) @ scaled / (len(filtered) * effort[i] ** 2)
         values, vectors = np.linalg.eigh(information)
         directions = vectors[:, values > LEAST_INFORMATION]
-        self._to_parameters = np.concatenate([*deviations, rotors])[:, None] * directions
+        self._to_parameters = deviation[:, None] * directions
         tilts = TILT_DEVIATION * np.linalg.norm(self.arm.gravity) * self._weights_of_unit_gravity(q)
         self._drive = drive = _drive_effects(self.arm, self._q, self._v, self.moves)
         self._rows = np.array([self.arm.effect_coordinates[effect.coordinate] for effect in drive.effects])
         shapes = np.column_stack(list(effect_shapes(regressor, drive.effects, self._q, self._v)))
         shapes = self._sampled(low_pass(shapes, GRID_RATE, self._cut_off) if self.moves else shapes)
-        self._effect_columns = [shapes * self._rows[:, i] for i in range(n)]
+        self._effect_columns = {i: shapes * self._rows[:, i] for i in self.used}
         size = sum(np.mean(self._effect_columns[i] ** 2, axis=0) / effort[i] ** 2 for i in self.used)
         share = drive.share / np.sqrt(np.maximum(np.asarray(size), np.finfo(float).tiny))
-        deviation = np.where(drive.deviation > 0, drive.deviation, share)
-        self._columns = [np.hstack([Y[:, i] @ directions, tilts[:, i], self._effect_columns[i]]) for i in range(n)]
+        spread = np.where(drive.deviation > 0, drive.deviation, share)
+        self._columns = {
+            i: np.hstack([filtered @ (to_base @ self._to_parameters), tilts[:, i], self._effect_columns[i]])
+            for i, (filtered, to_base) in rigid.items()
+        }
         self._num_rigid = directions.shape[1] + tilts.shape[2]
         self._mean = np.append(np.zeros(self._num_rigid), drive.mean)
-        self._precision = np.append(np.ones(self._num_rigid), deviation**-2.0)
+        self._precision = np.append(np.ones(self._num_rigid), spread**-2.0)
         dissipative = [effect.dissipative for effect in drive.effects]
         self._non_negative = np.append(np.zeros(self._num_rigid, dtype=bool), dissipative)
 
@@ -239,10 +259,14 @@ class ChannelFit:
 
 
 @cache
-def _regressors(arm: Arm) -> tuple[DynamicRegressor, list[DynamicRegressor]]:
-    """The arm's regressor, and those of the arm under a gravity of 1 m/s^2 along the base's x and y."""
+def _regressors(
+    arm: Arm,
+) -> tuple[DynamicRegressor, list[DynamicRegressor], tuple[NDArray[np.int_], NDArray[np.float64]]]:
+    """The arm's regressor, those under a gravity of 1 m/s^2 along the base's x and y, and its independent columns."""
     regressor = DynamicRegressor(arm)
-    return regressor, [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
+    lying = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
+    p = 10 * len(regressor.links) + arm.num_joints
+    return regressor, lying, independent_columns(at_random_states(regressor)[:, :p])
 
 
 class _DriveEffects(NamedTuple):

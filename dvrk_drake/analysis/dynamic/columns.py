@@ -43,7 +43,7 @@ class DynamicColumns:
         rigid: (r, n, b) of the base parameters.
         tilts: (2, r, n, b) derivative of `rigid` by the x and y component of gravity [s^2/m].
         effects: the candidate effects, in the order of the columns.
-        shapes: (r, e) of each effect along its coordinate, one column a block of actuators.
+        shapes: (r, e) of each effect along its coordinate, for each actuator that it acts on.
         rows: (e, n) coordinate of each effect: its column of actuator i is shapes[i] * rows[:, i].
     """
 
@@ -143,21 +143,27 @@ def dynamic_columns(
     # Efforts are linear in gravity: those at rest under a gravity of one are the derivative.
     lying = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]) if arm.identification.base_may_tilt]
     independent, base = independent_columns(
-        np.concatenate([_at_random_states(regressor), *map(_at_random_states, lying)])[:, :p]
+        np.concatenate([at_random_states(regressor), *map(at_random_states, lying)])[:, :p]
     )
     rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd), independent)
     rest = np.zeros_like(grid.q)
     tilts = [_filtered(grid, r.regressor(grid.q, rest, rest), independent) for r in lying]
     on_grid = np.column_stack(list(effect_shapes(regressor, effects, grid.q, grid.v)))
     rows = np.array([arm.effect_coordinates[effect.coordinate] for effect in effects])
-    by_delay = {d: grid.behind_filter(grid.at_rows(on_grid, i)) for i, d in enumerate(grid.settings.effort_delay)}
-    shapes = tuple(by_delay[d] for d in grid.settings.effort_delay)
+    delays = np.array(grid.settings.effort_delay)
+    by_delay = {}
+    for i, delay in enumerate(delays):
+        if delay not in by_delay:
+            acting = np.flatnonzero(np.any(rows[:, delays == delay], axis=1))
+            by_delay[delay] = np.zeros((len(rigid), len(effects)))
+            by_delay[delay][:, acting] = grid.behind_filter(grid.at_rows(on_grid[:, acting], i))
+    shapes = tuple(by_delay[delay] for delay in delays)
     return DynamicColumns(
         grid.behind_filter(tau), base, rigid, np.array(tilts).reshape(-1, *rigid.shape), tuple(effects), shapes, rows
     )
 
 
-def _at_random_states(regressor: DynamicRegressor) -> NDArray[np.float64]:
+def at_random_states(regressor: DynamicRegressor) -> NDArray[np.float64]:
     """(rows, p), many more than columns."""
     generator = np.random.default_rng(0)
     q, v, vd = generator.normal(0, 2, (3, len(regressor.values) // 2, regressor.arm.num_joints))

@@ -12,6 +12,8 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+#: Exchanges of unknowns between positive and 0 that are tried.
+MOST_EXCHANGES = 10
 #: Indices of an actuator's own columns among all, and these (r, c); the others are 0 for it.
 OwnColumns = tuple[NDArray[np.int_], NDArray[np.float64]]
 
@@ -139,7 +141,7 @@ class NonNegativeFit:
 
     |y|^2 - 2 y' X x + x' (X' X + diag(precision)) x is least at x. What may have any sign is eliminated first, which
     leaves the Schur complement of the others; one more unknown is a row more of it, or one more step of elimination.
-    The rest is scipy's non-negative least squares (Lawson and Hanson).
+    What remains is a small problem of non-negative least squares.
     """
 
     def __init__(
@@ -199,13 +201,20 @@ class NonNegativeFit:
         return (x * self._scale)[:-1]
 
     def _minimum(self, S: NDArray[np.float64], bound: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Of y' S y / 2 - b' y, y >= 0; first with those positive that are without what was added."""
+        """Of y' S y / 2 - b' y, y >= 0: by exchanges from what is positive without the unknown that was added.
+
+        All unknowns whose sign, or whose slope at 0, is wrong change sides at once (Portugal, Judice and Vicente,
+        1994), which takes a few solutions; should it cycle, Lawson and Hanson's method follows.
+        """
         H, b = S[bound[:, None], bound], S[bound, -1]
-        x, positive = np.zeros(len(b)), np.ones(len(b), dtype=bool)
-        positive[: len(self._positive)] = self._positive
-        x[positive] = np.linalg.solve(H[np.ix_(positive, positive)], b[positive])
-        if np.all(x[positive] > 0) and np.all(H[~positive] @ x >= b[~positive]):
-            return x
+        positive = np.append(self._positive, np.ones(len(b) - len(self._positive), dtype=bool))
+        for _ in range(MOST_EXCHANGES):
+            y = np.zeros(len(b))
+            y[positive] = np.linalg.solve(H[np.ix_(positive, positive)], b[positive])
+            wrong = np.where(positive, y <= 0, H @ y < b)
+            if not np.any(wrong):
+                return y
+            positive ^= wrong
         L = np.linalg.cholesky(H)
         return np.asarray(nnls(L.T, _solve_lower(L, b))[0])
 

@@ -97,6 +97,7 @@ class MotionGrid:
         q, v, vd: (m, n) of the joints.
         row_times: (r,) the true time of every row of the recording, on the clock of t.
         rate: mean rate of the rows [Hz].
+        clock: of the rows that say something new.
     """
 
     arm: Arm
@@ -107,6 +108,7 @@ class MotionGrid:
     vd: NDArray[np.float64]
     row_times: NDArray[np.float64]
     rate: float
+    clock: TrueTime
 
     @property
     def inner(self) -> slice:
@@ -141,18 +143,24 @@ def default_settings(arm: Arm) -> SignalSettings:
     )
 
 
-def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings) -> MotionGrid:
+def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock: TrueTime | None = None) -> MotionGrid:
     """Brings a motion in either coordinates onto the grid.
 
     The positions are differentiated (recorded velocities only tell the times, see `true_time`): actuator by actuator,
     since each has its own encoder and cut-off.
+
+    Args:
+        recording: the motion.
+        arm: which moves.
+        settings: of the filters and delays.
+        clock: `true_time` of the recording in actuator coordinates, if it is known.
 
     Raises:
         RecordingError: it does not fit the arm, has no times, or is too short or too coarse.
     """
     recording.check_fits(arm)
     recording = recording.in_actuator_coordinates(arm)
-    clock = true_time(recording)
+    clock = clock or true_time(recording)
     duration = float(clock.t[-1] - clock.t[0])
     rate = (len(recording) - 1) / duration
     if duration < LEAST_DURATION or rate < LEAST_RATE:
@@ -175,4 +183,5 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings) -> Mot
         vd=to_joint.velocity(central_difference(central_difference(slow, GRID_RATE), GRID_RATE)),
         row_times=clock.t[np.maximum(last, 0)],
         rate=rate,
+        clock=clock,
     )

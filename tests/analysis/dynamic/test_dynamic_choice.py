@@ -70,23 +70,23 @@ def equations(generator, true):
 
 def test_parts_are_left_out_with_the_rows_that_touch_them():
     X, tau, fold, edge = equations(np.random.default_rng(0), np.ones(3))
-    whole = NormalEquations.of([X], tau[:, None], fold, edge)
+    whole = NormalEquations.of([(np.arange(3), X)], 3, tau[:, None], fold, edge)
     for first in (0, 4, 10, 11):
         out = np.isin(fold, [first, (first + 1) % FOLDS])
         touches = ((fold == (first - 1) % FOLDS) & edge[:, 1]) | ((fold == (first + 2) % FOLDS) & edge[:, 0])
         rows = np.column_stack([X, tau])
         kept = rows[~(out | touches)]
-        np.testing.assert_allclose(whole.without_fold(first, 2)[0], kept.T @ kept, atol=1e-9)
-        np.testing.assert_allclose(whole.of_fold(first, 2)[0], rows[out].T @ rows[out], atol=1e-9)
+        np.testing.assert_allclose(whole.without_fold(first, 2).dense()[0], kept.T @ kept, atol=1e-9)
+        np.testing.assert_allclose(whole.of_fold(first, 2).dense()[0], rows[out].T @ rows[out], atol=1e-9)
         others = whole.without(first, 2)
         assert others.folds == FOLDS - 2
-        np.testing.assert_allclose(others.total()[0], kept.T @ kept, atol=1e-9)
+        np.testing.assert_allclose(others.total.dense()[0], kept.T @ kept, atol=1e-9)
         # And again: a fold of the others, with what touches it.
         second = others.without_fold(3)
         out = fold == (first + 2 + 3) % FOLDS
         touches |= ((fold == (first + 4) % FOLDS) & edge[:, 1]) | ((fold == (first + 6) % FOLDS) & edge[:, 0])
         kept = rows[~(out | touches | np.isin(fold, [first, (first + 1) % FOLDS]))]
-        np.testing.assert_allclose(second[0], kept.T @ kept, atol=1e-9)
+        np.testing.assert_allclose(second.dense()[0], kept.T @ kept, atol=1e-9)
 
 
 def test_an_effect_that_is_there_is_chosen_and_noise_is_not():
@@ -96,7 +96,7 @@ def test_an_effect_that_is_there_is_chosen_and_noise_is_not():
     for seed in range(5):
         X, tau, fold, edge = equations(np.random.default_rng(seed), true)
         selection = EffectSelection(
-            equations=NormalEquations.of([X], tau[:, None], fold, edge),
+            equations=NormalEquations.of([(np.arange(22), X)], 22, tau[:, None], fold, edge),
             efforts=np.array([[np.sum(tau[fold == f] ** 2)] for f in range(FOLDS)]),
             rows=np.bincount(fold),
             num_rigid=0,

@@ -56,7 +56,7 @@ def test_standard_errors_are_the_spread_of_repeated_fits(repeating):
     slow, fast = (np.hstack([np.sin(f * w * T[:, None]), np.cos(f * w * T[:, None])]) for f in (1, 5))
     X, weights, prior = [slow, 0.3 * fast + 0.1 * slow], np.array([1.0, 0.3]), 1e-6 * np.eye(6)
     fold = (T % PERIOD / PERIOD * 12).astype(int)
-    problem = SimpleNamespace(chosen_columns=lambda i, _: X[i], fold=fold)
+    problem = SimpleNamespace(chosen_columns=lambda i, _: (np.arange(6), X[i]), to_base=lambda _: np.eye(6), fold=fold)
     information = sum(weight * x.T @ x for weight, x in zip(weights, X, strict=True))
     fit = SimpleNamespace(
         information=information, prior_precision=prior, weights=weights, chosen=np.arange(0), lower=np.full(6, -np.inf)
@@ -89,7 +89,9 @@ def test_what_the_motion_does_not_tell_keeps_the_priors_variance():
         x=np.zeros(2),
         lower=np.full(2, -np.inf),
     )
-    problem = SimpleNamespace(chosen_columns=lambda i, _: X, fold=(T // 4).astype(int))
+    problem = SimpleNamespace(
+        chosen_columns=lambda i, _: (np.arange(2), X), to_base=lambda _: np.eye(2), fold=(T // 4).astype(int)
+    )
     covariance = parameter_covariance(problem, fit, tau, RATE, CUT_OFF, None)
     assert covariance[1, 1] == pytest.approx(1 / 4.0)
     assert covariance[0, 0] < 0.01

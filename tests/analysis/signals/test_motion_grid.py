@@ -1,5 +1,6 @@
 """A motion on a grid, its folds and the efforts that a model expects of it, against motions that are known."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from motions import friction_everywhere, true_dynamics
 
 from dvrk_drake.analysis.signals.drive_efforts import drive_efforts
-from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, default_settings, motion_grid
+from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import FOLDS, GAP, period_of, phase_folds
 from dvrk_drake.dynamics.dynamic_section import SignalSettings
 from dvrk_drake.errors import RecordingError
@@ -57,7 +58,7 @@ def test_actuator_coordinates_give_the_same_grid(grid):
 def test_what_explains_an_effort_is_late_by_its_delay(grid):
     delays = [0.0, 0.004, -0.01, 0.0, 0.02, 0.0, 0.0]
     settings = SignalSettings(50.0, [20.0] * N, 20.0, delays)
-    late = MotionGrid(ARM, settings, grid.t, grid.q, grid.v, grid.vd, grid.row_times, grid.rate)
+    late = replace(grid, settings=settings)
     lines = np.tile((grid.t - 5.0)[:, None], (1, N))
     rows = late.efforts_at_rows(lines)[late.inner]
     np.testing.assert_allclose(rows, grid.row_times[grid.inner, None] - 5.0 - np.array(delays), atol=1e-9)
