@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numba
 import numpy as np
@@ -34,7 +35,8 @@ class EffectKind:
         revolute: only of a coordinate that turns.
         loaded: its shape is times the load that the coordinate carries [N m, N].
         code: what the compiled step calls it, if it depends on velocity or has a state.
-        of_position: (x, scale) -> the shape, if position is all that it depends on; such effects act at rest too.
+        of_position: (f, x, scale) -> the shape, if position is all that it depends on; such effects act at rest too. f
+            has the functions sin, cos, Min and Max, of numbers or of symbols.
     """
 
     unit: str
@@ -43,13 +45,13 @@ class EffectKind:
     revolute: bool = False
     loaded: bool = False
     code: int = 0
-    of_position: Callable[[sympy.Expr, sympy.Expr], sympy.Expr] | None = None
+    of_position: Callable[[Any, Any, Any], Any] | None = None
 
 
 _WIDTH = "speed at which the smoothed sign is 0.76 [rad/s, m/s]"
 EFFECT_KINDS: dict[str, EffectKind] = {
     # Cable preload, current offset.
-    "offset": EffectKind("N m", of_position=lambda x, scale: sympy.Integer(1)),
+    "offset": EffectKind("N m", of_position=lambda f, x, scale: 1),
     "viscous": EffectKind("N m s/rad", dissipative=True, code=1),
     "coulomb": EffectKind("N m", _WIDTH, dissipative=True, code=2),
     "coulomb forward": EffectKind("N m", _WIDTH, code=3),
@@ -62,12 +64,13 @@ EFFECT_KINDS: dict[str, EffectKind] = {
     "spring": EffectKind(
         "N m/rad",
         "largest |x| to which it is a straight line [rad, m]",
-        of_position=lambda x, scale: sympy.Max(-scale, sympy.Min(scale, x)),
+        of_position=lambda f, x, scale: f.Max(-scale, f.Min(scale, x)),
     ),
     # One period a turn: a spring or a cable hooked on off the axis. More: a pulley that is not round, a cable's lay.
-    "cable sine": EffectKind("N m", "periods a turn", revolute=True, of_position=lambda x, s: sympy.sin(s * x)),
-    "cable cosine": EffectKind("N m", "periods a turn", revolute=True, of_position=lambda x, s: sympy.cos(s * x)),
+    "cable sine": EffectKind("N m", "periods a turn", revolute=True, of_position=lambda f, x, s: f.sin(s * x)),
+    "cable cosine": EffectKind("N m", "periods a turn", revolute=True, of_position=lambda f, x, s: f.cos(s * x)),
 }
+_NUMERIC = SimpleNamespace(sin=np.sin, cos=np.cos, Min=np.minimum, Max=np.maximum)
 #: Kinds that act at rest as well; friction holds either way and is left to the arm.
 POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.of_position is not None)
 
@@ -127,9 +130,13 @@ class ActuatorEffect:
 
     def of_position(self, x: sympy.Expr) -> sympy.Expr:
         """The shape at position x [rad, m] of the coordinate, of a kind in `POSITION_KINDS`."""
+        scale = sympy.Integer(int(self.scale)) if self.scale.is_integer() else sympy.Float(self.scale)
+        return sympy.sympify(self._shape(sympy, x, scale))
+
+    def _shape(self, functions: Any, x: Any, scale: Any) -> Any:
         shape = EFFECT_KINDS[self.kind].of_position
         assert shape is not None, f"{self} depends on more than position"
-        return shape(x, sympy.Integer(int(self.scale)) if self.scale.is_integer() else sympy.Float(self.scale))
+        return shape(functions, x, scale)
 
     def step(self, state: float, dx: float, x: float, v: float, load: float = 0.0) -> tuple[float, float]:
         """The next state, and the shape there: for a simulation.
@@ -141,7 +148,7 @@ class ActuatorEffect:
             load: size of the effort that it carries [N m, N], of kinds that are loaded.
         """
         if self.kind in POSITION_KINDS:
-            return state, float(_numeric(self.kind)(x, self.scale))
+            return state, float(self._shape(_NUMERIC, x, self.scale))
         kind = EFFECT_KINDS[self.kind]
         state, shape = effect_step(kind.code, state, dx, v, self.scale)
         return state, shape * load if kind.loaded else shape
@@ -151,19 +158,10 @@ class ActuatorEffect:
     ) -> NDArray[np.float64]:
         """The shape (m,) over a motion of the coordinate, x and v (m,), from state 0; load: (m,), see `step`."""
         if self.kind in POSITION_KINDS:
-            return np.array(np.broadcast_to(_numeric(self.kind)(x, self.scale), x.shape))
+            return np.array(np.broadcast_to(self._shape(_NUMERIC, x, self.scale), x.shape), dtype=np.float64)
         kind = EFFECT_KINDS[self.kind]
         shape = _run(kind.code, np.ascontiguousarray(x), np.ascontiguousarray(v), self.scale)
         return shape * load if kind.loaded else shape
-
-
-@cache
-def _numeric(kind: str) -> Callable:
-    """The shape of a kind of position alone as a function (x, scale) of numbers or arrays."""
-    x, scale = sympy.symbols("x scale", real=True)
-    shape = EFFECT_KINDS[kind].of_position
-    assert shape is not None
-    return sympy.lambdify((x, scale), shape(x, scale), "numpy")
 
 
 @numba.njit(cache=True)

@@ -128,7 +128,8 @@ class ChannelFit:
         power = np.full(self.arm.num_joints, np.nan)
         for i in self.used:
             if expected := float(self._effect_columns[i] @ stated @ v[:, i]):
-                left = self._tau[:, i] - self._nominal[:, i] - self._columns[i] @ carrying
+                own, columns = self._columns[i]
+                left = self._tau[:, i] - self._nominal[:, i] - columns @ carrying[own]
                 power[i] = float(left @ v[:, i]) / expected
         return power
 
@@ -139,7 +140,7 @@ class ChannelFit:
         return self._sampled(resample(times, low_pass(tau, grid.rate, self._cut_off)[rows], grid.t))
 
     def _make_columns(self) -> None:
-        regressor, (independent, base) = self._regressor, self._base
+        regressor, (independent, base, moves) = self._regressor, self._base
         q, v, vd = (x[:: self._half_step] for x in (self._q, self._v, self._vd))
         num_links = 10 * len(regressor.links)
         prior = regressor.values[: base.shape[1]]
@@ -152,9 +153,9 @@ class ChannelFit:
         self._nominal = np.zeros_like(self._tau)
         for i in self.used:
             drives = self._to_joint.matrix[:, i]
-            own = sum(drives[j] * Y[:, j, independent] for j in np.flatnonzero(drives))
-            moved = np.flatnonzero(np.any(own, axis=0))
-            filtered, to_base = self._filtered(own[:, moved]), base[moved]
+            moved = np.flatnonzero(np.any(moves[np.flatnonzero(drives)], axis=0))
+            own = sum(drives[j] * Y[:, j, independent[moved]] for j in np.flatnonzero(drives))
+            filtered, to_base = self._filtered(own), base[moved]
             rigid[i] = filtered, to_base
             self._nominal[:, i] = filtered @ (to_base @ prior)
             scaled = to_base * deviation
@@ -171,10 +172,11 @@ class ChannelFit:
         size = sum(np.mean(self._effect_columns[i] ** 2, axis=0) / effort[i] ** 2 for i in self.used)
         share = drive.share / np.sqrt(np.maximum(np.asarray(size), np.finfo(float).tiny))
         spread = np.where(drive.deviation > 0, drive.deviation, share)
-        self._columns = {
-            i: np.hstack([filtered @ (to_base @ self._to_parameters), tilts[:, i], self._effect_columns[i]])
-            for i, (filtered, to_base) in rigid.items()
-        }
+        self._columns = {}
+        for i, (filtered, to_base) in rigid.items():
+            columns = np.hstack([filtered @ (to_base @ self._to_parameters), tilts[:, i], self._effect_columns[i]])
+            own = np.flatnonzero(np.any(columns, axis=0))
+            self._columns[i] = own, columns[:, own]
         self._num_rigid = directions.shape[1] + tilts.shape[2]
         self._mean = np.append(np.zeros(self._num_rigid), drive.mean)
         self._precision = np.append(np.ones(self._num_rigid), spread**-2.0)
@@ -194,9 +196,11 @@ class ChannelFit:
         non_negative = np.append(self._non_negative, np.zeros(extra, dtype=bool))
         columns, size = [self._columns[i] for i in self.used], len(mean)
         if column is not None:
-            columns = [np.hstack([X, column[:, [i]]]) for i, X in zip(self.used, columns, strict=True)]
-        left = (tau - self._nominal)[:, self.used]
-        total = NormalEquations.of(((np.arange(size), X) for X in columns), size, left).total
+            columns = [
+                (np.append(own, size - 1), np.column_stack([X, column[:, i]]))
+                for i, (own, X) in zip(self.used, columns, strict=True)
+            ]
+        total = NormalEquations.of(columns, size, (tau - self._nominal)[:, self.used]).total
         # The priors' means are one more measurement of all unknowns.
         prior = np.zeros((size + 1, size + 1))
         prior[:-1, -1] = prior[-1, :-1] = precision * mean
@@ -258,15 +262,28 @@ class ChannelFit:
         return x[ends : len(x) - ends : 2]
 
 
+class _BaseColumns(NamedTuple):
+    """Columns of a regressor that the others depend on, see `independent_columns`.
+
+    Attributes:
+        independent, base: as `independent_columns` returns them.
+        moves: (n, b) where a column is not 0 for a joint.
+    """
+
+    independent: NDArray[np.int_]
+    base: NDArray[np.float64]
+    moves: NDArray[np.bool_]
+
+
 @cache
-def _regressors(
-    arm: Arm,
-) -> tuple[DynamicRegressor, list[DynamicRegressor], tuple[NDArray[np.int_], NDArray[np.float64]]]:
+def _regressors(arm: Arm) -> tuple[DynamicRegressor, list[DynamicRegressor], _BaseColumns]:
     """The arm's regressor, those under a gravity of 1 m/s^2 along the base's x and y, and its independent columns."""
     regressor = DynamicRegressor(arm)
     lying = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
-    p = 10 * len(regressor.links) + arm.num_joints
-    return regressor, lying, independent_columns(at_random_states(regressor)[:, :p])
+    Y = at_random_states(regressor)[:, : 10 * len(regressor.links) + arm.num_joints]
+    independent, base = independent_columns(Y)
+    moves = np.any(Y[:, independent].reshape(-1, arm.num_joints, len(independent)), axis=0)
+    return regressor, lying, _BaseColumns(independent, base, moves)
 
 
 class _DriveEffects(NamedTuple):

@@ -48,7 +48,7 @@ def model_of_all_effects(name, tilt):
     covariance = np.eye(10 * len(section.links)) * 1e-6
     model = IdentifiedModel(
         arm=arm,
-        base_parameters=base_parameter_estimates(arm, section, dynamics.regressor, covariance),
+        base_parameters=base_parameter_estimates(arm, section, covariance),
         joints=[JointStatistics(name=joint) for joint in arm.joint_names],
         dynamics=section,
     )

@@ -1,0 +1,139 @@
+"""Times of `dvrk-drake identify` and `derive_gravity` beside those of another checkout, in turns.
+
+    python benchmarks/identification_speed.py --base CHECKOUT [--recordings FOLDER] [--repetitions N]
+
+CHECKOUT is a folder with another version of dvrk_drake, such as that of `git worktree add ../before COMMIT`. FOLDER
+holds mtm_one.csv and psm_one.csv, the public recordings (docs/public_recordings.md); without it only `derive_gravity`
+is measured. Each run is a process of its own with one thread of BLAS. Times are medians; a ratio below 1 means faster.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+
+HERE = Path(__file__).resolve().parents[1]
+RECORDINGS = {"mtm_one": "mtmr", "psm_one": "psm"}
+ARMS = ("mtml", "psm")
+#: Arguments of the command in this checkout, and in the other one, whose options may have other names.
+IDENTIFY = ("identify", "{recording}", "--arm", "{arm}", "--coordinates", "actuator", "--output", "model.yaml")
+IDENTIFY_BASE = IDENTIFY
+#: Prints the formulas, and the processor and wall time of the derivation alone at the end.
+DERIVE = """
+import sys, time
+from dvrk_drake.dynamics.gravity_regressor import derive_gravity
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import shared_plant
+arm = load_arm(sys.argv[1])
+shared_plant(arm)
+start = time.process_time(), time.perf_counter()
+gravity = derive_gravity(arm)
+times = time.process_time() - start[0], time.perf_counter() - start[1]
+print(gravity.base.names, gravity.regressor, gravity.potential, sep="\\n")
+print(*times)
+"""
+
+
+class Run(NamedTuple):
+    """Processor and wall time [s], what was printed, and the numbers of the model that was written."""
+
+    cpu: float
+    wall: float
+    output: str
+    numbers: tuple[float, ...] = ()
+
+
+def run(checkout: Path, arguments: Sequence[str]) -> Run:
+    """One process of a checkout's Python, in an empty folder."""
+    environment = {**os.environ, "PYTHONPATH": str(checkout), "OPENBLAS_NUM_THREADS": "1"}
+    with tempfile.TemporaryDirectory() as folder:
+        before, start = os.times(), time.perf_counter()
+        process = subprocess.run(
+            [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, check=False
+        )
+        wall, after = time.perf_counter() - start, os.times()
+        if process.returncode:
+            raise SystemExit(f"{checkout}: {' '.join(arguments[-8:])}: {process.stderr.strip()}")
+        model = Path(folder) / "model.yaml"
+        numbers = tuple(_numbers(yaml.safe_load(model.read_text()))) if model.is_file() else ()
+    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    return Run(cpu, wall, process.stdout, numbers)
+
+
+def derive(checkout: Path, arm: str) -> Run:
+    """`derive_gravity` in a new process, without its imports."""
+    *formulas, times = run(checkout, ["-c", DERIVE, arm]).output.splitlines()
+    cpu, wall = map(float, times.split())
+    return Run(cpu, wall, "\n".join(formulas))
+
+
+def identify(checkout: Path, command: Sequence[str], recording: Path, arm: str) -> Run:
+    """The command, from its start to its end."""
+    arguments = [part.format(recording=recording, arm=arm) for part in command]
+    return run(checkout, ["-m", "dvrk_drake.cli", *arguments])
+
+
+def _numbers(content: object) -> list[float]:
+    if isinstance(content, dict):
+        return _numbers(list(content.values()))
+    if isinstance(content, list):
+        return [number for part in content for number in _numbers(part)]
+    return [content] if isinstance(content, float) else []
+
+
+def show(what: str, runs: list[tuple[Run, Run]]) -> None:
+    """One line: before, after, ratio, and whether both print the same; the largest difference of two model files."""
+    (cpu_before, wall_before), (cpu, wall) = (
+        np.median([(pair[k].cpu, pair[k].wall) for pair in runs], axis=0) for k in range(2)
+    )
+    before, after = runs[0]
+    same = "yes" if before.output == after.output else "no"
+    if before.numbers:
+        largest = "other numbers"
+        if len(before.numbers) == len(after.numbers):
+            a, b = np.array(before.numbers), np.array(after.numbers)
+            # What is rounding alone has no relative difference.
+            known = np.maximum(np.abs(a), np.abs(b)) > 1e-12
+            largest = f"{np.max(np.abs(a - b)[known] / np.abs(a[known])):.0e}"
+        same += f", model: {largest}"
+    print(
+        f"{what:24} {cpu_before:7.2f} {cpu:7.2f} {cpu / cpu_before:6.2f}   "
+        f"{wall_before:7.2f} {wall:7.2f} {wall / wall_before:6.2f}   {same}",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """A line for each arm and each recording."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--base", type=Path, required=True, help="folder of the other checkout")
+    parser.add_argument("--recordings", type=Path, help="folder of mtm_one.csv and psm_one.csv")
+    parser.add_argument("--repetitions", type=int, default=5)
+    options = parser.parse_args()
+    base = options.base.resolve()
+    columns = f"{'before':>7} {'after':>7} {'ratio':>6}"
+    print(f"{'':24} {'processor time [s]':^22}   {'wall time [s]':^22}   same output, largest")
+    print(f"{'':24} {columns}   {columns}   relative difference")
+    for arm in ARMS:
+        show(f"derive_gravity {arm}", [(derive(base, arm), derive(HERE, arm)) for _ in range(options.repetitions)])
+    for name, arm in RECORDINGS.items() if options.recordings else ():
+        recording = (options.recordings / f"{name}.csv").resolve()
+        pairs = [
+            (identify(base, IDENTIFY_BASE, recording, arm), identify(HERE, IDENTIFY, recording, arm))
+            for _ in range(options.repetitions)
+        ]
+        show(f"identify {name}", pairs)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""The base parameters of gravity by numbers, against those of the symbolic potential energies of all links."""
+
+import numpy as np
+import pytest
+import sympy
+
+from dvrk_drake.dynamics import gravity_parameters as numeric
+from dvrk_drake.dynamics.base_parameters import independent_columns, reduce_to_base
+from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
+from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.models.plant import shared_plant
+
+#: Joints of an arm built like a UR: name, parent's offset [m], axis. Three neighbouring ones are parallel.
+UR_LIKE = [
+    ("pan", (0, 0, 0.18), "0 0 1"),
+    ("lift", (0, 0.17, 0), "0 1 0"),
+    ("elbow", (0.61, 0, 0), "0 1 0"),
+    ("wrist_1", (0.57, 0, 0), "0 1 0"),
+    ("wrist_2", (0, -0.12, 0), "0 0 -1"),
+    ("wrist_3", (0, 0, -0.12), "0 1 0"),
+]
+
+
+@pytest.fixture(scope="module")
+def ur_like(tmp_path_factory):
+    folder, place = tmp_path_factory.mktemp("ur"), np.zeros(3)
+    parts = ['<link name="base_link"/><frame name="dh_0" attached_to="base_link"/>']
+    for i, (name, offset, axis) in enumerate(UR_LIKE, start=1):
+        place = place + offset
+        parent = f"{UR_LIKE[i - 2][0]}_link" if i > 1 else "base_link"
+        parts.append(
+            f'<link name="{name}_link"><pose>{place[0]} {place[1]} {place[2]} 0 0 0</pose><inertial><mass>{i}</mass>'
+            f"<pose>0.01 {0.02 * i} 0.03 0 0 0</pose><inertia><ixx>0.1</ixx><iyy>0.1</iyy><izz>0.1</izz></inertia>"
+            f'</inertial></link><frame name="dh_{i}" attached_to="{name}_link"/><joint name="{name}" type="revolute">'
+            f"<parent>{parent}</parent><child>{name}_link</child><axis><xyz>{axis}</xyz><limit><lower>-3</lower>"
+            "<upper>3</upper><effort>100</effort></limit></axis></joint>"
+        )
+    (folder / "arm.sdf").write_text(f'<sdf version="1.9"><model name="ur">{"".join(parts)}</model></sdf>')
+    names, ones = [name for name, _, _ in UR_LIKE], [1.0] * len(UR_LIKE)
+    (folder / "mechanism.yaml").write_text(
+        f"sdf: arm.sdf\njoints: {names}\ngains: {{kp: {ones}, kd: {ones}, ki: {ones}}}\n"
+        f"motion: {{acceleration_cut_off: {ones}, effort_delay: {[0.0] * len(ones)}}}\n"
+    )
+    limits = ", ".join(f"{name}: [-3, 3]" for name in names)
+    (folder / "arm.yaml").write_text(f"name: UR\nmechanism: mechanism.yaml\nposition_limits: {{{limits}}}\n")
+    return load_arm(folder / "arm.yaml")
+
+
+@pytest.fixture(scope="module", params=["mtmr", "psm", "mtmr leaning", "ur"])
+def arm(request, ur_like):
+    name, _, leaning = request.param.partition(" ")
+    arm = ur_like if name == "ur" else load_arm(name)
+    return arm.with_gravity([0.1, -0.5, -9.79]) if leaning else arm
+
+
+def test_base_parameters_are_those_of_the_symbolic_derivation(arm):
+    """All parameters are derived here, where `derive_gravity` writes out only those of the base."""
+    parameters, plant = gravity_parameters(arm), SymbolicPlant(arm)
+    energies = [plant.potential_energy(p.label, p.axis) for p in parameters.standard_parameters]
+    columns = [[plant.ring.to_sympy(plant.ring.derivative(e, q)) for e in energies] for q in plant.q]
+    regressor = sympy.lambdify(plant.q, columns, "numpy", cse=True)
+    poses = np.random.default_rng(4).uniform(-2, 2, (80, arm.num_joints))
+    base = reduce_to_base(
+        np.concatenate([np.array(regressor(*q), dtype=float) for q in poses]),
+        parameters.standard_parameters,
+        numeric._readable_preference(parameters.standard_parameters),
+        numeric.named_lengths(shared_plant(arm), plant.bodies),
+    )
+    assert base.names == parameters.base.names
+    assert base.columns == parameters.base.columns
+    np.testing.assert_allclose(base.combination, parameters.base.combination, rtol=0, atol=1e-9)
+
+
+def test_base_parameters_of_any_links_hold_them(arm):
+    """The same torque as the full dynamics at rest, for links that the SDF does not have; rotors stay balanced."""
+    regressor, parameters = DynamicRegressor(arm), gravity_parameters(arm)
+    links = [link.link for link in regressor.links]
+    q = np.random.default_rng(5).uniform(-1, 1, (40, arm.num_joints))
+    Y = regressor.regressor(q, np.zeros_like(q), np.zeros_like(q))[..., : 10 * len(links)]
+    phi = np.concatenate([link.parameters for link in regressor.links])
+    framed = np.repeat([not link.startswith("motor_") for link in links], 10)
+    phi += np.where(framed, np.random.default_rng(6).normal(size=len(phi)), 0.0)
+    lift = np.linalg.lstsq(parameters.combination_of(links), parameters.combination_of(links) @ phi, rcond=None)[0]
+    np.testing.assert_allclose(Y @ (phi - lift)[:, None], 0, atol=1e-9)
+
+
+def test_columns_of_a_regressor_are_combinations_of_the_independent_ones():
+    generator = np.random.default_rng(7)
+    Y = generator.normal(size=(60, 5)) @ generator.normal(size=(5, 11))
+    Y[:, 3] = 0.0
+    columns, B = independent_columns(Y)
+    assert len(columns) == 5 and 3 not in columns and list(columns) == sorted(columns)
+    np.testing.assert_allclose(Y[:, columns] @ B, Y, atol=1e-10)
+    np.testing.assert_allclose(B[:, columns], np.eye(5), atol=1e-12)
