@@ -41,8 +41,8 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
     identified, drawn = (f"{drift[j]:.4f} {unit}" for drift in drifts[:2])
     print_answer(
         console,
-        f"Released under gravity compensation, {arm.name} drifts by at most {identified} ({arm.joint_names[j]}) with "
-        f"the identified model, and by {drawn} with that of the SDF.",
+        f"Released without dry friction, {arm.name} drifts by at most {identified} ({arm.joint_names[j]}) with the "
+        f"identified model, and by {drawn} with that of the SDF.",
         f"open {folder}/arm.html in a browser",
     )
     table = make_table(
