@@ -43,8 +43,8 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
     )
     print_answer(
         console,
-        f"Released under gravity compensation, {arm.name} drifts by at most {identified} with the identified model, "
-        f"and by {drawn} with that of the SDF.",
+        f"Released without dry friction, {arm.name} drifts by at most {identified} with the identified model, and by "
+        f"{drawn} with that of the SDF.",
         f"open {folder}/arm.html in a browser",
     )
     table = make_table(
