@@ -40,13 +40,13 @@ class TrigonometricRing:
         for term in _arguments(expression.Expand(), _Kind.Add):
             coefficient, monomial = 1.0, []
             for factor in _arguments(term, _Kind.Mul):
-                if isinstance(factor, float):
-                    coefficient *= factor
+                if isinstance(factor, float) or factor.get_kind() == _Kind.Constant:
+                    coefficient *= _number(factor)
                     continue
                 base, power = factor, 1
                 if factor.get_kind() == _Kind.Pow:
                     base, exponent = factor.Unapply()[1]
-                    power = int(exponent.Evaluate())
+                    power = int(_number(exponent))
                 sign, index = self._variable(base)
                 coefficient *= sign**power
                 monomial += [index] * power
@@ -154,6 +154,10 @@ def _arguments(expression: symbolic.Expression | float, kind: symbolic.Expressio
     if isinstance(expression, float) or expression.get_kind() not in (kind, _Kind.Constant):
         return [expression]
     return list(expression.Unapply()[1])
+
+
+def _number(constant: symbolic.Expression | float) -> float:
+    return constant if isinstance(constant, float) else float(constant.Evaluate())
 
 
 def _add(polynomial: Polynomial, monomial: tuple[int, ...], coefficient: float) -> None:

@@ -8,14 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, at_random_states, named_effects
+from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, BaseColumns, base_columns, named_effects
 from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalEquations
 from dvrk_drake.analysis.signals.low_pass import low_pass, resample
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid, default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import period_of
 from dvrk_drake.analysis.signals.true_time import TrueTime
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS, ActuatorEffect
-from dvrk_drake.dynamics.base_parameters import independent_columns
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.physical_consistency import LinkScale
@@ -140,10 +139,10 @@ class ChannelFit:
         return self._sampled(resample(times, low_pass(tau, grid.rate, self._cut_off)[rows], grid.t))
 
     def _make_columns(self) -> None:
-        regressor, (independent, base, moves) = self._regressor, self._base
+        regressor = self._regressor
         q, v, vd = (x[:: self._half_step] for x in (self._q, self._v, self._vd))
         num_links = 10 * len(regressor.links)
-        prior = regressor.values[: base.shape[1]]
+        prior = regressor.values[: self._base.base.shape[1]]
         deviations = [LINK_DEVIATION * LinkScale.of(link).deviations for link in regressor.links]
         rotors = np.maximum(LINK_DEVIATION * prior[num_links:], LEAST_ROTOR_DEVIATION)
         deviation = np.concatenate([*deviations, rotors])
@@ -152,10 +151,8 @@ class ChannelFit:
         rigid, information = {}, np.zeros((len(prior), len(prior)))
         self._nominal = np.zeros_like(self._tau)
         for i in self.used:
-            drives = self._to_joint.matrix[:, i]
-            moved = np.flatnonzero(np.any(moves[np.flatnonzero(drives)], axis=0))
-            own = sum(drives[j] * Y[:, j, independent[moved]] for j in np.flatnonzero(drives))
-            filtered, to_base = self._filtered(own), base[moved]
+            own, columns = self._base.of_actuator(Y, self._to_joint.matrix[:, i])
+            filtered, to_base = self._filtered(columns), self._base.base[own]
             rigid[i] = filtered, to_base
             self._nominal[:, i] = filtered @ (to_base @ prior)
             scaled = to_base * deviation
@@ -262,28 +259,12 @@ class ChannelFit:
         return x[ends : len(x) - ends : 2]
 
 
-class _BaseColumns(NamedTuple):
-    """Columns of a regressor that the others depend on, see `independent_columns`.
-
-    Attributes:
-        independent, base: as `independent_columns` returns them.
-        moves: (n, b) where a column is not 0 for a joint.
-    """
-
-    independent: NDArray[np.int_]
-    base: NDArray[np.float64]
-    moves: NDArray[np.bool_]
-
-
 @cache
-def _regressors(arm: Arm) -> tuple[DynamicRegressor, list[DynamicRegressor], _BaseColumns]:
-    """The arm's regressor, those under a gravity of 1 m/s^2 along the base's x and y, and its independent columns."""
+def _regressors(arm: Arm) -> tuple[DynamicRegressor, list[DynamicRegressor], BaseColumns]:
+    """The arm's regressor, those under a gravity of 1 m/s^2 along the base's x and y, and its base columns."""
     regressor = DynamicRegressor(arm)
     lying = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
-    Y = at_random_states(regressor)[:, : 10 * len(regressor.links) + arm.num_joints]
-    independent, base = independent_columns(Y)
-    moves = np.any(Y[:, independent].reshape(-1, arm.num_joints, len(independent)), axis=0)
-    return regressor, lying, _BaseColumns(independent, base, moves)
+    return regressor, lying, base_columns([regressor])
 
 
 class _DriveEffects(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,16 +139,13 @@ def dynamic_columns(
         regressor: of the arm, mounted as expected.
         effects: to make columns of.
     """
-    arm, n = grid.arm, grid.arm.num_joints
-    p = len(regressor.values) - len(regressor.rotors) + n
+    arm = grid.arm
     # Efforts are linear in gravity: those at rest under a gravity of one are the derivative.
     lying = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]) if arm.identification.base_may_tilt]
-    independent, base = independent_columns(
-        np.concatenate([at_random_states(regressor), *map(at_random_states, lying)])[:, :p]
-    )
-    rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd), independent)
+    columns = base_columns([regressor, *lying])
+    rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd), columns)
     rest = np.zeros_like(grid.q)
-    tilts = [_filtered(grid, r.regressor(grid.q, rest, rest), independent) for r in lying]
+    tilts = [_filtered(grid, r.regressor(grid.q, rest, rest), columns) for r in lying]
     on_grid = np.column_stack(list(effect_shapes(regressor, effects, grid.q, grid.v)))
     rows = np.array([arm.effect_coordinates[effect.coordinate] for effect in effects])
     delays = np.array(grid.settings.effort_delay)
@@ -159,25 +157,57 @@ def dynamic_columns(
             by_delay[delay][:, acting] = grid.behind_filter(grid.at_rows(on_grid[:, acting], i))
     shapes = tuple(by_delay[delay] for delay in delays)
     return DynamicColumns(
-        grid.behind_filter(tau), base, rigid, np.array(tilts).reshape(-1, *rigid.shape), tuple(effects), shapes, rows
+        tau=grid.behind_filter(tau),
+        base=columns.base,
+        rigid=rigid,
+        tilts=np.array(tilts).reshape(-1, *rigid.shape),
+        effects=tuple(effects),
+        shapes=shapes,
+        rows=rows,
     )
 
 
-def at_random_states(regressor: DynamicRegressor) -> NDArray[np.float64]:
-    """(rows, p), many more than columns."""
+class BaseColumns(NamedTuple):
+    """Columns of an arm's regressors that the others depend on, see `independent_columns`.
+
+    Attributes:
+        independent, base: (b,) and (b, p), as `independent_columns` returns them.
+        moves: (n, b) where a column is not 0 for a joint.
+    """
+
+    independent: NDArray[np.int_]
+    base: NDArray[np.float64]
+    moves: NDArray[np.bool_]
+
+    def of_actuator(
+        self, Y: NDArray[np.float64], drives: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
+        """Which of the b columns an actuator has, and these (m, c), from a regressor (m, n, p) of the joints.
+
+        `drives` (n,): by how much each joint moves per unit of the actuator.
+        """
+        joints = np.flatnonzero(drives)
+        own = np.flatnonzero(np.any(self.moves[joints], axis=0))
+        return own, np.asarray(sum(drives[j] * Y[:, j, self.independent[own]] for j in joints))
+
+
+def base_columns(regressors: Sequence[DynamicRegressor]) -> BaseColumns:
+    """Of one arm under any of some gravities; without rotors that are coupled, see `rotor_inertias`."""
+    arm, p = regressors[0].arm, len(regressors[0].values)
     generator = np.random.default_rng(0)
-    q, v, vd = generator.normal(0, 2, (3, len(regressor.values) // 2, regressor.arm.num_joints))
-    return regressor.regressor(q, v, vd).reshape(-1, len(regressor.values))
+    q, v, vd = generator.normal(0, 2, (3, p // 2, arm.num_joints))
+    Y = np.concatenate([regressor.regressor(q, v, vd) for regressor in regressors])
+    Y = Y[..., : 10 * len(regressors[0].links) + arm.num_joints]
+    independent, base = independent_columns(Y.reshape(-1, Y.shape[2]))
+    return BaseColumns(independent, base, np.any(Y[..., independent], axis=0))
 
 
-def _filtered(grid: MotionGrid, Y: NDArray[np.float64], independent: NDArray[np.int_]) -> NDArray[np.float64]:
+def _filtered(grid: MotionGrid, Y: NDArray[np.float64], columns: BaseColumns) -> NDArray[np.float64]:
     """(r, n, b) independent columns of the actuators behind the filter, from a regressor (m, n, p) of the joints."""
-    J_inverse = grid.arm.transmission.inverse.matrix
-    out = np.zeros((len(range(*grid.inner.indices(len(grid.row_times)))), Y.shape[1], len(independent)))
-    for i in range(Y.shape[1]):
-        of_actuator = sum(J_inverse[j, i] * Y[:, j, independent] for j in np.flatnonzero(J_inverse[:, i]))
-        moved = np.flatnonzero(np.any(of_actuator, axis=0))
-        out[:, i, moved] = grid.behind_filter(grid.at_rows(of_actuator[:, moved], i))
+    out = np.zeros((len(range(*grid.inner.indices(len(grid.row_times)))), Y.shape[1], len(columns.independent)))
+    for i, drives in enumerate(grid.arm.transmission.inverse.matrix.T):
+        own, of_actuator = columns.of_actuator(Y, drives)
+        out[:, i, own] = grid.behind_filter(grid.at_rows(of_actuator, i))
     return out
 
 
