@@ -11,6 +11,7 @@ from scipy.linalg import matmul_toeplitz
 
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
+from dvrk_drake.analysis.signals.low_pass import correlation
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.dynamics.dynamic_section import (
     CorrelatedEstimates,
@@ -149,10 +150,8 @@ def error_covariance(
     Up to `MEMORY` it is the error's own, tapered (Parzen's window); whole periods later that of the part of it that
     repeats, which is what the first repetition shows.
     """
-    from scipy.signal import correlate  # takes 0.3 s, see `low_pass`
-
     count = len(seen)
-    both = correlate(seen, unseen, method="fft")
+    both = correlation(seen, unseen)
     lags = (both + both[::-1])[count - 1 :] / 2 / np.arange(count, 0, -1)
     reach = min(round(MEMORY * rate), count - 1)
     window = _parzen(np.arange(-reach, reach + 1) / reach)

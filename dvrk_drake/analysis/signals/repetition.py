@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.analysis.signals.low_pass import low_pass
+from dvrk_drake.analysis.signals.low_pass import correlation, low_pass
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid
 
 #: A motion repeats if, a period later, its positions differ by less than this share of their standard deviation
@@ -36,12 +36,10 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
     if not np.any(moving):
         return None
     x = (q[:, moving] - np.mean(q[:, moving], axis=0)) / deviation[moving]
-    from scipy.signal import correlate  # takes 0.3 s, see `low_pass`
-
     count = len(x)
     squares = np.cumsum(np.sum(x**2, axis=1))
     lags = np.arange(count)
-    product = sum(correlate(column, column, method="fft")[count - 1 :] for column in x.T)
+    product = sum(correlation(column, column)[count - 1 :] for column in x.T)
     # sum over t of (x(t) - x(t + T))^2, from running sums of squares and the autocorrelation.
     first, last = squares[count - 1 - lags], squares[-1] - np.concatenate([[0.0], squares[:-1]])[lags]
     difference = np.maximum(first + last - 2 * product, 0) / (count - lags) / (2 * x.shape[1])

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.signal import butter, correlate, sosfiltfilt
 
-from dvrk_drake.analysis.signals.low_pass import ORDER, central_difference, low_pass, resample
+from dvrk_drake.analysis.signals.low_pass import ORDER, central_difference, correlation, low_pass, resample
 
 RATE = 400.0
 T = np.arange(4000) / RATE
@@ -34,6 +35,21 @@ def test_low_pass_halves_the_amplitude_at_each_columns_cut_off():
     np.testing.assert_array_equal(y[:, 2:], x[:, 2:])  # at half the rate and above a column stays as it is
     np.testing.assert_allclose(low_pass(x[:, 0], RATE, 10.0), y[:, 0], atol=1e-12)
     np.testing.assert_allclose(low_pass(np.full(400, 3.0), RATE, 5.0), 3.0, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("order", [2, 4, 6])
+@pytest.mark.parametrize("cut_off", [0.5, 18.0, 150.0])
+def test_low_pass_and_correlation_are_scipys(order, cut_off):
+    x = np.random.default_rng(0).normal(size=(700, 5)).cumsum(axis=0)
+    expected = sosfiltfilt(butter(order, cut_off, fs=RATE, output="sos"), x, axis=0)
+    np.testing.assert_allclose(low_pass(x, RATE, cut_off, order), expected, rtol=1e-9, atol=1e-9)
+    a, b = x[:, :2].T
+    np.testing.assert_allclose(correlation(a, b), correlate(a, b), rtol=1e-9, atol=1e-6)
+
+
+def test_too_few_rows_for_the_filter_are_refused():
+    with pytest.raises(ValueError, match="needs more than 21 rows, got 21"):
+        low_pass(np.zeros(21), RATE, 10.0)
 
 
 def test_central_difference_is_exact_inside_a_parabola():
