@@ -5,6 +5,7 @@ Commands import what they need when they run: drake and numba take seconds, `--h
 
 from __future__ import annotations
 
+import gc
 import os
 import re
 import signal
@@ -60,7 +61,10 @@ def run(arguments: Sequence[str] | None) -> int:
         return 2
     try:
         if command.__module__.startswith("dvrk_drake."):  # not the help or the version
+            gc.disable()  # modules stay: to look among them for garbage takes a tenth of an import's time
             import_interruptibly()
+            gc.freeze()
+            gc.enable()
         if arguments is None:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         with folders_only_for_results():

@@ -13,15 +13,17 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
-import sympy
 from numpy.typing import NDArray
 
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
+
+if TYPE_CHECKING:
+    import sympy
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,8 @@ class ActuatorEffect:
 
     def of_position(self, x: sympy.Expr) -> sympy.Expr:
         """The shape at position x [rad, m] of the coordinate, of a kind in `POSITION_KINDS`."""
+        import sympy  # takes 0.3 s, and motions need none
+
         scale = sympy.Integer(int(self.scale)) if self.scale.is_integer() else sympy.Float(self.scale)
         return sympy.sympify(self._shape(sympy, x, scale))
 

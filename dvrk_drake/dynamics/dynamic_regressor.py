@@ -16,7 +16,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 
 from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParameter, reduce_to_base
-from dvrk_drake.dynamics.gravity_parameters import named_lengths
+from dvrk_drake.dynamics.gravity_parameters import labelled_bodies, named_lengths
 from dvrk_drake.dynamics.inertial_parameters import (
     PARAMETER_NAMES,
     LinkInertia,
@@ -28,7 +28,6 @@ from dvrk_drake.dynamics.inertial_parameters import (
 )
 from dvrk_drake.dynamics.kinematic_tree import KinematicTree
 from dvrk_drake.dynamics.regressor_kernel import fill_regressor
-from dvrk_drake.dynamics.symbolic_plant import labelled_bodies
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant

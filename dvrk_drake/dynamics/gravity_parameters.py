@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import JacobianWrtVariable, Joint, RigidBody
+from pydrake.multibody.tree import JacobianWrtVariable, Joint, ModelInstanceIndex, RigidBody
 
 from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParameter, reduce_to_base
 from dvrk_drake.dynamics.inertial_parameters import link_inertias, rotor_links
-from dvrk_drake.dynamics.symbolic_plant import arm_instance, exact_rotation, labelled_bodies
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import set_arm_positions, shared_plant, tree_selector
@@ -154,6 +153,32 @@ def _balanced_rotor(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
     along = np.outer(axis, axis)
     R_BC, p_BM = X_BC.rotation().matrix(), X_BC.multiply(p_CM)
     return np.block([[np.ones((1, 1)), np.zeros((1, 3))], [(p_BM - R_BC @ along @ p_CM)[:, None], R_BC @ along]])
+
+
+def labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[RigidBody, RigidTransform]]:
+    """Bodies by label with the frame F that their parameters are written in, X_BF; numbered links first.
+
+    The links are those with a frame <frames>_<number>, the base's 0 left out, or dh_<name> for links of a linkage.
+    """
+    bodies = {}
+    for index in plant.GetFrameIndices(arm_instance(plant)):
+        frame = plant.get_frame(index)
+        prefix, _, label = frame.name().partition("_")
+        if (prefix == frames or (prefix == "dh" and not label.isdigit())) and not plant.IsAnchored(frame.body()):
+            bodies[label] = (frame.body(), frame.GetFixedPoseInBodyFrame())
+    if not any(label.isdigit() for label in bodies):
+        raise ArmError(f'the SDF has no frames "{frames}_1", "{frames}_2", ...; try "dh"')
+    return dict(sorted(bodies.items(), key=lambda item: (not item[0].isdigit(), item[0])))
+
+
+def arm_instance(plant: MultibodyPlant) -> ModelInstanceIndex:
+    """The model instance of the arm in a plant that holds one."""
+    return plant.GetBodyByName("base_link").model_instance()
+
+
+def exact_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """R with the entries that are 0 or +-1 but for the rounding of their angles made exactly that."""
+    return np.where(np.abs(R - np.round(R)) < 1e-12, np.round(R), R)
 
 
 def named_lengths(

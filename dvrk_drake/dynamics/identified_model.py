@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +25,6 @@ from dvrk_drake.dynamics.dynamic_section import (
     SignalSettings,
 )
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
-from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
@@ -34,6 +33,9 @@ from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import missing_key, schema_fault, within
 from dvrk_drake.models.sdf_model import PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
+
+if TYPE_CHECKING:
+    from dvrk_drake.dynamics.static_model import StaticModel
 
 # No postponed annotations here: yaml_load_typed reads the types at run time.
 
@@ -288,8 +290,10 @@ class IdentifiedModel(_Identified):
         return np.array([joint.trust for joint in self.joints])
 
     @cached_property
-    def static_model(self) -> StaticModel:
+    def static_model(self) -> "StaticModel":
         """The compiled structure that `theta` belongs to."""
+        from dvrk_drake.dynamics.static_model import compile_static_model  # sympy takes 0.3 s, and motions need none
+
         return compile_static_model(self.arm, tuple(map(ActuatorEffect.of, self.holding_effects)))
 
     @cached_property

@@ -10,10 +10,9 @@ import sympy
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
+from dvrk_drake.dynamics.gravity_parameters import exact_rotation, labelled_bodies
 from dvrk_drake.dynamics.trigonometric_ring import Polynomial, TrigonometricRing, exact_half
-from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant, tree_selector
 
@@ -93,11 +92,6 @@ def _dot(numbers: NDArray[np.float64], expressions: Sequence[symbolic.Expression
     return sum(terms, symbolic.Expression(0))
 
 
-def exact_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """R with the entries that are 0 or +-1 but for the rounding of their angles made exactly that."""
-    return np.where(np.abs(R - np.round(R)) < 1e-12, np.round(R), R)
-
-
 def _exact_matrix(X: RigidTransform) -> NDArray[np.float64]:
     """X as a matrix, (4, 4), with an exact rotation."""
     matrix = X.GetAsMatrix4()
@@ -110,27 +104,6 @@ def _tree_positions(arm: Arm, q: list[symbolic.Variable]) -> list[symbolic.Expre
     return [
         sum((G[row, j] * q[j] for j in np.flatnonzero(G[row])), symbolic.Expression(c[row])) for row in range(len(c))
     ]
-
-
-def labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[RigidBody, RigidTransform]]:
-    """Bodies by label with the frame F that their parameters are written in, X_BF; numbered links first.
-
-    The links are those with a frame <frames>_<number>, the base's 0 left out, or dh_<name> for links of a linkage.
-    """
-    bodies = {}
-    for index in plant.GetFrameIndices(arm_instance(plant)):
-        frame = plant.get_frame(index)
-        prefix, _, label = frame.name().partition("_")
-        if (prefix == frames or (prefix == "dh" and not label.isdigit())) and not plant.IsAnchored(frame.body()):
-            bodies[label] = (frame.body(), frame.GetFixedPoseInBodyFrame())
-    if not any(label.isdigit() for label in bodies):
-        raise ArmError(f'the SDF has no frames "{frames}_1", "{frames}_2", ...; try "dh"')
-    return dict(sorted(bodies.items(), key=lambda item: (not item[0].isdigit(), item[0])))
-
-
-def arm_instance(plant: MultibodyPlant) -> ModelInstanceIndex:
-    """The model instance of the arm in a plant that holds one."""
-    return plant.GetBodyByName("base_link").model_instance()
 
 
 def _parallel_sums(plant: MultibodyPlant, arm: Arm, q: Sequence[sympy.Symbol]) -> list[tuple[sympy.Expr, sympy.Expr]]:

@@ -20,7 +20,7 @@ from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.analysis.verdict import cross_validated_verdicts, rule_text, worst
 from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect
 from dvrk_drake.dynamics.dynamic_section import CorrelatedEstimates, DynamicSection
-from dvrk_drake.dynamics.gravity_regressor import derive_gravity
+from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.dynamics.physical_consistency import total_mass_reached
 from dvrk_drake.models.arm import Arm
@@ -335,7 +335,7 @@ def print_static_parameters(console: Console, model: IdentifiedModel) -> None:
     """Parameters of a static model with their standard errors, then how each joint was fitted."""
     provenance = model.provenance
     table = make_table("Base parameters", "", "value", "standard error", "unit", "")
-    units = derive_gravity(model.arm).base.units
+    units = gravity_parameters(model.arm).base.units
     for p, unit in zip(model.base_parameters, units, strict=True):
         zero = "" if p.distinguishable else "zero?"
         table.add_row(escape(p.name), f"{p.value:+.5f}", f"{p.standard_error:.5f}", unit, zero)

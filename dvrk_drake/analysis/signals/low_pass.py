@@ -36,7 +36,7 @@ def low_pass(x: NDArray[np.float64], rate: float, cut_off: ArrayLike, order: int
 
 
 def _forwards_and_backwards(x: NDArray[np.float64], cut_off: float, order: int) -> NDArray[np.float64]:
-    """Filters columns (m, k), continued beyond both ends by their point reflection; `cut_off` is a share of the rate."""
+    """Filters columns (m, k), continued beyond both ends by reflection in a point; `cut_off`: share of the rate."""
     if cut_off >= 0.5:
         return x
     sos = butterworth(order, cut_off)

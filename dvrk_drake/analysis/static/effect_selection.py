@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,10 @@ from dvrk_drake.dynamics.actuator_effects import (
     slides,
     spring_over,
 )
-from dvrk_drake.dynamics.static_model import StaticModel, compile_static_model
 from dvrk_drake.models.arm import Arm
+
+if TYPE_CHECKING:
+    from dvrk_drake.dynamics.static_model import StaticModel
 
 #: Prior standard deviation of a base parameter, as a share of what would use up some joint's effort limit by itself.
 BASE_PRIOR = 0.25
@@ -41,6 +44,8 @@ class StaticProblem:
 
     def __init__(self, arm: Arm, q: NDArray[np.float64], tau: NDArray[np.float64], usable: NDArray[np.bool_]):
         """Of poses q (m, n) and torques tau (m, n) with `usable` (m, n) False where a measurement is doubted."""
+        from dvrk_drake.dynamics.static_model import compile_static_model  # sympy takes 0.3 s, and motions need none
+
         self.arm, self.q, self.tau, self.usable = arm, q, tau, usable
         self.base_model = compile_static_model(arm)
         self._Y = self.base_model.regressor(q)

@@ -21,7 +21,6 @@ from dvrk_drake.dynamics.identified_model import (
     JointStatistics,
     Provenance,
 )
-from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
@@ -86,6 +85,8 @@ def identify_static(
         RecordingError: the recording does not fit the arm or has no efforts.
         IdentificationError: too few poses, a motion instead of poses, or (method "paper") a rank too low.
     """
+    from dvrk_drake.dynamics.static_model import compile_static_model  # sympy takes 0.3 s, and motions need none
+
     if method not in get_args(Method):
         raise IdentificationError(f'method is "{method}"; allowed: {", ".join(get_args(Method))}')
     recording = usable_poses(recording, arm, averaged=method == "robust" and measured is None)
