@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 from pydrake.geometry import Role, SceneGraphInspector
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
@@ -177,16 +178,21 @@ def consistent_parameters(
     program = MathematicalProgram()
     # In z = R x the cost is a sphere: what motions tell differs by many decades, which no scaling of x takes away.
     z = program.NewContinuousVariables(len(b), "z")
-    to_x = np.asarray(np.linalg.inv(R), dtype=np.float64)
-    program.AddQuadraticCost(np.eye(len(b)), -b, z, is_convex=True)
+    # With the links last, R is a triangle in which they depend on few z, which Clarabel's matrices are sparse with.
+    order = np.roll(np.arange(len(b)), -10 * len(links))
+    Q, triangle = np.linalg.qr(R[:, order])
+    to_x = np.empty_like(R)
+    to_x[order] = scipy.linalg.solve_triangular(triangle, np.eye(len(b)))
+    program.AddQuadraticCost(np.eye(len(b)), -Q.T @ b, z, is_convex=True)
     bounded = np.flatnonzero(np.isfinite(lower))
     size = np.linalg.norm(to_x[bounded], axis=1)
     high = np.full(len(bounded), np.inf)
     program.AddLinearConstraint(to_x[bounded] / size[:, None], lower[bounded] / size, high, z)
     for k, link in enumerate(links):
         to_link = to_x[10 * k : 10 * k + 10]
-        _add_prior(program, z, to_link, link)
-        _constrain_link(program, z, to_link, link, boxes[link.link])
+        own = np.flatnonzero(np.any(to_link, axis=0))
+        _add_prior(program, z[own], to_link[:, own], link)
+        _constrain_link(program, z[own], to_link[:, own], link, boxes[link.link])
     share = TOTAL_MASS_TOLERANCE
     total = np.sum(to_x[: 10 * len(links) : 10], axis=0) / _total_mass(links)
     program.AddLinearConstraint(total[None], [1 - share], [1 + share], z)
