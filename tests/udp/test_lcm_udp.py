@@ -402,8 +402,8 @@ def test_commands_that_are_played_again_from_a_log_are_refused(arm, tmp_path):
 @inside
 def test_an_arm_that_is_killed_and_restarted_hears_nothing_from_run_nor_from_a_log(tmp_path):
     """A watchdog test, since `run` ends where the computer stops the arm's guard for 40 ms again and again."""
-    observer, on_other = Observer("mtml", OTHER_URL), ("--realtime", "--lcm-url", OTHER_URL)
-    arm, run = start_arm("mtml", *PATIENT, *on_other), start_run("mtml", "--mode", "hold", *on_other)
+    observer, on_other = Observer("mtml", OTHER_URL), ("--lcm-url", OTHER_URL)
+    arm, run = start_arm("mtml", *PATIENT, *on_other), start_run("mtml", "--mode", "hold", "--realtime", *on_other)
     try:
         with Logged(tmp_path / "commands", OTHER_URL) as log:
             begun = observer.until(takes_efforts, "run", process=run)
