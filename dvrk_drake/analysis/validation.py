@@ -103,6 +103,7 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
     # What finds and checks a motion needs efforts.
     measured = recording if recording.tau is not None else replace(recording, tau=np.zeros_like(recording.q))
     if model.dynamics is None or not find_poses(measured, arm).moves:
+        step_progress(progress, "predicting")(0.0)
         return Prediction(predict_static(model, recording))
     report = require_usable(measured, arm, progress, apart_from="no effort" if recording.tau is None else "")
     share = step_progress(progress, "predicting")

@@ -105,7 +105,7 @@ def _add_random_poses(name: str, path: str, count: int, seed: int) -> None:
     arm = load_arm(name)
     poses = load_poses_if_any(path, arm)
     # Near its limits an arm's guard pushes back, and there is no room to come from both sides.
-    added = arm.sample_poses(count, np.random.default_rng(seed), margin=0.1)
+    added = arm.sample_poses(count, np.random.default_rng([seed, len(poses)]), margin=0.1)
     poses = np.vstack([poses, added])
     save_poses(poses, arm, path)
     print_written(path, f"{len(poses)} poses of {arm.name}")

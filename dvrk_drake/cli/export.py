@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Group, Parameter
@@ -63,7 +64,7 @@ def export(
     """
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.export.model_export import prepare_export
-    from dvrk_drake.export.sdf import sdf_difference
+    from dvrk_drake.export.sdf import mesh_folder, refuse_existing_meshes, sdf_difference
     from dvrk_drake.reports.export import print_export
     from dvrk_drake.reports.terminal_tables import make_console
 
@@ -75,12 +76,14 @@ def export(
     }
     outputs = {format: path for format, path in named.items() if path is not None}
     if not outputs and not diff:
-        raise DvrkDrakeError(f"nothing to write; give {' or '.join('--' + format for format in named)}")
+        raise DvrkDrakeError(f"nothing to write; give {' or '.join('--' + format for format in named)}, or --diff")
     if friction and coulomb is not None:
         raise DvrkDrakeError("--friction and --coulomb both say how large friction is; give one")
     loaded = load_model(model, arm)
-    for path in outputs.values():
+    for format, path in outputs.items():
         check_output(path, model or "", overwrite=overwrite)
+        if format in ("sdf", "urdf"):
+            refuse_existing_meshes(path, overwrite)
     settings: dict[str, Any] = {
         "tolerance": gc_tolerance,
         "friction": friction if coulomb is None else coulomb,
@@ -94,8 +97,13 @@ def export(
         exports = {format: prepare_export(loaded, format, origin=origin, **settings) for format in outputs}
     for format, path in outputs.items():
         exports[format].write(path)
-        print_export(make_console(), path, exports[format], verbose=verbose)
+    for format, path in outputs.items():
+        if format != "urdf" or "sdf" not in outputs:  # they state the same
+            print_export(make_console(), path, exports[format], verbose=verbose)
+    for format, path in outputs.items():
         print_written(path)
+        if format in ("sdf", "urdf"):
+            print_written(Path(path).with_name(mesh_folder(Path(path))), "meshes")
     if diff:
         bodies = model_bodies(loaded)
         sys.stdout.write(sdf_difference(loaded.arm, bodies.links, bodies.rotors))
@@ -135,6 +143,8 @@ def compare_gc(
             comparison = compare_compensation(installed, loaded)
     except ModelError as error:
         raise ModelError(f"{file}: {error}") from error
+    if json is not None:
+        write_json(json, comparison.as_dict())
     print_comparison(make_console(), file, origin, comparison, verbose=verbose)
     for warning in comparison.warnings:
         print(f"dvrk-drake: warning: {file}: {warning}", file=sys.stderr, flush=True)
@@ -144,5 +154,4 @@ def compare_gc(
         plot_compensation(folder / "compensation.png", comparison, f"{file} and {origin} over the joint box, at rest")
         print_written(folder)
     if json is not None:
-        write_json(json, comparison.as_dict())
         print_written(json)

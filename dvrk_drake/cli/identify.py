@@ -73,17 +73,19 @@ def identify(
         read = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
         print_notes(recording, read.notes)
         result = dvrk.identify(read, recorded_arm, method=method, slow_parts=slow_parts, progress=steps)
+    # Before anything is printed: whoever reads the output may close it (head).
+    result.save(output, overwrite=True)
+    if folder is not None:
+        from dvrk_drake.reports.figures.identification import plot_identification
+
+        plot_identification(folder, result)
     console = make_console()
     print_identification(console, result, model_path=output, verbose=verbose)
     if result.note:
         console.print(result.note)
     print_warnings(console, result.warnings)
-    result.save(output, overwrite=True)
     print_written(output)
     if folder is not None:
-        from dvrk_drake.reports.figures.identification import plot_identification
-
-        plot_identification(folder, result)
         print_written(folder)
 
 
@@ -116,7 +118,7 @@ def validate(
 
     Args:
         require: Exit code 2 unless every joint that the model commands has this verdict or a better one.
-        save: Store the verdicts in the model file, where run looks for them.
+        save: Add the verdicts to the model file, where run looks for them.
     """
     from dvrk_drake.reports.identification import print_validation
     from dvrk_drake.reports.terminal_tables import make_console
@@ -139,15 +141,16 @@ def validate(
         validation.save(model, overwrite=True)
     if json is not None:
         write_json(json, validation.as_dict())
+    if folder is not None:
+        from dvrk_drake.reports.figures.identification import plot_validation
+
+        plot_validation(folder, validation)
     console = make_console()
     print_validation(console, validation, model_path=model, verbose=verbose)
     if validation.note:
         console.print(validation.note)
     print_warnings(console, validation.warnings)
     if folder is not None:
-        from dvrk_drake.reports.figures.identification import plot_validation
-
-        plot_validation(folder, validation)
         print_written(folder)
     if json is not None:
         print_written(json)
@@ -183,9 +186,9 @@ def predict(
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "predicting") as steps:
         prediction = dvrk.predict(*_model_and_recording(model, recording, coordinates, steps), progress=steps)
-    print_warnings(make_console(), prediction.warnings)
     tau = prediction.tau
     write_csv(output, [f"tau{i + 1}" for i in range(tau.shape[1])], tau)
+    print_warnings(make_console(), prediction.warnings)
     print_written(output, f"{len(tau)} rows")
 
 
@@ -210,8 +213,8 @@ def recalibrate(
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "refitting friction") as steps:
         result = dvrk.recalibrate(*_model_and_recording(model, recording, coordinates, steps), progress=steps)
-    print_recalibration(make_console(), result, model_path=output, verbose=verbose)
     result.save(output, overwrite=True)
+    print_recalibration(make_console(), result, model_path=output, verbose=verbose)
     print_written(output)
 
 
@@ -255,9 +258,10 @@ def payload(
         for recording in (without, with_it):
             print_notes(recording.source, recording.notes)
         result = dvrk.payload(without, with_it, known or recorded_arm, link, progress=steps)
+    if json is not None:
+        write_json(json, result.as_dicts())
     console = make_console()
     print_payload(console, result, model_path=model, verbose=verbose)
     print_warnings(console, [warning for warning in result.warnings if warning.kind == "other link"])
     if json is not None:
-        write_json(json, result.as_dicts())
         print_written(json)

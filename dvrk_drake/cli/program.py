@@ -76,6 +76,9 @@ def run(arguments: Sequence[str] | None) -> int:
         # The reader (head, less) has seen enough.
         sys.stderr.close()
         return 0
+    except OSError as error:  # the disk is full, for example
+        print(f"dvrk-drake: error: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("dvrk-drake: interrupted", file=sys.stderr)
         return 130
@@ -96,7 +99,10 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
         message = error.exception_message if error.group else message.replace(". must", ": must")
     elif isinstance(error, UnusedCliTokensError):
         message = f"Unexpected argument: {' '.join(error.unused_tokens or [])}"
-    elif isinstance(error, MissingArgumentError) and error.argument and error.argument.name not in options:
+    elif isinstance(error, MissingArgumentError) and error.argument and error.argument.name in options:
+        count, given = error.argument.token_count()[0], len(error.tokens_so_far)
+        message = f"{error.argument.name} needs {f'{count} values, got {given}' if count > 1 else 'a value'}"
+    elif isinstance(error, MissingArgumentError) and error.argument:
         suggestion = re.search(r"Did you mean .*", message)
         message = f"{error.argument.name} is required"
         if suggestion:

@@ -42,9 +42,12 @@ def check(
     with Steps("reading", "checking the recording") as steps:
         checked = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
         report = dvrk.check(checked, recorded_arm, progress=steps)
-    print_report(make_console(), report, arm=arm, verbose=verbose)
+    # Before anything is printed: whoever reads the output may close it (head).
     if json is not None:
         write_json(json, report.as_dict())
+    options = arm if coordinates == "joint" else f"{arm} --coordinates {coordinates}"
+    print_report(make_console(), report, arm=options, verbose=verbose)
+    if json is not None:
         print_written(json)
     if folder is not None:
         from dvrk_drake.reports.figures.recording_check import plot_report

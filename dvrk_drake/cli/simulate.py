@@ -58,9 +58,10 @@ def simulate(
     with Steps("simulating") as steps:
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
     named = (scenario or f"--arm {arm}") if folder is None else None
-    print_simulation(make_console(), simulation, loaded.mounted_arm, scenario=named, verbose=verbose)
     if output is not None:
         dvrk.write_recording(simulation.recording, output)
+    print_simulation(make_console(), simulation, loaded.mounted_arm, scenario=named, verbose=verbose)
+    if output is not None:
         print_written(output, f"{len(simulation.recording)} rows")
     if folder is not None:
         from dvrk_drake.reports.figures.simulation import plot_simulation
@@ -164,10 +165,11 @@ def tune(
     step = f"tuning {tuned.name}"
     with Steps(step) as steps:
         tuning = tune_arm(arm, methods, step_progress(steps, step))
-    print_tuning(make_console(), tuning, gains_path=output, verbose=verbose)
     best = tuning.comparison.best(tuning.found)
     if output is not None:
         save_gains(tuning.found[best], output, f"{tuned.name}: dvrk-drake tune --arm {arm}, method {best}.")
+    print_tuning(make_console(), tuning, gains_path=output, verbose=verbose)
+    if output is not None:
         print_written(output)
     if folder is not None:
         from dvrk_drake.reports.figures.tuning import plot_steps
@@ -222,13 +224,15 @@ def transparency(
         check_output(output, path or "", *(model or []), overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
     felt = []
-    with Steps(*(compensation.name for compensation in compensations)) as steps:
-        for compensation in compensations:
-            progress = step_progress(steps, compensation.name)
+    names = [f"compensation by {compensation.name}" for compensation in compensations]
+    with Steps(*names) as steps:
+        for name, compensation in zip(names, compensations, strict=True):
+            progress = step_progress(steps, name)
             felt.append(feel(led, followed, compensation, effects=effects, frame_name=frame, progress=progress))
-    print_transparency(make_console(), led, felt, verbose=verbose)
     if output is not None:
         write_transparency(Path(output), felt)
+    print_transparency(make_console(), led, felt, verbose=verbose)
+    if output is not None:
         print_written(output)
     if folder is not None:
         from dvrk_drake.reports.figures.transparency import plot_transparency
@@ -253,6 +257,8 @@ def _compensations(arm: dvrk.Arm, paths: list[str], friction_ratio: float) -> li
         name = Path(path).stem
         if name in models:
             raise ModelError(f"--model {path}: another model is named {name} too; rename one file")
+        if "=" in path and not Path(path).is_file():
+            raise ModelError(f"--model {path}: no such file; give a file alone, a model is named by its file")
         models[name] = dvrk.IdentifiedModel.load(path, arm)
     if not models:
         models["SDF"] = dvrk.IdentifiedModel.from_arm(arm)

@@ -99,6 +99,7 @@ def check_output(path: str, *inputs: str, overwrite: bool) -> None:
         overwrite: an existing file is replaced: the user said so, or the command goes on with its own output.
     """
     target = Path(os.path.realpath(path))
+    _refuse_twice(path)
     if not target.parent.is_dir():
         raise DvrkDrakeError(f"{path}: cannot be written: its folder does not exist")
     if os.path.exists(target) and not target.is_file():
@@ -117,9 +118,18 @@ def check_output(path: str, *inputs: str, overwrite: bool) -> None:
         raise DvrkDrakeError(f"{path}: exists already; name another file, or replace it with --overwrite")
 
 
+def _refuse_twice(path: str) -> None:
+    """Refuses a second output of this command with the same name."""
+    if (target := Path(os.path.realpath(path))) in _outputs:
+        raise DvrkDrakeError(f"{path}: is named for two outputs; name another file or folder for one")
+    _outputs.add(target)
+
+
 #: Bars on a terminal at most; finished steps give way.
 MOST_BARS = 6
 
+#: Outputs of this command.
+_outputs: set[Path] = set()
 #: Folders that were made, each before the one that it is in.
 _made: list[Path] = []
 
@@ -131,6 +141,7 @@ def new_folder(path: str, *, overwrite: bool) -> Path:
         path: of the folder.
         overwrite: files that are there may be replaced: the user said so.
     """
+    _refuse_twice(path)
     folder = Path(path).absolute()
     missing = [place for place in (folder, *folder.parents) if not os.path.exists(place)]
     try:
@@ -139,7 +150,7 @@ def new_folder(path: str, *, overwrite: bool) -> Path:
     except OSError as error:
         raise DvrkDrakeError(f"{path}: cannot be made a folder: {error.strerror}") from error
     if filled and not overwrite:
-        raise DvrkDrakeError(f"{path}: holds files already; name another folder, or replace them with --overwrite")
+        raise DvrkDrakeError(f"{path}: holds files already; name another folder, or write into it with --overwrite")
     _made[:0] = missing
     return Path(path)
 
@@ -162,6 +173,7 @@ def print_written(path: str | Path, what: str = "") -> None:
 def folders_only_for_results() -> Iterator[None]:
     """Where the block is left by an error or by Ctrl-C, the folders that it made and that are empty are gone again."""
     _made.clear()
+    _outputs.clear()
     try:
         yield
     except BaseException:
@@ -172,11 +184,12 @@ def folders_only_for_results() -> Iterator[None]:
 
 
 def until_stopped(meshcat: Meshcat, meanwhile: Callable[[], object] = lambda: None) -> None:
-    """Serves a Meshcat page until its Stop button or Escape is pressed; `meanwhile` is called all the time."""
+    """Serves a Meshcat page until its Stop button, Escape or Ctrl-C is pressed; calls `meanwhile` all the time."""
     meshcat.AddButton("Stop", "Escape")
-    while meshcat.GetButtonClicks("Stop") == 0:
-        meanwhile()
-        time.sleep(0.03)
+    with suppress(KeyboardInterrupt):
+        while meshcat.GetButtonClicks("Stop") == 0:
+            meanwhile()
+            time.sleep(0.03)
 
 
 def load_model(model: str | None, arm: str | None) -> IdentifiedModel:

@@ -260,7 +260,7 @@ def _refuse_errors(
     if lean > 0.05:
         limits.append(f"an upright base, which here leans by {lean:.1f} deg")
     if np.any((model.trust != 0) & (model.trust != 1)):
-        limits.append("trust only where it is 1")
+        limits.append("no feedforward scale below 1")
     reasons = {
         f"gravity {gravity_off.max():.2g} (the file knows {', '.join(limits)})": gravity_off.max(),
         f"effects {effects_off.max():.2g} (it knows polynomials of order 4 in a joint's own position, nothing at "

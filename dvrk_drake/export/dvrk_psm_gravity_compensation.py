@@ -127,8 +127,9 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
         off = ", ".join(f"{name} {e:.2g}" for name, e in zip(ARM_JOINTS, error, strict=True) if e > tolerance)
         raise ModelError(
             f"the controller's file cannot hold this model: over the joint box it would be off by up to {off} "
-            "(N m; N on insertion). It knows gravity only, and trust only where it is 1; left out: "
-            f"{_left_out(model, straight)}. To accept it: --gc-tolerance {round_up(error.max()):g}"
+            "(N m; N on insertion). It knows gravity only, and no feedforward scale below 1; left out: "
+            f"{_left_out(model, straight)}. To accept it, repeat the command with "
+            f"--gc-tolerance {round_up(error.max()):g}"
         )
     center = np.divide(known[:, 1:], mass[:, None], out=np.zeros((7, 3)), where=mass[:, None] > 0)
     wrist = np.abs(model.holding_torque(q)[:, :3] - tau_model).max(axis=0)

@@ -13,7 +13,7 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model, dry_friction
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import KinematicCompensation, kinematic_compensation
-from dvrk_drake.export.sdf import write_sdf
+from dvrk_drake.export.sdf import refuse_existing_meshes, write_sdf
 from dvrk_drake.export.urdf import write_urdf
 from dvrk_drake.models.files import refuse_existing
 
@@ -138,6 +138,8 @@ def export_model(
             raise ModelError(f"{path}: its format is not clear; state one of {', '.join(get_args(Format))}")
         format = "sdf" if suffix == ".sdf" else "urdf"
     refuse_existing(path, overwrite)
+    if format in ("sdf", "urdf"):
+        refuse_existing_meshes(path, overwrite)
     export = prepare_export(
         model,
         format,

@@ -182,6 +182,15 @@ def mesh_folder(model_path: Path) -> str:
     return f"{model_path.stem}_meshes"
 
 
+def refuse_existing_meshes(model_path: str | Path, overwrite: bool) -> None:
+    """Raises DvrkDrakeError if the folder for a model's meshes holds files, unless they may be replaced."""
+    folder = Path(model_path).with_name(mesh_folder(Path(model_path)))
+    if not overwrite and folder.is_dir() and any(folder.iterdir()):
+        raise DvrkDrakeError(
+            f"{folder}: holds files already; name another model file, or write into it with --overwrite"
+        )
+
+
 def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, Path]:
     """Makes every `<uri>` of a composed model relative to `model_path`: meshes in `mesh_folder`.
 

@@ -45,6 +45,12 @@ def _source(model: IdentifiedModel, origin: str) -> str:
     return f"--{'arm' if origin == model.arm.source else 'model'} {origin}"
 
 
+def _next_step(model: IdentifiedModel, origin: str) -> str:
+    if origin == model.arm.source:  # whose masses are estimates
+        return f"dvrk-drake identify RECORDING.csv --arm {origin} --output MODEL.yaml"
+    return f"dvrk-drake export --model {origin} --dvrk-gc NEW.json"
+
+
 def _print_bodies(console: Console, arm: Arm, export: ModelExport, bodies: ModelBodies, verbose: bool) -> None:
     changes = changed_links(arm, bodies.links)
     answer = f"The {export.format.upper()} states the inertias of the arm's own SDF."
@@ -166,7 +172,7 @@ def print_comparison(
         console,
         f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). At {wrong:.0f} % of "
         f"the poses a joint is at its clip, runs away or opposes the model.",
-        f"dvrk-drake export {_source(comparison.model, model_name)} --dvrk-gc NEW.json",
+        _next_step(comparison.model, model_name),
         "yellow" if wrong else "green",
     )
     table = make_table(

@@ -25,6 +25,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.dynamics.physical_consistency import total_mass_reached
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
 #: Colours of rows by verdict.
@@ -47,7 +48,7 @@ def print_identification(
     verdicts = cross_validated_verdicts(result.model)
     next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
     if worst(verdicts)[0] == "do not use":
-        next_command = f"dvrk-drake check {result.recording.source or 'RECORDING.csv'} --arm {result.model.arm.source}"
+        next_command = f"dvrk-drake check {_source(result.recording)} --arm {result.model.arm.source}"
     if isinstance(result, DynamicIdentification):
         actuators = result.model.dynamic_model.section.actuators
         fit, held_out = (
@@ -70,6 +71,12 @@ def print_identification(
             _print_pose_details(console, result)
 
 
+def _source(recording: Recording) -> str:
+    """Arguments that name a recording and its coordinates."""
+    coordinates = "" if recording.coordinates == "joint" else f" --coordinates {recording.coordinates}"
+    return f"{recording.source or 'RECORDING.csv'}{coordinates}"
+
+
 def print_validation(
     console: Console, validation: Validation, *, model_path: str = "MODEL.yaml", verbose: bool = False
 ) -> None:
@@ -82,7 +89,7 @@ def print_validation(
         verbose: also print the rule behind the verdicts, the kinds of errors, and the excluded measurements.
     """
     verdicts, model = validation.verdicts, validation.model
-    source = validation.recording.source or "RECORDING.csv"
+    source = _source(validation.recording)
     next_command = f"dvrk-drake run --arm {model.arm.source} --model {model_path} --mode gravity"
     if validation.of_same_recording:
         next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
@@ -159,7 +166,7 @@ def print_recalibration(
 def _print_verdict(console: Console, verdicts: Mapping[str, Verdict], error: str, next_command: str) -> None:
     """The least favourable verdict and the joints that have it, the error, and the joints without torque."""
     verdict, names = worst(verdicts)
-    which = "" if len(names) == len(verdicts) else f" ({', '.join(names)})"
+    which = "" if verdict == "good" or len(names) == len(verdicts) else f" ({', '.join(names)})"
     off = [name for name, v in verdicts.items() if v == "off"]
     disabled = f" Feedforward disabled: {', '.join(off)}." if off else ""
     answer = f"Verdict: {verdict}{which}. {error}{disabled}"
@@ -314,11 +321,13 @@ def _print_pose_errors(console: Console, result: StaticIdentification, verdicts:
             style=_STYLES.get(verdict, ""),
         )
     console.print(table)
+    if result.doubts:
+        console.print("--verbose lists the excluded measurements and why.")
     if poses < result.num_rows:
         console.print(f"{result.num_rows} rows are {poses} distinct poses: repeated samples of a pose are averaged.")
     for j in joints:
         if j.trust == 0.0:
-            why = "the joint moved too little to separate gravity from friction"
+            why = "the recording cannot separate its gravity from friction"
             if j.rms_zero_torque == 0.0:
                 why = "no holding torque was measured"
             console.print(f"{j.name}: feedforward disabled: {why}", style="yellow", markup=False)

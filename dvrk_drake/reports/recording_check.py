@@ -18,13 +18,13 @@ def print_report(console: Console, report: RecordingReport, *, arm: str = "ARM",
     Args:
         console: to print to.
         report: to print.
-        arm: value of --arm, for the next command.
+        arm: value of --arm and what follows, for the next command.
         verbose: also print the notes, and the numbers of each actuator's signals.
     """
     _print_verdict(console, report, arm)
     notes = [finding for finding in report.findings if finding.severity == "note"]
     for finding in [*report.warnings, *(notes if verbose else [])]:
-        console.print(str(finding), style=_STYLES[finding.severity], markup=False)
+        console.print(str(finding), style=_STYLES[finding.severity], markup=False, soft_wrap=True)
     if notes and not verbose:
         console.print(f"{_count(len(notes), 'note')}: --verbose prints {'it' if len(notes) == 1 else 'them'}.")
     if report.warnings or notes:
@@ -56,7 +56,7 @@ def _print_verdict(console: Console, report: RecordingReport, arm: str) -> None:
 def _print_joints(console: Console, report: RecordingReport) -> None:
     columns = ("", "range [rad; m]", "share of limits", "RMS effort [N m; N]", "peak / effort limit")
     periodic = report.period is not None
-    table = make_table("Positions and efforts", *columns, *(["repeatability"] if periodic else []))
+    table = make_table("Positions and efforts of the joints", *columns, *(["repeatability"] if periodic else []))
     for joint in report.joints:
         cells = [f"{joint.range:.3f}", f"{100 * joint.coverage:.0f} %"]
         cells += [_number(joint.effort, "{:.4f}"), _number(joint.peak_effort, "{:.0f} %", 1e2)]

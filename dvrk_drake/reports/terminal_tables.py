@@ -42,6 +42,10 @@ class TableConsole(Console):
         finally:
             self.width = width
 
+    def on_broken_pipe(self) -> None:
+        """Leaves it to the program that the reader has seen enough; rich would end the process with an error."""
+        raise BrokenPipeError
+
     def _width_of(self, table: Table, folded: bool = False) -> int:
         """With the numbers on one line each, and with names if not `folded`. Rich's own measure breaks numbers."""
         free = self.options.update(max_width=10 * TABLE_WIDTH)

@@ -117,7 +117,7 @@ def studied(console, verbose):
     )
     rows = {c.index: Row({"held": c.index % 3 > 0, "drift": 1e-3 * c.index, "effort_share": 0.1}) for c in what.cases}
     rows[5] = Row({}, "RuntimeError: the solver failed")
-    study.print_study(console, what, rows, verbose=verbose)
+    study.print_study(console, what, rows, study_path="study.yaml", verbose=verbose)
 
 
 def tuned(console, verbose):

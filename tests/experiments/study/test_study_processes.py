@@ -11,6 +11,7 @@ from pathlib import Path
 
 import formula_study
 import pytest
+from command_output import messages
 from patience import PATIENCE, wait_until
 
 import dvrk_drake.experiments.study.study as study_module
@@ -109,7 +110,7 @@ def test_a_killed_study_goes_on_and_a_killed_worker_costs_nothing(study, started
     os.kill(children_of(second)[0], signal.SIGKILL)
     sell(20)
     output, error = second.communicate(timeout=PATIENCE)
-    assert (second.returncode, error) == (0, "")
+    assert (second.returncode, messages(error)) == (0, [])
     assert "nominal: 2 of 5 runs" in output
     monkeypatch.delenv(formula_study.TICKETS)
     assert path.read_bytes() == undisturbed(study)
@@ -146,6 +147,6 @@ def test_ctrl_c_ends_in_one_line_and_leaves_no_worker(study, started, sell, tmp_
     workers = children_of(run)
     run.send_signal(signal.SIGINT)
     _, error = run.communicate(timeout=PATIENCE)
-    assert (run.returncode, error) == (130, "dvrk-drake: interrupted\n")
+    assert (run.returncode, messages(error)) == (130, ["dvrk-drake: interrupted"])
     assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
     assert rows_in(path) == 1
