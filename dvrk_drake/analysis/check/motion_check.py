@@ -243,7 +243,8 @@ def _noise(
     joints = [replace(joint, floor=float(value)) for joint, value in zip(joints, floor, strict=True)]
     what = f"repeats every {period:.4f} s ({1 / period:.4f} Hz), {len(tau) / rate / period:.1f} times"
     advice = (
-        "compare that with the frequency that was asked for; the floor is about the least error that a model can have"
+        "compare that with the frequency that was asked for; repeatability is about the least error that a model can "
+        "have"
     )
     findings = [Finding("note", "repetition", "motion", what, advice, size=period)]
     for j, name in enumerate(arm.joint_names):
