@@ -73,9 +73,9 @@ def run(arguments: Sequence[str] | None) -> int:
         print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except BrokenPipeError:
-        # The reader (head, less) has seen enough.
+        # The reader (head, less) has seen enough. As of other programs: a verdict that fails must not pass.
         sys.stderr.close()
-        return 0
+        return 128 + signal.SIGPIPE
     except OSError as error:  # the disk is full, for example
         print(f"dvrk-drake: error: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
         return 2

@@ -72,7 +72,7 @@ def test_bad_arguments_are_refused_in_one_line(arguments, message, capsys):
 
 
 def test_too_few_numbers_are_refused(capsys):
-    assert "--gravity requires 3" in refused(capsys, "model", "--arm", "psm", "--gravity", "1", "2")
+    assert "--gravity needs 3 values, got 2" in refused(capsys, "model", "--arm", "psm", "--gravity", "1", "2")
 
 
 @pytest.mark.parametrize(("command", "old"), [(command, old) for command in RENAMED for old in RENAMED[command]])

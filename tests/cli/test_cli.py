@@ -1,7 +1,9 @@
 """What commands write, and the one line with exit code 2 for bad input."""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
 
@@ -224,7 +226,7 @@ def test_a_folder_with_files_is_kept_without_overwrite(command, tmp_path, monkey
     (tmp_path / "full").mkdir()
     (tmp_path / "full/mine.txt").write_text("mine")
     error = fails(capsys, *command.split(), "full")
-    assert error.endswith("full: holds files already; name another folder, or replace them with --overwrite")
+    assert error.endswith("full: holds files already; name another folder, or write into it with --overwrite")
     if "none" in command:
         assert "none" in fails(capsys, *command.split(), "full", "--overwrite")
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "mine.txt"]
@@ -237,7 +239,7 @@ def test_a_folder_with_files_is_kept_without_overwrite(command, tmp_path, monkey
         ("convert {0}/poses.csv --coordinates joint --output o.csv", ["o.csv"]),
         ("predict {0}/poses.csv --model {0}/model.yaml --output o.csv", ["o.csv"]),
         ("validate {0}/other.csv --model {0}/model.yaml --json o.json --plots p", ["o.json", "p"]),
-        ("export --model {0}/model.yaml --sdf o.sdf --urdf o.urdf", ["o.sdf", "o.urdf"]),
+        ("export --model {0}/model.yaml --sdf o.sdf --urdf o.urdf", ["o.sdf", "o.urdf", "o_meshes"]),
         ("simulate --arm psm --set duration=0.02 --output o.csv --plots p", ["o.csv", "p"]),
         ("collect --arm psm --poses o.yaml --random 3", ["o.yaml"]),
         ("key --output o.key", ["o.key"]),
@@ -247,7 +249,7 @@ def test_commands_print_what_they_wrote(command, written, folder, tmp_path, monk
     monkeypatch.chdir(tmp_path)
     assert main(command.format(folder).split()) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("wrote ")]
-    assert sorted(line.split()[1].rstrip(":") for line in lines) == written
+    assert sorted({line.split()[1].rstrip(":") for line in lines}) == written
     assert {path.name for path in tmp_path.iterdir()} >= set(written)
 
 
@@ -410,3 +412,42 @@ def test_convert(tmp_path, capsys):
     ours = read_recording(tmp_path / "ours.csv", coordinates="actuator")
     np.testing.assert_array_equal(ours.q, values[:, :7])
     np.testing.assert_array_equal(ours.tau, values[:, 14:])
+
+
+def test_two_outputs_of_one_name_are_refused(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    export = ["export", "--model", f"{folder}/model.yaml", "--sdf", "o.sdf", "--urdf"]
+    identify = ["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", "o", "--plots", "o"]
+    for command in ([*export, "./o.sdf"], identify):
+        assert "is named for two outputs" in fails(capsys, *command)
+    assert not list(tmp_path.iterdir())
+
+
+def test_meshes_are_not_replaced_unasked(folder, tmp_path, capsys):
+    (tmp_path / "o_meshes").mkdir()
+    (tmp_path / "o_meshes/mine.txt").write_text("mine")
+    export = ["export", "--model", f"{folder}/model.yaml", "--sdf", f"{tmp_path}/o.sdf"]
+    assert "o_meshes: holds files already" in fails(capsys, *export)
+    assert not (tmp_path / "o.sdf").exists()
+    assert main([*export, "--overwrite"]) == 0
+    assert (tmp_path / "o_meshes/mine.txt").read_text() == "mine"
+
+
+def test_a_closed_pipe_loses_no_model(folder, tmp_path):
+    read, write = os.pipe()
+    os.close(read)
+    command = ["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", f"{tmp_path}/m.yaml"]
+    program = [sys.executable, "-m", "dvrk_drake.cli", *command]
+    done = subprocess.run(program, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert done.returncode == 128 + signal.SIGPIPE and "Traceback" not in done.stderr
+    assert IdentifiedModel.load(tmp_path / "m.yaml").arm.name == "MTMR"
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full here")
+def test_a_full_disk_is_one_line():
+    command = [sys.executable, "-m", "dvrk_drake.cli", "model", "--arm", "mtml"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert "No space left on device" in refusal(done.stderr)
