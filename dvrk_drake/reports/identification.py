@@ -95,7 +95,7 @@ def print_validation(
         next_command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
     elif validation.verdict == "do not use":
         next_command = f"dvrk-drake check {source} --arm {model.arm.source}"
-        if model.dynamics is not None:
+        if isinstance(validation, DynamicValidation):
             next_command = f"dvrk-drake recalibrate {source} --model {model_path} --output NEW.yaml"
     if isinstance(validation, DynamicValidation):
         error = f"Mean effort error {_percent(validation.mean_relative_error)}."
