@@ -2,10 +2,11 @@
 
 import threading
 import time
+from typing import ClassVar
 
 import lcm
 import numpy as np
-from patience import wait_until
+from patience import PATIENCE, wait_until
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.processes.pace import make_realtime
@@ -16,11 +17,21 @@ NETWORK_URL = "udpm://239.255.76.67:7667?ttl=0"
 class Observer:
     """What an arm says, gathered by a thread that is scheduled as real-time where that is permitted."""
 
+    running: ClassVar[set] = set()
+
     def __init__(self, name, url=NETWORK_URL):
         self.heard, self.times = [], []
-        self.listens = threading.Event()
-        threading.Thread(target=self.listen, args=(name, url), daemon=True).start()
+        self.listens, self.ended = threading.Event(), threading.Event()
+        self.thread = threading.Thread(target=self.listen, args=(name, url), daemon=True)
+        self.thread.start()
         assert self.listens.wait()
+        self.running.add(self)
+
+    def end(self):
+        """Ends its threads: those of LCM read every message of the network, in real time."""
+        self.running.remove(self)
+        self.ended.set()
+        self.thread.join(PATIENCE)
 
     def listen(self, name, url):
         # Scheduling is a thread's own. LCM's reading thread, which is started here, inherits it; processes do not,
@@ -30,8 +41,8 @@ class Observer:
         subscription = network.subscribe(f"DVRK_STATUS_{name.upper()}", self.hear)
         subscription.set_queue_capacity(0)  # no limit
         self.listens.set()
-        while True:
-            network.handle()
+        while not self.ended.is_set():
+            network.handle_timeout(100)
 
     def hear(self, channel, data):
         self.times.append(time.monotonic())

@@ -54,6 +54,15 @@ def running_arm(request):
     assert "ended" in said
 
 
+@pytest.fixture(autouse=True)
+def end_observers():
+    """Ends the observers of a test, which would read the messages of all later tests."""
+    before = set(Observer.running)
+    yield
+    for observer in Observer.running - before:
+        observer.end()
+
+
 @pytest.fixture
 def arm(running_arm):
     """A running arm that holds and remembers no sender: its name, its process, what it says."""
@@ -401,9 +410,11 @@ def test_commands_that_are_played_again_from_a_log_are_refused(arm, tmp_path):
 @watchdog
 @inside
 def test_an_arm_that_is_killed_and_restarted_hears_nothing_from_run_nor_from_a_log(tmp_path):
-    """A watchdog test, since `run` ends where the computer stops the arm's guard for 40 ms again and again."""
+    """A watchdog test, since `run` ends where the computer stops the arm's guard for 40 ms."""
     observer, on_other = Observer("mtml", OTHER_URL), ("--lcm-url", OTHER_URL)
-    arm, run = start_arm("mtml", *PATIENT, *on_other), start_run("mtml", "--mode", "hold", "--realtime", *on_other)
+    arm = start_arm("mtml", *PATIENT, *on_other)
+    observer.until(lambda status: True, "first status", process=arm)
+    run = start_run("mtml", "--mode", "hold", "--realtime", *on_other)
     try:
         with Logged(tmp_path / "commands", OTHER_URL) as log:
             begun = observer.until(takes_efforts, "run", process=run)
