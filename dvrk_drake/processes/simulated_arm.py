@@ -145,6 +145,9 @@ class SimulatedArm:
         # would keep one message between two steps; a second sender must not hide there.
         network = lcm.LCM(self._url)
         network.subscribe(command_channel(self.arm), self.hear).set_queue_capacity(_QUEUE)
+        # The guard takes the time since the simulation was made for its first period, which is too long. The status of
+        # that step is not sent: a controller would refuse the arm for it.
+        self.step()
         self.step()
         pace = Pace(self.driver.status_period, sleep=lambda seconds: listen(network, seconds))
         told = ""
