@@ -32,6 +32,7 @@ app.register_install_completion_command(
 
 
 def _complete_arm(_: Any) -> list[str]:
+    # As `known_arms`, whose module imports drake: --help and completion do not.
     arms = Path(__file__).parents[1] / "models/arms"
     return sorted(path.stem for path in arms.glob("*.yaml"))
 

@@ -60,12 +60,13 @@ def run(arguments: Sequence[str] | None) -> int:
         print(_usage_error(error, words), file=sys.stderr)
         return 2
     try:
+        if arguments is None:
+            gc.disable()  # modules stay: a search for garbage among them takes a tenth of the time of an import
         if command.__module__.startswith("dvrk_drake."):  # not the help or the version
-            gc.disable()  # modules stay: to look among them for garbage takes a tenth of an import's time
             import_interruptibly()
+        if arguments is None:
             gc.freeze()
             gc.enable()
-        if arguments is None:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         with folders_only_for_results():
             command(*bound.args, **bound.kwargs)
@@ -86,7 +87,7 @@ def run(arguments: Sequence[str] | None) -> int:
 
 
 def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
-    """What is wrong with the arguments, in one line that names the new option where an old one was given."""
+    """Returns the error of the arguments in one line, which names the new option where an old one was given."""
     name = error.command_chain[0] if error.command_chain else ""
     renamed = RENAMED.get(name, {})
     options = {word.partition("=")[0] for word in words if word.startswith("--")}

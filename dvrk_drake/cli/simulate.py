@@ -221,6 +221,8 @@ def transparency(
         raise ScenarioError("--speed is that of a recorded motion; name one with --path")
     compensations = _compensations(led, model or [], friction_ratio)
     if output is not None:
+        if not output.endswith(".csv"):
+            raise ScenarioError(f"{output}: --output must end in .csv; figures are written to --plots FOLDER")
         check_output(output, path or "", *(model or []), overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
     felt = []

@@ -1,4 +1,4 @@
-"""What the commands share: output that is checked first, progress, a clean Ctrl-C."""
+"""Helpers of all commands: checks of outputs before the work begins, progress, and a clean Ctrl-C."""
 
 from __future__ import annotations
 

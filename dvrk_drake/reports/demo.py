@@ -36,14 +36,11 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
     """
     arm = result.arm
     drifts = list(result.drift.values())
-    furthest = [int(np.argmax(drift / (arm.position_upper - arm.position_lower))) for drift in drifts[:2]]
-    identified, drawn = (
-        f"{drift[j]:.4f} {'m' if arm.prismatic[j] else 'rad'} ({arm.joint_names[j]})"
-        for drift, j in zip(drifts[:2], furthest, strict=True)
-    )
+    angles = [np.where(arm.prismatic, 0.0, drift) for drift in drifts[:2]]
+    identified, drawn = (f"{angle.max():.4f} rad ({arm.joint_names[int(np.argmax(angle))]})" for angle in angles)
     print_answer(
         console,
-        f"Released without dry friction, {arm.name} drifts by at most {identified} with the identified model, and by "
+        f"Released without dry friction, {arm.name} turns by at most {identified} with the identified model, and by "
         f"{drawn} with that of the SDF.",
         f"open {folder}/arm.html in a browser",
     )

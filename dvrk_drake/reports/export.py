@@ -102,7 +102,7 @@ def _place(place: NDArray[np.float64]) -> str:
 def _print_compensation(
     console: Console, path: str, export: ModelExport, file: GravityCompensationFile, verbose: bool
 ) -> None:
-    """What a person should read before the controller does."""
+    """Prints how far a written file differs from its model, and at which torques it clips."""
     arm, off = export.model.arm, largest_differences(file, export.model)
     j = int(np.argmax(off))
     print_answer(

@@ -145,3 +145,7 @@ def test_completion_is_installed(shell, tmp_path, monkeypatch, capsys):
     text = "".join(path.read_text() for path in files)
     assert "dvrk" in text and "recalibrate" in text
     capsys.readouterr()
+
+
+def test_a_folder_as_the_table_of_transparency_names_plots(capsys):
+    assert "figures are written to --plots" in refused(capsys, "transparency", "--arm", "mtml", "--output", "folder")

@@ -211,7 +211,10 @@ def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _gain_of(other: Recording, fit: ChannelFit) -> float:
-    """Of exchanged, inverted or shifted channels. Where these are the actuators' own, they keep the times."""
+    """Returns the gain in log-likelihood of a recording with exchanged, inverted or shifted channels.
+
+    In the actuators' coordinates the clock of `fit` is used again.
+    """
     clock = fit.clock if fit.recording.coordinates == "actuator" else None
     return ChannelFit(other, fit.arm, clock).log_likelihood - fit.log_likelihood
 

@@ -192,7 +192,7 @@ class BaseColumns(NamedTuple):
 
 
 def base_columns(regressors: Sequence[DynamicRegressor]) -> BaseColumns:
-    """Of one arm under any of some gravities; without rotors that are coupled, see `rotor_inertias`."""
+    """Finds columns that suffice for one arm under all given gravities, without coupled rotors (`rotor_inertias`)."""
     arm, p = regressors[0].arm, len(regressors[0].values)
     generator = np.random.default_rng(0)
     q, v, vd = generator.normal(0, 2, (3, p // 2, arm.num_joints))

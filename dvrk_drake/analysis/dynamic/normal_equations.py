@@ -201,7 +201,7 @@ class NonNegativeFit:
         return (x * self._scale)[:-1]
 
     def _minimum(self, S: NDArray[np.float64], bound: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Of y' S y / 2 - b' y, y >= 0: by exchanges from what is positive without the unknown that was added.
+        """Returns y >= 0 that minimises y' S y / 2 - b' y, from the unknowns that are positive without the new one.
 
         All unknowns whose sign, or whose slope at 0, is wrong change sides at once (Portugal, Judice and Vicente,
         1994), which takes a few solutions; should it cycle, Lawson and Hanson's method follows.

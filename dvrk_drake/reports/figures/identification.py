@@ -51,7 +51,7 @@ def plot_static_identification(folder: Path, result: StaticIdentification) -> No
             "leave-one-out": np.array([j.rms_leave_one_out_undoubted for j in joints]),
             "ten-fold, effects chosen anew": np.array([j.rms_cross_validation_undoubted for j in joints]),
         },
-        f"{result.model.arm.name}: poses not used for fitting ({Path(recording.source).name}, without doubted ones)",
+        f"{result.model.arm.name}: poses not used for fitting ({Path(recording.source).name}, without excluded ones)",
     )
     plot_measured_against_predicted(folder / "predicted.png", result.model, recording, result.measured, result.doubts)
 
@@ -136,7 +136,7 @@ def plot_measured_against_predicted(
             np.clip(predicted[doubted, j], *limits),
             "x",
             color=MEASURED_COLOUR,
-            label="doubted (at the edge: outside)",
+            label="excluded (at the edge: outside)",
         )
         ax.set(xlim=limits, ylim=limits)
         ax.locator_params(nbins=5)
