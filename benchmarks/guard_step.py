@@ -18,7 +18,7 @@ from pathlib import Path
 from timing import print_table
 
 ROOT = Path(__file__).resolve().parents[1]
-TURNS = 5
+NUM_TILT_ITERATIONS = 5
 
 WORKER = """
 import sys, time
@@ -73,7 +73,7 @@ def main() -> None:
     other = parser.parse_args().other
     rows = {}
     for arm in ("mtml", "psm"):
-        turns = [(*cost(ROOT, arm), cost(other, arm)[0] if other else float("nan")) for _ in range(TURNS)]
+        turns = [(*cost(ROOT, arm), cost(other, arm)[0] if other else float("nan")) for _ in range(NUM_TILT_ITERATIONS)]
         tick, message, theirs = (min(turn[i] for turn in turns) for i in range(3))
         compared = [f"{theirs:.1f}", f"{tick / theirs:.2f}"] if other else []
         rows[arm] = [f"{tick:.1f}", f"{message:.1f}", f"{tick / message:.2f}", *compared]

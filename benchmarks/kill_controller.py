@@ -50,7 +50,7 @@ CONDITIONS = {"alone": 0, "two busy processes": 2}
 #: The controller is killed when its efforts have acted for so long [s].
 ACTING = (0.3, 0.6)
 #: Attempts without a kill before it is given up.
-MOST_TAKEOVERS = 50
+MAX_TAKEOVERS = 50
 EFFORT = describe_state(lcmt_dvrk_status.STATE_EFFORT)
 HOLD = describe_state(lcmt_dvrk_status.STATE_HOLD)
 
@@ -143,7 +143,7 @@ def measure(name: str, kills: int, busy: int, realtime: bool) -> tuple[list[floa
                 print("the watchdog took over before the kill", file=sys.stderr, flush=True)
                 controller.kill()
                 controller.join()
-                if process.poll() is not None or before > MOST_TAKEOVERS:
+                if process.poll() is not None or before > MAX_TAKEOVERS:
                     raise SystemExit("the controller's efforts do not act for long enough")
                 continue
             killed = time.monotonic_ns()

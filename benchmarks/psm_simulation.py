@@ -24,7 +24,7 @@ Rows that this version of drake cannot run are left out, with its reason: CENIC 
 Where the time of `ball` goes (perf, drake 1.51.1): SAP's problem and solution take half, of which its Context, made and
 destroyed twice per step, takes a third. One Newton iteration solves each step. A tree without constraints skips all of
 that, so the first constraint costs more than the other five. Memory allocation takes a quarter, in all of these parts:
-a faster allocator (docs/real_arm.md) takes a sixth off `ball` and `mimic`, and nothing off `open`.
+a faster allocator (docs/simulated_effects.md) takes a sixth off `ball` and `mimic`, and nothing off `open`.
 """
 
 from __future__ import annotations

@@ -44,12 +44,12 @@ def main() -> int:
         ours = identify_static(raw, arm)
         recording = ours.recording  # repeated poses averaged: both methods get the same
         paper = identify_static(recording, arm, "paper")
-        doubted = np.zeros(recording.q.shape, dtype=bool)
-        for doubt in ours.doubts:
-            doubted[doubt.row, list(doubt.joints)] = True
+        excluded = np.zeros(recording.q.shape, dtype=bool)
+        for measurement in ours.excluded:
+            excluded[measurement.row, list(measurement.joints)] = True
         table = Table(
             title=escape(
-                f"from {name}, {len(raw)} rows, {len(recording)} poses: RMS error [N m] without doubted measurements"
+                f"from {name}, {len(raw)} rows, {len(recording)} poses: RMS error [N m] without excluded measurements"
             ),
             title_justify="left",
         )
@@ -60,25 +60,25 @@ def main() -> int:
         def rms(values: np.ndarray, use: np.ndarray) -> list[str]:
             return [f"{np.sqrt(np.mean(values[use[:, j], j] ** 2)):.4f}" for j in range(values.shape[1])]
 
-        table.add_row("left-out poses", "zero", *rms(tau, ~doubted))
-        table.add_row("", "paper", *rms(paper.left_out_residuals, ~doubted))
-        table.add_row("", "ours", *rms(ours.left_out_residuals, ~doubted))
-        table.add_row("", "ours, ten-fold", *(f"{j.rms_cross_validation_undoubted:.4f}" for j in ours.model.joints))
-        everything = np.ones_like(doubted)
+        table.add_row("left-out poses", "zero", *rms(tau, ~excluded))
+        table.add_row("", "paper", *rms(paper.leave_one_out_residuals, ~excluded))
+        table.add_row("", "ours", *rms(ours.leave_one_out_residuals, ~excluded))
+        table.add_row("", "ours, ten-fold", *(f"{j.rms_cross_validation_included:.4f}" for j in ours.model.joints))
+        everything = np.ones_like(excluded)
         table.add_row("left-out, all", "zero", *rms(tau, everything))
-        table.add_row("", "paper", *rms(paper.left_out_residuals, everything))
-        table.add_row("", "ours", *rms(ours.left_out_residuals, everything))
+        table.add_row("", "paper", *rms(paper.leave_one_out_residuals, everything))
+        table.add_row("", "ours", *rms(ours.leave_one_out_residuals, everything))
         for other_name, other in recordings.items():
             if other_name == name:
                 continue
             by_ours, by_paper = validate_static(ours.model, other).joints, validate_static(paper.model, other).joints
-            table.add_row(other_name, "zero", *(f"{j.rms_torque_undoubted:.4f}" for j in by_ours))
-            table.add_row("", "paper", *(f"{j.rms_error_undoubted:.4f}" for j in by_paper))
-            table.add_row("", "ours", *(f"{j.rms_error_undoubted:.4f}" for j in by_ours))
+            table.add_row(other_name, "zero", *(f"{j.rms_torque_included:.4f}" for j in by_ours))
+            table.add_row("", "paper", *(f"{j.rms_error_included:.4f}" for j in by_paper))
+            table.add_row("", "ours", *(f"{j.rms_error_included:.4f}" for j in by_ours))
         console.print(table)
         effects = ", ".join(f"{ActuatorEffect.of(e)} {e.coefficient:+.3f}" for e in ours.model.effects)
-        trusts = ", ".join(f"{j.name} {j.trust:.2f}" for j in ours.model.joints if j.trust < 1)
-        console.print(f"effects chosen: {effects or 'none'}; trust below 1: {trusts or 'none'}\n")
+        scales = ", ".join(f"{j.name} {j.feedforward_scale:.2f}" for j in ours.model.joints if j.feedforward_scale < 1)
+        console.print(f"effects chosen: {effects or 'none'}; feedforward scale below 1: {scales or 'none'}\n")
     return 0
 
 

@@ -15,7 +15,7 @@ try:
     for warning in result.warnings:
         print(warning)
     for joint in result.model.joints:
-        error, zero = joint.rms_leave_one_out_undoubted, joint.rms_zero_torque_undoubted
+        error, zero = joint.rms_leave_one_out_included, joint.rms_zero_torque_included
         print(f"{joint.name:15} left-out error {error:.4f} N m, zero torque {zero:.4f} N m")
     if len(sys.argv) == 3:
         result.save(sys.argv[2])

@@ -47,19 +47,19 @@ from dvrk_drake.recordings.recording import Recording, read_recording, write_rec
 #: How many times as many examples as CI runs; more than 1 draws new ones each time.
 MORE = int(os.environ.get("DVRK_DRAKE_FUZZ", "1"))
 #: Processor time [s] that one file may take.
-LONGEST = 20
+MAX_LENGTH = 20
 
 
 @contextmanager
 def hang_is_an_error():
-    """Raises TimeoutError in a block that takes more than LONGEST seconds of the processor, or waits for minutes."""
+    """Raises TimeoutError in a block that takes more than MAX_LENGTH seconds of the processor, or waits for minutes."""
 
     def stop(*_):
-        raise TimeoutError(f"took longer than {LONGEST} s")
+        raise TimeoutError(f"took longer than {MAX_LENGTH} s")
 
     before = [signal.signal(number, stop) for number in (signal.SIGPROF, signal.SIGALRM)]
-    signal.setitimer(signal.ITIMER_PROF, LONGEST)
-    signal.setitimer(signal.ITIMER_REAL, 10 * LONGEST)
+    signal.setitimer(signal.ITIMER_PROF, MAX_LENGTH)
+    signal.setitimer(signal.ITIMER_REAL, 10 * MAX_LENGTH)
     try:
         yield
     finally:
@@ -102,7 +102,7 @@ targets: [{time: 0.5, pose: [0.1, 0.1, 0.12, 0, 0, 0, 0]}]
 hand: {path: []}
 effects: [{coordinate: joint.yaw, kind: offset, coefficient: 0.1}]
 stretch: {yaw: {stiffness: 1000.0, damping: 1.0}}
-real_arm: [friction]
+simulated_effects: [friction]
 seed: 3
 """
 STUDY = """scenario: psm
@@ -275,7 +275,7 @@ WORK = (
     "dvrk_drake.processes.lcm_network.open_lcm",
     "dvrk_drake.experiments.tuning.tuning.tune_arm",
     "dvrk_drake.experiments.study.study.run_study_locally",
-    "dvrk_drake.experiments.transparency.feel",
+    "dvrk_drake.experiments.transparency.simulate_operator",
     "dvrk_drake.analysis.identification.identify_dynamic",
     "dvrk_drake.analysis.payload.payload.estimate_payload",
 )

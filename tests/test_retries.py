@@ -6,9 +6,9 @@ import subprocess
 import sys
 
 import pytest
-from own_network import INSIDE, MOST_RETRIES
-from patience import PATIENCE
+from own_network import INSIDE, MAX_RETRIES
 from repository import ROOT
+from waiting import TIMEOUT
 
 FILE = '''
 from pathlib import Path
@@ -49,10 +49,10 @@ def test_watchdog():
     ("steady", "late", "standstill", "passes", "retries", "runs"),
     [
         (0, 1, 1e9, True, "1 retry", (1, 2)),
-        (0, 100, 1e9, False, f"{MOST_RETRIES} retries", (1, 1 + MOST_RETRIES)),
+        (0, 100, 1e9, False, f"{MAX_RETRIES} retries", (1, 1 + MAX_RETRIES)),
         (1, 1, 1e9, False, "0 retries", (1, 1)),
         (1, 1, 0.0, True, "2 retries", (2, 2)),
-        (100, 0, 0.0, False, f"{MOST_RETRIES} retries", (1 + MOST_RETRIES, 1)),
+        (100, 0, 0.0, False, f"{MAX_RETRIES} retries", (1 + MAX_RETRIES, 1)),
     ],
 )
 def test_what_runs_again_and_is_counted(tmp_path, steady, late, standstill, passes, retries, runs):
@@ -70,12 +70,12 @@ def test_what_runs_again_and_is_counted(tmp_path, steady, late, standstill, pass
         env=environment,
         capture_output=True,
         text=True,
-        timeout=PATIENCE,
+        timeout=TIMEOUT,
         check=False,
     )
     assert done.returncode == (0 if passes else 1), done.stdout
     said = re.search(r"^UDP tests: (.*) of at most (\d+)(: .*)?$", done.stdout, re.MULTILINE)
-    assert said[1] == retries and said[2] == str(MOST_RETRIES)
+    assert said[1] == retries and said[2] == str(MAX_RETRIES)
     assert [len((tmp_path / name).read_text()) for name in ("steady", "late")] == list(runs)
     if not passes:
         assert f"failed: test_{'steady' if steady else 'watchdog'}" in done.stdout

@@ -5,7 +5,7 @@ from pathlib import Path
 
 TESTS = Path(__file__).parent
 #: Smallest absolute tolerance: 450 times the rounding of a number near 1.
-LEAST = 1e-13
+MIN_VALUE = 1e-13
 #: Functions that compute with BLAS or numba. Tests never compare their results exactly.
 COMPUTED = {"column", "effect_effort", "effort", "holding_torque", "mass_matrix", "predict", "predict_motion"} | {
     *("pull_back_effort", "regressor", "torque"),
@@ -38,7 +38,7 @@ def test_every_comparison_states_an_absolute_tolerance():
 def test_no_tolerance_is_as_small_as_rounding():
     found = [(p, argument(n, "atol")) for p, n in calls("assert_allclose", "isclose", "allclose")]
     found += [(p, argument(n, "abs")) for p, n in calls("approx")]
-    assert not [p for p, atol in found if isinstance(atol, ast.Constant) and 0 < atol.value < LEAST]
+    assert not [p for p, atol in found if isinstance(atol, ast.Constant) and 0 < atol.value < MIN_VALUE]
 
 
 def test_computed_numbers_are_not_compared_exactly():

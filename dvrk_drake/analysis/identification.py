@@ -24,7 +24,7 @@ def identify(
     arm: Arm,
     *,
     method: Method = "robust",
-    slow_parts: bool = False,
+    low_speed_segments: bool = False,
     progress: Progress | None = None,
 ) -> StaticIdentification | DynamicIdentification:
     """Checks a recording and identifies the arm's model from it: what `dvrk-drake identify` does.
@@ -37,7 +37,7 @@ def identify(
         recording: poses with efforts (m, n), or a motion with times and efforts, in joint or actuator coordinates.
         arm: which was recorded, mounted as it was: see `Arm.with_gravity`.
         method: for poses: "robust", or "paper" for the least squares of Rutfield et al. (2015).
-        slow_parts: take the low-speed segments of a motion without rests as poses.
+        low_speed_segments: take the low-speed segments of a motion without rests as poses.
         progress: called with the step, "checking the recording" or "identifying", and its finished share 0..1.
 
     Returns:
@@ -62,7 +62,7 @@ def identify(
         ...     print(warning)
         >>> result.save("model.yaml")
     """
-    poses = find_poses(recording, arm, slow_parts)
+    poses = find_poses(recording, arm, low_speed_segments)
     report = require_usable(poses.recording, arm, progress, channels=True)
     share = step_progress(progress, "identifying")
     try:
@@ -83,7 +83,7 @@ def _unexplained(result: DynamicIdentification) -> tuple[Finding, ...]:
 
 
 def _friction_in_segments(result: StaticIdentification, measured: NDArray[np.bool_] | None) -> tuple[Finding, ...]:
-    commanded = [joint.name for joint in result.model.joints if joint.trust > 0]
+    commanded = [joint.name for joint in result.model.joints if joint.feedforward_scale > 0]
     if measured is None or not commanded:
         return ()
     what = (

@@ -33,9 +33,9 @@ SCALE_DEVIATION, OFFSET_DEVIATION = 0.5, 0.3
 #: Relative error that the efforts are weighed with.
 _RELATIVE_ERROR = 0.1
 #: An actuator must move in both directions for at least this share of the time.
-LEAST_SHARE = 0.1
+MIN_SHARE = 0.1
 #: A recording that leaves a larger share of the efforts unexplained, on average, is of another arm.
-LARGEST_ERROR = 0.7
+MAX_ERROR = 0.7
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
     excited = fit.excited
     if not np.any(excited):
         raise RecordingError(
-            f"{recording.source or 'recording'}: no actuator moves both ways for {LEAST_SHARE:.0%} of the time at "
+            f"{recording.source or 'recording'}: no actuator moves both ways for {MIN_SHARE:.0%} of the time at "
             f"{REST_SPEED[0]:g} rad/s, {REST_SPEED[1]:g} m/s RMS or more; friction shows only in such a motion"
         )
     refuse_opposite_efforts(recording, fit.names, fit.tau, fit.expected)
@@ -142,10 +142,10 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
     while np.any(worse := free & ~(after < before)):
         free &= ~worse
         after = fit.left_out_error(free)
-    if not np.mean(np.minimum(before, after)) < LARGEST_ERROR:
+    if not np.mean(np.minimum(before, after)) < MAX_ERROR:
         raise RecordingError(
             f"{recording.source or 'recording'}: efforts differ from the model's by {np.mean(before):.0%} on average "
-            f"over the actuators, and by {np.mean(after):.0%} with its friction fitted; {LARGEST_ERROR:.0%} is "
+            f"over the actuators, and by {np.mean(after):.0%} with its friction fitted; {MAX_ERROR:.0%} is "
             "allowed: is it of this arm, in these coordinates?"
         )
     x = fit.solve(free, np.ones(len(fit.tau), dtype=bool))
@@ -267,7 +267,7 @@ def _moves_both_ways(model: DynamicModel, grid: MotionGrid) -> NDArray[np.bool_]
     v = model.arm.transmission.velocity(grid.v)
     share = np.minimum(np.mean(v > 0, axis=0), np.mean(v < 0, axis=0))
     speed = np.sqrt(np.mean(v**2, axis=0))
-    return np.asarray((share >= LEAST_SHARE) & (speed >= model.arm.per_joint(*REST_SPEED)))
+    return np.asarray((share >= MIN_SHARE) & (speed >= model.arm.per_joint(*REST_SPEED)))
 
 
 def _section(section: DynamicSection, fit: _Fit, x: NDArray[np.float64]) -> DynamicSection:

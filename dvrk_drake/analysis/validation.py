@@ -19,7 +19,7 @@ from dvrk_drake.recordings.recording import Recording
 
 
 def validate(
-    model: IdentifiedModel, recording: Recording, *, slow_parts: bool = False, progress: Progress | None = None
+    model: IdentifiedModel, recording: Recording, *, low_speed_segments: bool = False, progress: Progress | None = None
 ) -> StaticValidation | DynamicValidation:
     """Compares a model's efforts with those of a recording: what `dvrk-drake validate` does.
 
@@ -29,7 +29,7 @@ def validate(
     Args:
         model: from `identify`, or `IdentifiedModel.load`.
         recording: poses or a motion with efforts (m, n), which the model was not identified from.
-        slow_parts: take the low-speed segments of a motion without rests as poses.
+        low_speed_segments: take the low-speed segments of a motion without rests as poses.
         progress: called with the step, "checking the recording" or "validating", and its finished share 0..1.
 
     Returns:
@@ -37,7 +37,7 @@ def validate(
 
     Raises:
         RecordingError: the recording does not fit the model's arm, or `check` refuses it: see `findings` of the error.
-        IdentificationError: `slow_parts` finds none.
+        IdentificationError: `low_speed_segments` finds none.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -49,7 +49,7 @@ def validate(
         ('good', 0.091)
     """
     arm = model.arm
-    poses = find_poses(recording, arm, slow_parts)
+    poses = find_poses(recording, arm, low_speed_segments)
     report = require_usable(poses.recording, arm, progress)
     share = step_progress(progress, "validating")
     share(0.0)

@@ -91,16 +91,22 @@ def cross_validated_verdicts(model: IdentifiedModel) -> dict[str, Verdict]:
     limits = model.arm.effort_limits
     if model.dynamics is not None:
         return {
-            a.name: judge(a.rms_effort, a.rms_cross_validation, float(limit), in_motion=True, commanded=joint.trust > 0)
+            a.name: judge(
+                a.rms_effort,
+                a.rms_cross_validation,
+                float(limit),
+                in_motion=True,
+                commanded=joint.feedforward_scale > 0,
+            )
             for a, joint, limit in zip(model.dynamics.actuators, model.joints, limits, strict=True)
         }
     return {
         j.name: judge(
-            j.rms_zero_torque_undoubted,
-            j.rms_cross_validation_undoubted,
+            j.rms_zero_torque_included,
+            j.rms_cross_validation_included,
             float(limit),
             in_motion=False,
-            commanded=j.trust > 0,
+            commanded=j.feedforward_scale > 0,
         )
         for j, limit in zip(model.joints, limits, strict=True)
     }

@@ -34,7 +34,7 @@ from dvrk_drake.errors import ModelError
 
 Recording = Annotated[str, Parameter(help="CSV with header q1..qn, tau1..taun (t, qd1..qdn optional), or an LCM log.")]
 NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="The model file to write.")]
-SlowParts = Annotated[
+LowSpeedSegments = Annotated[
     bool, Parameter(show_default=False, help="Of a motion without rests: take its low-speed segments as poses.")
 ]
 _STEPS = "reading", "checking the recording"
@@ -50,7 +50,7 @@ def identify(
     output: NewModel,
     coordinates: Coordinates = "joint",
     method: Literal["robust", "paper"] = "robust",
-    slow_parts: SlowParts = False,
+    low_speed_segments: LowSpeedSegments = False,
     gravity: Gravity = None,
     plots: Plots = None,
     overwrite: Overwrite = False,
@@ -72,7 +72,7 @@ def identify(
     with Steps(*_STEPS, "identifying") as steps:
         read = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
         print_notes(recording, read.notes)
-        result = dvrk.identify(read, recorded_arm, method=method, slow_parts=slow_parts, progress=steps)
+        result = dvrk.identify(read, recorded_arm, method=method, low_speed_segments=low_speed_segments, progress=steps)
     # Before anything is printed: whoever reads the output may close it (head).
     result.save(output, overwrite=True)
     if folder is not None:
@@ -108,7 +108,7 @@ def validate(
     coordinates: Coordinates = "joint",
     require: Literal["good", "usable"] | None = None,
     save: Annotated[bool, Parameter(show_default=False)] = False,
-    slow_parts: SlowParts = False,
+    low_speed_segments: LowSpeedSegments = False,
     json: Json = None,
     plots: Plots = None,
     overwrite: Overwrite = False,
@@ -135,7 +135,7 @@ def validate(
             if loaded.validation is not None and not overwrite:
                 saved = loaded.validation.recording
                 raise ModelError(f"{model}: has verdicts from {saved} already; replace them with --overwrite")
-        validation = dvrk.validate(loaded, read, slow_parts=slow_parts, progress=steps)
+        validation = dvrk.validate(loaded, read, low_speed_segments=low_speed_segments, progress=steps)
     # Before anything is printed: whoever reads the output may close it (head).
     if save:
         validation.save(model, overwrite=True)

@@ -187,7 +187,7 @@ def transparency(
     speed: Annotated[float | None, Parameter(metavar="S")] = None,
     model: Annotated[list[str] | None, Parameter(metavar="MODEL.yaml")] = None,
     friction_ratio: Annotated[float, Parameter(metavar="R")] = 0.5,
-    real_arm: Annotated[list[str] | None, Parameter(metavar="PART ..", consume_multiple=True)] = None,
+    simulated_effects: Annotated[list[str] | None, Parameter(metavar="PART ..", consume_multiple=True)] = None,
     frame: Annotated[str, Parameter(metavar="NAME", show_default=False)] = "",
     output: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
     plots: Plots = None,
@@ -201,11 +201,11 @@ def transparency(
         speed: Follow the recording S times as fast.
         model: Compensate with this model; repeat to compare. Without it: what the arm's SDF states.
         friction_ratio: Share of the friction to compensate.
-        real_arm: Parts of the real arm that the simulation has, as in a scenario. Without it: all.
+        simulated_effects: Parts of the real arm that the simulation has, as in a scenario. Without it: all.
         frame: The SDF's frame of the handle. Without it: dh_7 of an MTM, dh_6 of a PSM.
         output: Write the table.
     """
-    from dvrk_drake.experiments.transparency import feel, rambling_path, recorded_path
+    from dvrk_drake.experiments.transparency import random_path, recorded_path, simulate_operator
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.recordings.recording import read_recording
     from dvrk_drake.reports.terminal_tables import make_console
@@ -213,8 +213,8 @@ def transparency(
 
     quiet_drake()
     led = load_arm(arm)
-    effects = led.effects.only(real_arm or ["all"])
-    followed = rambling_path(led)
+    effects = led.effects.only(simulated_effects or ["all"])
+    followed = random_path(led)
     if path is not None:
         followed = recorded_path(led, read_recording(path, led, coordinates), 1.0 if speed is None else speed)
     elif speed is not None:
@@ -225,21 +225,23 @@ def transparency(
             raise ScenarioError(f"{output}: --output must end in .csv; figures are written to --plots FOLDER")
         check_output(output, path or "", *(model or []), overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
-    felt = []
+    forces = []
     names = [f"compensation by {compensation.name}" for compensation in compensations]
     with Steps(*names) as steps:
         for name, compensation in zip(names, compensations, strict=True):
             progress = step_progress(steps, name)
-            felt.append(feel(led, followed, compensation, effects=effects, frame_name=frame, progress=progress))
+            forces.append(
+                simulate_operator(led, followed, compensation, effects=effects, frame_name=frame, progress=progress)
+            )
     if output is not None:
-        write_transparency(Path(output), felt)
-    print_transparency(make_console(), led, felt, verbose=verbose)
+        write_transparency(Path(output), forces)
+    print_transparency(make_console(), led, forces, verbose=verbose)
     if output is not None:
         print_written(output)
     if folder is not None:
         from dvrk_drake.reports.figures.transparency import plot_transparency
 
-        plot_transparency(folder / "transparency.png", led, felt)
+        plot_transparency(folder / "transparency.png", led, forces)
         print_written(folder)
 
 

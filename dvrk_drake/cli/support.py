@@ -126,7 +126,7 @@ def _refuse_twice(path: str) -> None:
 
 
 #: Bars on a terminal at most; finished steps give way.
-MOST_BARS = 6
+MAX_BARS = 6
 
 #: Outputs of this command.
 _outputs: set[Path] = set()
@@ -285,7 +285,7 @@ class Steps:
             print(text, file=sys.stderr, flush=True)
         for task in self._progress.tasks:
             self._progress.update(task.id, total=1.0, completed=1.0)
-        if len(self._progress.tasks) >= MOST_BARS:
+        if len(self._progress.tasks) >= MAX_BARS:
             oldest = next(iter(self._tasks))
             self._progress.remove_task(self._tasks.pop(oldest))
         self._tasks[step] = self._progress.add_task(text, total=None)

@@ -53,7 +53,7 @@ def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.floa
 
 
 #: An actuator that needs no more than this at so many poses bears no weight [N m, N].
-LEAST_WEIGHT, WEIGHING_POSES = 1e-9, 20
+MIN_WEIGHT, WEIGHING_POSES = 1e-9, 20
 
 
 class DynamicModel:
@@ -101,7 +101,7 @@ class DynamicModel:
         arm = self.arm.with_gravity(self.section.gravity_expected or self.section.gravity)
         poses = arm.sample_poses(WEIGHING_POSES, np.random.default_rng(0))
         weight = np.abs(nominal_weight(DynamicRegressor(arm), poses)).max(axis=0)
-        left_out = {f"actuator.{name}" for name, w in zip(arm.joint_names, weight, strict=True) if w > LEAST_WEIGHT}
+        left_out = {f"actuator.{name}" for name, w in zip(arm.joint_names, weight, strict=True) if w > MIN_WEIGHT}
         left_out -= {e.coordinate for e in self.effects if e.kind == "cable cosine"}
         return tuple(
             i

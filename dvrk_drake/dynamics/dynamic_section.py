@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.models.schema_fault import within
+from dvrk_drake.models.schema_fault import formerly, within
 
 #: What a fit finds: beyond the largest arm by orders of magnitude, as parameters that a recording does not tell are
 #: found anywhere, and their standard errors are larger still.
@@ -22,7 +22,7 @@ class LinkEstimate:
     """The ten inertial parameters of a link about its origin in its frame of the SDF, see `LinkInertia`.
 
     `least_eigenvalue` is that of its pseudo-inertia: positive for every body that can exist. `standard_errors` are of
-    the parameters, of one by one: base parameters are known far better. `mass_told` is the share of the prior's
+    the parameters, of one by one: base parameters are known far better. `mass_identifiability` is the share of the prior's
     variance of the mass that the motion took away, 0..1: near 0 the mass is the SDF's. `bounds` says which bounds of
     `consistent_parameters` it lies at.
     """
@@ -31,7 +31,7 @@ class LinkEstimate:
     parameters: list[float] = field(default_factory=list, metadata=ESTIMATES)
     least_eigenvalue: float = field(default=0.0, metadata=ESTIMATES)
     standard_errors: list[float] = field(default_factory=list, metadata=STANDARD_ERRORS)
-    mass_told: float = field(default=0.0, metadata=SHARES)
+    mass_identifiability: float = field(default=0.0, metadata=SHARES | formerly("mass_told"))
     bounds: list[str] = field(default_factory=list)
 
 
@@ -39,14 +39,14 @@ class LinkEstimate:
 class MotionParameterEstimate:
     """A base parameter of the full dynamics, see `derive_base_parameters`.
 
-    `told` is the share of the prior's variance that the motion took away, 0..1.
+    `identifiability` is the share of the prior's variance that the motion took away, 0..1.
     """
 
     name: str = ""
     unit: str = ""
     value: float = field(default=0.0, metadata=ESTIMATES)
     standard_error: float = field(default=0.0, metadata=STANDARD_ERRORS)
-    told: float = field(default=0.0, metadata=SHARES)
+    identifiability: float = field(default=0.0, metadata=SHARES | formerly("told"))
 
 
 @dataclass

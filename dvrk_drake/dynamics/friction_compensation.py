@@ -23,9 +23,9 @@ HOLDING_TRAVEL = 0.015
 HOLDING_SPEED = 0.25
 #: Share of the friction that may be compensated. On another day an arm may have a third less friction than identified
 #: (docs/dynamics.md); more than is there must never be given, also not late.
-LARGEST_RATIO = 0.6
+MAX_RATIO = 0.6
 #: The same of hysteresis that springs back, which is a part of it.
-LARGEST_HYSTERESIS_RATIO = 0.9
+MAX_HYSTERESIS_RATIO = 0.9
 #: How many times as wrong as on average over its own recording a model is anywhere: rarely more on simulated arms.
 WRONG_AT_MOST = 2.0
 
@@ -116,11 +116,11 @@ def check_ratios(ratio: float, hysteresis_ratio: float = 0.0) -> None:
     """Whether these shares may be asked for.
 
     Raises:
-        ControllerError: one is below 0, or above `LARGEST_RATIO` or `LARGEST_HYSTERESIS_RATIO`.
+        ControllerError: one is below 0, or above `MAX_RATIO` or `MAX_HYSTERESIS_RATIO`.
     """
     for name, share, largest in (
-        ("friction ratio", ratio, LARGEST_RATIO),
-        ("hysteresis ratio", hysteresis_ratio, LARGEST_HYSTERESIS_RATIO),
+        ("friction ratio", ratio, MAX_RATIO),
+        ("hysteresis ratio", hysteresis_ratio, MAX_HYSTERESIS_RATIO),
     ):
         if not 0 <= share <= largest:
             raise ControllerError(f"{name} must be between 0 and {largest:g}; got {share:g}")
@@ -139,10 +139,10 @@ def safe_ratios(
 
     Args:
         friction: of the arm.
-        ratio: wanted, 0..`LARGEST_RATIO`.
+        ratio: wanted, 0..`MAX_RATIO`.
         holding_error: (n,) by which the gravity compensation may be wrong [N m, N].
-        hysteresis_ratio: wanted of what `springs_back`, 0..`LARGEST_HYSTERESIS_RATIO`. That holds no arm where it was
-            let go, so nothing has to remain of it; but of all that rubs along a coordinate at most `LARGEST_RATIO` is
+        hysteresis_ratio: wanted of what `springs_back`, 0..`MAX_HYSTERESIS_RATIO`. That holds no arm where it was
+            let go, so nothing has to remain of it; but of all that rubs along a coordinate at most `MAX_RATIO` is
             compensated, this first.
 
     Returns:
@@ -172,9 +172,9 @@ def safe_ratios(
         return ratios[index]
     dry = np.array([effect.kind != "viscous" for effect in friction.effects], bool)
     wide = np.bincount(index, friction.coefficients * friction.springs_back, len(names))
-    most = LARGEST_RATIO * np.bincount(index, friction.coefficients * dry, len(names))
+    most = MAX_RATIO * np.bincount(index, friction.coefficients * dry, len(names))
     of_wide = np.minimum(hysteresis_ratio, most / np.maximum(wide, 1e-12))
-    left_for_rest = (most - of_wide * wide) / np.maximum(most / LARGEST_RATIO - wide, 1e-12)
+    left_for_rest = (most - of_wide * wide) / np.maximum(most / MAX_RATIO - wide, 1e-12)
     of_rest = np.where(wide > 0, np.minimum(ratios, np.maximum(left_for_rest, 0.0)), ratios)
     return np.where(friction.springs_back, of_wide[index], of_rest[index])
 
@@ -204,4 +204,4 @@ def holding_error(model: IdentifiedModel) -> NDArray[np.float64]:
 
     Zero for a model that was not identified from poses.
     """
-    return WRONG_AT_MOST * np.array([joint.rms_leave_one_out_undoubted for joint in model.joints])
+    return WRONG_AT_MOST * np.array([joint.rms_leave_one_out_included for joint in model.joints])

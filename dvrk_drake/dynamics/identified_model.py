@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,7 +30,7 @@ from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.models.schema_fault import missing_key, schema_fault, within
+from dvrk_drake.models.schema_fault import formerly, missing_key, schema_fault, with_current_keys, within
 from dvrk_drake.models.sdf_model import PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 
@@ -39,10 +39,10 @@ if TYPE_CHECKING:
 
 # No postponed annotations here: yaml_load_typed reads the types at run time.
 
-#: Of the files that `IdentifiedModel.save` writes.
-FORMAT = "dvrk_drake identified model 3"
-#: Of older files that can be read: there `arm` is a name or an absolute path, and effects have a `value`.
-_FORMAT_2 = "dvrk_drake identified model 2"
+#: Format of the files that `IdentifiedModel.save` writes.
+FORMAT = "dvrk_drake identified model 4"
+#: Formats of earlier versions that can be read. In format 2, `arm` is a name or an absolute path.
+_EARLIER_FORMATS = ("dvrk_drake identified model 3", "dvrk_drake identified model 2")
 #: Measured positions, which may be beyond the limits of a joint.
 _POSITIONS = within(-50.0, 50.0, "rad or m")
 
@@ -62,8 +62,8 @@ class JointStatistics:
     """How one joint was fitted. Torques are RMS in N m (N if prismatic), angles in rad (m).
 
     `rms_zero_torque` is the error of commanding nothing: the RMS of the measured torque. `rms_leave_one_out` predicts
-    each pose from all others; `rms_cross_validation` chooses the effects anew as well (ten folds). `_undoubted` leaves
-    out the measurements that were doubted (`num_doubted` of them). `trust` scales the joint's torque: 1, or less where
+    each pose from all others; `rms_cross_validation` chooses the effects anew as well (ten folds). `_included` leaves
+    out the measurements that were excluded (`num_excluded` of them). `feedforward_scale` scales the joint's torque: 1, or less where
     the data do not support the model. `position_lower`, `position_upper`: the range that the poses covered;
     `coverage`: its share of the arm's range.
     """
@@ -72,12 +72,16 @@ class JointStatistics:
     rms_zero_torque: float = field(default=0.0, metadata=RMS_EFFORTS)
     rms_fit: float = field(default=0.0, metadata=RMS_EFFORTS)
     rms_leave_one_out: float = field(default=0.0, metadata=RMS_EFFORTS)
-    rms_zero_torque_undoubted: float = field(default=0.0, metadata=RMS_EFFORTS)
-    rms_fit_undoubted: float = field(default=0.0, metadata=RMS_EFFORTS)
-    rms_leave_one_out_undoubted: float = field(default=0.0, metadata=RMS_EFFORTS)
-    rms_cross_validation_undoubted: float = field(default=0.0, metadata=RMS_EFFORTS)
-    num_doubted: int = field(default=0, metadata=within(0, 10**9))
-    trust: float = field(default=1.0, metadata=within(0.0, 1.0))
+    rms_zero_torque_included: float = field(default=0.0, metadata=RMS_EFFORTS | formerly("rms_zero_torque_undoubted"))
+    rms_fit_included: float = field(default=0.0, metadata=RMS_EFFORTS | formerly("rms_fit_undoubted"))
+    rms_leave_one_out_included: float = field(
+        default=0.0, metadata=RMS_EFFORTS | formerly("rms_leave_one_out_undoubted")
+    )
+    rms_cross_validation_included: float = field(
+        default=0.0, metadata=RMS_EFFORTS | formerly("rms_cross_validation_undoubted")
+    )
+    num_excluded: int = field(default=0, metadata=within(0, 10**9) | formerly("num_doubted"))
+    feedforward_scale: float = field(default=1.0, metadata=within(0.0, 1.0) | formerly("trust"))
     position_lower: float = field(default=0.0, metadata=_POSITIONS)
     position_upper: float = field(default=0.0, metadata=_POSITIONS)
     coverage: float = field(default=0.0, metadata=within(0.0, 10.0))
@@ -148,7 +152,7 @@ class ModelFile(_Identified, _Head):
 class IdentifiedModel(_Identified):
     """Identified parameters of an arm.
 
-    They give its holding torque tau = trust o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
+    They give its holding torque tau = feedforward_scale o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
 
     Attributes:
         arm: the arm, mounted as it was when its base parameters were identified.
@@ -212,10 +216,9 @@ class IdentifiedModel(_Identified):
         content = load_yaml(path, ModelError)
         # Another version has other keys, which are not worth naming.
         version = content.get("format") if isinstance(content, dict) else None
-        if version and version not in (FORMAT, _FORMAT_2):
-            raise ModelError(f'{path}: format is "{version}", this version reads "{FORMAT}" and 2; identify anew')
-        if version == _FORMAT_2:
-            _rename_values(content)
+        if version and version not in (FORMAT, *_EARLIER_FORMATS):
+            raise ModelError(f'{path}: format is "{version}", this version reads "{FORMAT}", 3 and 2; identify anew')
+        content = with_current_keys(ModelFile, content, str(path))
         file = typed_content(ModelFile, content, str(path), ModelError, "a model file")
         # A number that is missing would be 0 without a word.
         if key := missing_key(ModelFile, content):
@@ -285,9 +288,9 @@ class IdentifiedModel(_Identified):
         return np.array([p.value for p in self.base_parameters] + [e.coefficient for e in self.holding_effects])
 
     @property
-    def trust(self) -> NDArray[np.float64]:
+    def feedforward_scale(self) -> NDArray[np.float64]:
         """(n,) factor of each joint's torque."""
-        return np.array([joint.trust for joint in self.joints])
+        return np.array([joint.feedforward_scale for joint in self.joints])
 
     @cached_property
     def static_model(self) -> "StaticModel":
@@ -314,7 +317,7 @@ class IdentifiedModel(_Identified):
 
     def holding_torque(self, q: ArrayLike) -> NDArray[np.float64]:
         """Torque [N m, N] on the joints that holds the arm: (n,) for q (n,), (m, n) for q (m, n)."""
-        return self.trust * self.static_model.torque(q, self.theta)
+        return self.feedforward_scale * self.static_model.torque(q, self.theta)
 
 
 class ControlModel:
@@ -334,7 +337,7 @@ class ControlModel:
         model.check()
         self._torque_into = model.static_model.torque_into
         self._theta = np.ascontiguousarray(model.theta)
-        self._scale = model.trust * with_gravity
+        self._scale = model.feedforward_scale * with_gravity
         if model.dynamics is None:
             self._regressor = DynamicRegressor(model.arm)
             self._parameters = self._regressor.values
@@ -350,15 +353,6 @@ class ControlModel:
     def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the mass matrix (n, n) of the independent joints at q (n,) [rad, m], rotors included."""
         return self._regressor.mass_matrix(q[None], self._parameters)[0]
-
-
-def _rename_values(content: dict[str, Any]) -> None:
-    """Makes the effects of a file of version 2 those of version 3; what does not fit is refused later."""
-    for part in (content, content.get("dynamics")):
-        effects = part.get("effects") if isinstance(part, dict) else None
-        for effect in effects if isinstance(effects, list) else ():
-            if isinstance(effect, dict) and "value" in effect:
-                effect["coefficient"] = effect.pop("value")
 
 
 def _name_for(path: str | Path, arm: Arm) -> str:

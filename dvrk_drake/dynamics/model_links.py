@@ -22,7 +22,7 @@ from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import shared_plant
 
 #: Least eigenvalue of a link's pseudo-inertia, as a share of that of the SDF's link in all directions.
-LEAST_SHARE = 0.01
+MIN_SHARE = 0.01
 #: Change of Z below which a link has not moved.
 _ROUNDING = 1e-7
 _UPPER = [(i, k) for i in range(4) for k in range(i, 4)]
@@ -32,7 +32,7 @@ def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
     """Links of which the gravity torque is Y(q) beta, as near to the SDF's as bodies can be.
 
     With the SDF's pseudo-inertia J0 = L L' of a link, Z = L^-1 J L^-T is 1 where nothing changes, whatever the link's
-    size: the distance is the sum of |Z - 1|^2 (Frobenius) over the links, under Z > LEAST_SHARE and the linear
+    size: the distance is the sum of |Z - 1|^2 (Frobenius) over the links, under Z > MIN_SHARE and the linear
     equations of the gravity torque. Distance and condition do not depend on frames or units (Lee, Wensing, Park,
     "Geometric robot dynamic identification", 2020: its second-order approximation at J0).
 
@@ -48,10 +48,10 @@ def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
     maps = {i: _map(link) for i, link in enumerate(regressor.links) if not _is_rotor(arm, link.link)}
     A, b = _equations(regressor, maps, np.asarray(base_values, dtype=np.float64))
     z = _nearest(A, b)
-    if _least_eigenvalue(z) < LEAST_SHARE:
+    if _least_eigenvalue(z) < MIN_SHARE:
         z = _nearest_body(A, b)
     z = _polished(A, b, z)
-    if _least_eigenvalue(z) < LEAST_SHARE / 2:
+    if _least_eigenvalue(z) < MIN_SHARE / 2:
         raise ModelError(f"{arm.name}: no bodies were found that have these base parameters")
     links = list(regressor.links)
     for (i, T), part in zip(maps.items(), z.reshape(-1, 10), strict=True):
@@ -103,14 +103,14 @@ def _nearest(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float
 
 
 def _nearest_body(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The nearest z of which all Z exceed LEAST_SHARE."""
+    """The nearest z of which all Z exceed MIN_SHARE."""
     weights, target = _weights(A.shape[1] // 10)
     program = MathematicalProgram()
     z = program.NewContinuousVariables(len(weights), "z")
     program.AddQuadraticCost(2 * np.diag(weights), -2 * weights * target, z, is_convex=True)
     program.AddLinearEqualityConstraint(A, b, z)
     for link in z.reshape(-1, 10):
-        shifted = [variable - LEAST_SHARE * (i == k) for variable, (i, k) in zip(link, _UPPER, strict=True)]
+        shifted = [variable - MIN_SHARE * (i == k) for variable, (i, k) in zip(link, _UPPER, strict=True)]
         program.AddPositiveSemidefiniteConstraint(_symmetric(np.array(shifted, dtype=object)))
     result = ClarabelSolver().Solve(program)
     if not result.is_success():
@@ -190,8 +190,8 @@ def _static_effects(model: IdentifiedModel) -> list[str]:
     remarks = []
     if effects := [f"{ActuatorEffect.of(e)} {e.coefficient:+.4g}" for e in model.effects]:
         remarks.append(f"effects [N m; N if prismatic]: {', '.join(effects)}")
-    if doubted := [f"{j.name} {j.trust:g}" for j in model.joints if j.trust != 1.0]:
-        remarks.append(f"feedforward scale below 1: {', '.join(doubted)}")
+    if excluded := [f"{j.name} {j.feedforward_scale:g}" for j in model.joints if j.feedforward_scale != 1.0]:
+        remarks.append(f"feedforward scale below 1: {', '.join(excluded)}")
     return remarks
 
 

@@ -100,7 +100,7 @@ def _stated(link: str, corners: BoxCorners) -> BoundingBox:
 
 
 #: Least eigenvalue of a pseudo-inertia [kg, kg m, kg m^2], unless the SDF's own link has less than four times that.
-LEAST_EIGENVALUE = 1e-9
+MIN_EIGENVALUE = 1e-9
 #: A link's mass stays within these multiples of the SDF's.
 MASS_RANGE = 0.1, 5.0
 #: The sum of all links' masses stays within this share of the SDF's.
@@ -234,8 +234,8 @@ def log_det_curvature(x: NDArray[np.float64], links: Sequence[LinkInertia]) -> N
 
 
 def least_eigenvalue_bound(link: LinkInertia) -> float:
-    """The least eigenvalue that a link's pseudo-inertia may get: `LEAST_EIGENVALUE`, or a quarter of the SDF's."""
-    return min(LEAST_EIGENVALUE, 0.25 * float(np.linalg.eigvalsh(link.pseudo_inertia())[0]))
+    """The least eigenvalue that a link's pseudo-inertia may get: `MIN_EIGENVALUE`, or a quarter of the SDF's."""
+    return min(MIN_EIGENVALUE, 0.25 * float(np.linalg.eigvalsh(link.pseudo_inertia())[0]))
 
 
 def room_in_box(parameters: NDArray[np.float64], box: BoundingBox) -> NDArray[np.float64]:

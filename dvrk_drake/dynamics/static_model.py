@@ -1,4 +1,4 @@
-"""The torque that holds an arm, tau = trust o (Y(q) beta + effects(q)): compiled, for any arm and choice of effects."""
+"""The torque that holds an arm, tau = feedforward_scale o (Y(q) beta + effects(q)): compiled, for any arm and choice of effects."""
 
 from __future__ import annotations
 

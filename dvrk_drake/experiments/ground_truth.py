@@ -39,7 +39,7 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 #: Highest joint speed between poses [rad/s], [m/s].
 TRAVEL_SPEED = 1.7, 0.2
 #: Least time on the way [s], time to settle [s], samples a pose.
-LEAST_TRAVEL, SETTLE, SAMPLES = 0.8, 1.0, 10
+MIN_TRAVEL, SETTLE, SAMPLES = 0.8, 1.0, 10
 #: Between two samples of a pose [s].
 SAMPLE_SPACING = 0.01
 
@@ -62,7 +62,7 @@ def visiting_trajectory(arm: Arm, poses: NDArray[np.float64]) -> tuple[Piecewise
     for i, pose in enumerate(poses):
         if i:
             # A cubic from rest to rest is 1.5 times as fast in its middle as on average.
-            travel = max(LEAST_TRAVEL, 1.5 * float(np.max(np.abs(pose - poses[i - 1]) / speed)))
+            travel = max(MIN_TRAVEL, 1.5 * float(np.max(np.abs(pose - poses[i - 1]) / speed)))
             times.append(times[-1] + travel)
             knots.append(pose)
         settled.append(times[-1] + SETTLE)
@@ -127,13 +127,13 @@ class GroundTruth:
     Attributes:
         arm: to simulate; its SDF is a file of the output folder, its `effects` are the real arm's.
         model: the torque that holds it against gravity, cables and springs; for judging, never for a controller.
-        is_the_papers: it is the arm that the paper's parameters are of.
+        is_paper_arm: it is the arm that the paper's parameters are of.
         origin: where it comes from, a sentence.
     """
 
     arm: Arm
     model: IdentifiedModel
-    is_the_papers: bool
+    is_paper_arm: bool
     origin: str
 
 
@@ -152,11 +152,11 @@ def paper_arm(recording: Recording, folder: Path) -> GroundTruth:
     model = identify_static(recording, arm).model
     one_sided = {law.coordinate for law in arm.effects.friction if law.kind == "presliding forward"}
     lasting = [e for e in model.effects if not (e.kind == "offset" and _at_actuator(e.coordinate) in one_sided)]
-    statistics = [dataclasses.replace(joint, trust=1.0) for joint in model.joints]
+    statistics = [dataclasses.replace(joint, feedforward_scale=1.0) for joint in model.joints]
     model = dataclasses.replace(model, joints=statistics, effects=lasting)
     laws = model.effects
     effects = dataclasses.replace(arm.effects, cables=laws, springs=[])
-    true_arm = with_links(arm, model_bodies(model).links, folder / "true_mtm.sdf", "the paper's recording")
+    ground_truth_arm = with_links(arm, model_bodies(model).links, folder / "true_mtm.sdf", "the paper's recording")
     origin = (
         "The true arm is the paper's MTM as our identification sees it in the paper's 72 poses (gravity, cables, "
         "springs), with the friction, stops, encoders, motors and delays of `mechanisms/mtm.yaml`, which are "
@@ -164,14 +164,14 @@ def paper_arm(recording: Recording, folder: Path) -> GroundTruth:
         "which is what its friction leaves, larger towards one side: there the true arm has less to compensate than "
         "the real one seems to have had."
     )
-    return GroundTruth(dataclasses.replace(true_arm, effects=effects), model, True, origin)
+    return GroundTruth(dataclasses.replace(ground_truth_arm, effects=effects), model, True, origin)
 
 
 def _at_actuator(coordinate: str) -> str:
     return "actuator." + coordinate.partition(".")[2]
 
 
-def unlike_its_drawing(name: str, folder: Path, seed: int) -> GroundTruth:
+def perturbed_ground_truth(name: str, folder: Path, seed: int) -> GroundTruth:
     """An arm whose links are each up to `SPREAD` heavier or lighter than the SDF's; writes its SDF into `folder`.
 
     An MTM has no wrist spring then: the identified spring balances an identified wrist, which is heavier than the
@@ -179,16 +179,18 @@ def unlike_its_drawing(name: str, folder: Path, seed: int) -> GroundTruth:
     """
     arm = load_arm(name)
     links = perturbed_links(arm, np.random.default_rng(seed))
-    true_arm = with_links(arm, links, folder / f"true_{name}.sdf", "no arm: each link's mass is drawn at random")
+    ground_truth_arm = with_links(
+        arm, links, folder / f"true_{name}.sdf", "no arm: each link's mass is drawn at random"
+    )
     if name == PAPER_ARM:
-        true_arm = dataclasses.replace(true_arm, effects=arm.effects.without("springs"))
-    laws = [*true_arm.effects.cables, *true_arm.effects.springs]
-    model = dataclasses.replace(IdentifiedModel.from_arm(true_arm, laws), arm=arm)
+        ground_truth_arm = dataclasses.replace(ground_truth_arm, effects=arm.effects.without("springs"))
+    laws = [*ground_truth_arm.effects.cables, *ground_truth_arm.effects.springs]
+    model = dataclasses.replace(IdentifiedModel.from_arm(ground_truth_arm, laws), arm=arm)
     origin = (
         f"The true arm is the SDF's with links that are each up to {100 * SPREAD:.0f} % heavier or lighter (drawn with "
         f"seed {seed}), and the effects of `mechanisms/`: friction, cables, encoders, motors, delays."
     )
-    return GroundTruth(true_arm, model, False, origin)
+    return GroundTruth(ground_truth_arm, model, False, origin)
 
 
 def perturbed_links(arm: Arm, generator: np.random.Generator, shift: float = 0.0) -> list[LinkInertia]:
@@ -215,15 +217,17 @@ def with_links(arm: Arm, links: Sequence[LinkInertia], path: Path, origin: str) 
 
 
 def damped_station(
-    arm: Arm, true_arm: Arm, effects: ArmEffects, closure: Closure, meshcat: Meshcat | None = None
+    arm: Arm, ground_truth_arm: Arm, effects: ArmEffects, closure: Closure, meshcat: Meshcat | None = None
 ) -> ArmStation:
     """A station that simulates a ground-truth arm with these effects, its joints damped in the place of friction."""
     damping = arm.per_joint(0.03, 0.3) * arm.effort_limits
 
     def damp(plant: MultibodyPlant) -> None:
-        set_joint_damping(plant, true_arm, damping)
+        set_joint_damping(plant, ground_truth_arm, damping)
 
-    return ArmStation(arm, plant_arm=true_arm, meshcat=meshcat, closure=closure, modify_plant=damp, effects=effects)
+    return ArmStation(
+        arm, plant_arm=ground_truth_arm, meshcat=meshcat, closure=closure, modify_plant=damp, effects=effects
+    )
 
 
 #: From how far on either side a pose is approached, so that dry friction cancels [rad], [m].
@@ -258,12 +262,12 @@ def collect(
     return Recording(q=q, tau=tau, source=f"{count} poses of the simulated {arm.name}")
 
 
-def _collect_chunk(name: str, true_arm: Arm, poses: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+def _collect_chunk(name: str, ground_truth_arm: Arm, poses: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
     """(m, 2n) means of q and tau over both sides."""
     arm = load_arm(name)
     offset = arm.per_joint(*APPROACH)
     visited = np.concatenate([[beside(arm, q, -offset), q, beside(arm, q, offset), q] for q in poses])
-    station = ArmStation(arm, plant_arm=true_arm, effects=true_arm.effects, seed=seed)
+    station = ArmStation(arm, plant_arm=ground_truth_arm, effects=ground_truth_arm.effects, seed=seed)
     generator = np.random.default_rng(seed)
     nominal = IdentifiedModel.from_arm(arm)
     recording = collect_static_poses(station, nominal, visited, effort_noise=0.0, generator=generator)

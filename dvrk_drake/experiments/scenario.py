@@ -13,20 +13,20 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.dynamics.friction_compensation import LARGEST_HYSTERESIS_RATIO, LARGEST_RATIO
+from dvrk_drake.dynamics.friction_compensation import MAX_HYSTERESIS_RATIO, MAX_RATIO
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ScenarioError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains, load_gains
-from dvrk_drake.models.schema_fault import within
+from dvrk_drake.models.schema_fault import formerly, within
 from dvrk_drake.models.typed_yaml import load_yaml, parse_yaml, typed_content
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.hand import Grip
 from dvrk_drake.systems.station_config import ArmConfig
 
 #: Longest simulation [s] and finest recording that are taken for meant.
-LONGEST, LEAST_SAMPLE_PERIOD = 3600.0, 1e-3
+MAX_LENGTH, MIN_SAMPLE_PERIOD = 3600.0, 1e-3
 #: Positions; `check_pose` has the limits of the arm.
 _POSITIONS = within(-1e4, 1e4, "rad or m")
 _GRIP = {grip.name: grip for grip in dataclasses.fields(Grip)}
@@ -41,16 +41,16 @@ class ControllerScenario:
     `friction_ratio` is the share of the friction that the arm's files state which is compensated, and
     `hysteresis_ratio` that of the part that springs back, see `check_ratios`; in mode "gravity" only.
     `parameter_error` makes the model wrong: each of its base parameters is multiplied by a factor of its own from
-    1 - `parameter_error`..1 + `parameter_error`, drawn by the scenario's seed. `knows` names those of "cables" and
+    1 - `parameter_error`..1 + `parameter_error`, drawn by the scenario's seed. `compensated_effects` names those of "cables" and
     "springs" of the arm's own effects that the model has beside the SDF; not for a model from a file.
     """
 
     mode: str = "hold"
     model: str = ""
-    knows: list[str] = field(default_factory=list)
+    compensated_effects: list[str] = field(default_factory=list, metadata=formerly("knows"))
     gains: Gains | None = None
-    friction_ratio: float = field(default=0.0, metadata=within(0.0, LARGEST_RATIO))
-    hysteresis_ratio: float = field(default=0.0, metadata=within(0.0, LARGEST_HYSTERESIS_RATIO))
+    friction_ratio: float = field(default=0.0, metadata=within(0.0, MAX_RATIO))
+    hysteresis_ratio: float = field(default=0.0, metadata=within(0.0, MAX_HYSTERESIS_RATIO))
     parameter_error: float = field(default=0.0, metadata=within(0.0, 1.0))
 
 
@@ -58,7 +58,7 @@ class ControllerScenario:
 class Target:
     """At `time` [s] the arm is wanted at rest at `pose` [rad, m], one number a joint."""
 
-    time: float = field(default=0.0, metadata=within(0.0, LONGEST, "s"))
+    time: float = field(default=0.0, metadata=within(0.0, MAX_LENGTH, "s"))
     pose: list[float] = field(default_factory=list, metadata=_POSITIONS)
 
 
@@ -106,7 +106,7 @@ class Scenario(ArmConfig):
 
     Example:
         >>> import dvrk_drake as dvrk
-        >>> scenario = dvrk.Scenario(arm="psm", duration=0.1, real_arm=["friction"])
+        >>> scenario = dvrk.Scenario(arm="psm", duration=0.1, simulated_effects=["friction"])
         >>> scenario.controller.mode = "gravity"
         >>> dvrk.simulate(scenario).recording.measured_effort().shape
         (11, 7)
@@ -114,8 +114,8 @@ class Scenario(ArmConfig):
 
     closure: str = "ball"
     time_step: float = field(default=1e-3, metadata=within(1e-5, 0.01, "s"))
-    duration: float = field(default=5.0, metadata=within(LEAST_SAMPLE_PERIOD, LONGEST, "s"))
-    sample_period: float = field(default=0.01, metadata=within(LEAST_SAMPLE_PERIOD, LONGEST, "s"))
+    duration: float = field(default=5.0, metadata=within(MIN_SAMPLE_PERIOD, MAX_LENGTH, "s"))
+    sample_period: float = field(default=0.01, metadata=within(MIN_SAMPLE_PERIOD, MAX_LENGTH, "s"))
     controller: ControllerScenario = field(default_factory=ControllerScenario)
     start: list[float] | None = field(default=None, metadata=_POSITIONS)
     targets: list[Target] = field(default_factory=list)
@@ -126,7 +126,9 @@ class Scenario(ArmConfig):
     def model(self) -> IdentifiedModel:
         """What the controller believes."""
         file, error = self.controller.model, self.controller.parameter_error
-        known = [effect for part in self.controller.knows for effect in getattr(self.mounted_arm.effects, part)]
+        known = [
+            effect for part in self.controller.compensated_effects for effect in getattr(self.mounted_arm.effects, part)
+        ]
         model = (
             IdentifiedModel.load(file, self.mounted_arm) if file else IdentifiedModel.from_arm(self.mounted_arm, known)
         )
@@ -155,16 +157,18 @@ class Scenario(ArmConfig):
         arm = self.mounted_arm
         _check_choice("controller.mode", self.controller.mode, get_args(Mode))
         if self.duration < self.sample_period:
-            raise ScenarioError(f"duration is {self.duration:g}; allowed: {self.sample_period:g}..{LONGEST:g} s")
+            raise ScenarioError(f"duration is {self.duration:g}; allowed: {self.sample_period:g}..{MAX_LENGTH:g} s")
         if self.start is not None:
             check_pose("start", self.start, arm)
         self._check_targets("targets", self.targets, 0.0)
         self._check_targets("hand.path", self.hand.path, -1.0)
         self._check_hand()
-        for part in self.controller.knows:
-            _check_choice("controller.knows", part, ("cables", "springs"))
-        if self.controller.knows and self.controller.model:
-            raise ScenarioError("controller.knows is of a model from the arm's files; controller.model names another")
+        for part in self.controller.compensated_effects:
+            _check_choice("controller.compensated_effects", part, ("cables", "springs"))
+        if self.controller.compensated_effects and self.controller.model:
+            raise ScenarioError(
+                "controller.compensated_effects is of a model from the arm's files; controller.model names another"
+            )
         if (gains := self.controller.gains) and (fault := arm.gains_fault(gains)):
             raise ScenarioError(f"controller.{fault}")
         for name in ("friction_ratio", "hysteresis_ratio"):

@@ -35,7 +35,7 @@ class Simulation:
     """Result of `simulate`.
 
     Attributes:
-        recording: t, q, qd, tau (m, n) as the arm measures them: exact without `real_arm`, but for the scenario's noise
+        recording: t, q, qd, tau (m, n) as the arm measures them: exact without `simulated_effects`, but for the scenario's noise
             on tau.
         state_true: (m, 2n) q, then v as they are.
         hand: (m, 6) torque [N m], then force [N] of the hand on the arm at the frame that it holds, in the base; zeros
@@ -222,7 +222,7 @@ def scenario_of_arm(
         gravity=arm.gravity.tolist(),
         start=None if start is None else np.asarray(start, float).tolist(),
         targets=[Target(float(time), np.asarray(pose, float).tolist()) for time, pose in targets],
-        real_arm=[effects] if isinstance(effects, str) else list(effects),
+        simulated_effects=[effects] if isinstance(effects, str) else list(effects),
     )
 
 

@@ -29,9 +29,9 @@ from dvrk_drake.systems.hand import Grip, Hand, PoseTrajectorySource
 #: Of what is recorded [s].
 SAMPLE_PERIOD = 5e-3
 #: Until the hand has taken hold of the arm; what it feels before does not count [s].
-TAKES_HOLD = 1.0
+GRASP_TIME = 1.0
 #: A motion that leaves the limits further is not this arm's [rad, m].
-LEAVES = 0.1
+MAX_LIMIT_EXCESS = 0.1
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class Compensation:
 
 
 @dataclass(frozen=True, eq=False)
-class Felt:
-    """What a hand felt along a path.
+class OperatorForces:
+    """Interaction force and torque between the hand of an operator and the handle along a path.
 
     Attributes:
         name: of the compensation.
@@ -71,22 +71,22 @@ class Felt:
     @property
     def rms_force(self) -> float:
         """[N] once the hand has taken hold."""
-        return _rms(self.force[self.time >= TAKES_HOLD])
+        return _rms(self.force[self.time >= GRASP_TIME])
 
     @property
     def rms_torque(self) -> float:
         """[N m] once the hand has taken hold."""
-        return _rms(self.torque[self.time >= TAKES_HOLD])
+        return _rms(self.torque[self.time >= GRASP_TIME])
 
     def peak(self) -> tuple[float, float]:
         """The force [N] and torque [N m] that are exceeded in a twentieth of the time."""
-        late = self.time >= TAKES_HOLD
+        late = self.time >= GRASP_TIME
         norms = (np.linalg.norm(x[late], axis=1) for x in (self.force, self.torque))
         force, torque = (float(np.percentile(norm, 95)) for norm in norms)
         return force, torque
 
 
-def rambling_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int = 0) -> PiecewisePolynomial:
+def random_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int = 0) -> PiecewisePolynomial:
     """A smooth motion of the joints through random poses, as slow as a hand, for lack of a recorded one."""
     q = arm.sample_poses(poses, np.random.default_rng(seed), margin=0.25)
     times = seconds_each * np.arange(poses, dtype=float)
@@ -109,7 +109,7 @@ def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> Piecewi
         raise ScenarioError(f"speed is {speed:g}; allowed: above 0, up to 10")
     A, lower, upper = arm.limit_matrix()
     outside = np.max(np.maximum(lower - recording.q @ A.T, recording.q @ A.T - upper), axis=0)
-    if np.any(outside > LEAVES):
+    if np.any(outside > MAX_LIMIT_EXCESS):
         j = int(np.argmax(outside))
         name = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)][j]
         raise ScenarioError(
@@ -123,7 +123,7 @@ def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> Piecewi
     return PiecewisePolynomial.CubicShapePreserving((t - t[0]) / speed, q.T, zero_end_point_derivatives=True)
 
 
-def feel(
+def simulate_operator(
     arm: Arm,
     path: PiecewisePolynomial,
     compensation: Compensation,
@@ -133,7 +133,7 @@ def feel(
     frame_name: str = "",
     seed: int = 0,
     progress: Callable[[float], object] = lambda share: None,
-) -> Felt:
+) -> OperatorForces:
     """Lets a hand lead the handle of a simulated arm along the way that `path` takes it.
 
     Args:
@@ -171,7 +171,7 @@ def feel(
     positions = np.array([frame.pose(q).translation() for q in state[:, : arm.num_joints]])
     wanted = np.array([way.GetPose(min(t, way.end_time())).translation() for t in times])
     deviation = np.linalg.norm(wanted - positions, axis=1)
-    return Felt(compensation.name, times, forces[:, :3], forces[:, 3:], deviation)
+    return OperatorForces(compensation.name, times, forces[:, :3], forces[:, 3:], deviation)
 
 
 def _friction(arm: Arm, compensation: Compensation) -> FrictionCompensator | None:

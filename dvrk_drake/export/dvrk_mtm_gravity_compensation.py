@@ -184,9 +184,9 @@ def largest_differences(file: GravityCompensationFile, model: IdentifiedModel) -
 
 
 def _gravity_torque(model: IdentifiedModel, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m, 7) what the base parameters alone say, trust included."""
+    """(m, 7) what the base parameters alone say, feedforward scale included."""
     beta = np.array([p.value for p in model.base_parameters])
-    return np.asarray(model.trust * (model.static_model.regressor(q)[:, :, : len(beta)] @ beta))
+    return np.asarray(model.feedforward_scale * (model.static_model.regressor(q)[:, :, : len(beta)] @ beta))
 
 
 def _gravity_parameters(model: IdentifiedModel, poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -212,7 +212,7 @@ def _effect_parameters(model: IdentifiedModel, arm: Arm) -> NDArray[np.float64]:
         row = joint_row(arm, estimate.coordinate)
         # The file has nothing for the last joint, nor for what moves with two: _refuse_errors measures what that costs.
         for joint in map(int, np.flatnonzero(row[:-1])):
-            value = float(model.trust[joint] * estimate.coefficient * row[joint])
+            value = float(model.feedforward_scale[joint] * estimate.coefficient * row[joint])
             if estimate.kind == "offset":
                 parameters[polynomial_columns(joint).start] += value
             elif np.count_nonzero(row) > 1:
@@ -259,7 +259,7 @@ def _refuse_errors(
     limits = ["a last link balanced about its roll axis"]
     if lean > 0.05:
         limits.append(f"an upright base, which here leans by {lean:.1f} deg")
-    if np.any((model.trust != 0) & (model.trust != 1)):
+    if np.any((model.feedforward_scale != 0) & (model.feedforward_scale != 1)):
         limits.append("no feedforward scale below 1")
     reasons = {
         f"gravity {gravity_off.max():.2g} (the file knows {', '.join(limits)})": gravity_off.max(),

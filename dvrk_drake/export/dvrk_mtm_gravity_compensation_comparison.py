@@ -26,7 +26,7 @@ _TELLS_SIDE = slice(1, 4)
 #: The mirror image fits clearly better if its error is below this share; of the four public files the wrong
 #: side has 1.8 to 2.1 times the error of the right one.
 _CLEARLY_BETTER = 0.8
-_LEAST_POSES = 200
+_MIN_POSES = 200
 #: A torque below this share of the model's largest on that joint has no sign that matters.
 SIGN_SHARE = 0.1
 POSES = 20000
@@ -185,7 +185,7 @@ def _is_of_other_side(
     model: IdentifiedModel, q: NDArray[np.float64], tau_file: NDArray[np.float64], in_sweep: NDArray[np.bool_]
 ) -> bool:
     """Whether the mirror image of the model fits a file's torque clearly better, where the file has data if it says."""
-    if np.count_nonzero(in_sweep) >= _LEAST_POSES:
+    if np.count_nonzero(in_sweep) >= _MIN_POSES:
         q, tau_file = q[in_sweep], tau_file[in_sweep]
     own, mirrored = model.holding_torque(q), _MIRROR * model.holding_torque(_MIRROR * q)
     return _side_error(tau_file, mirrored) < _CLEARLY_BETTER * _side_error(tau_file, own)

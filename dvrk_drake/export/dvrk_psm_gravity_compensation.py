@@ -92,7 +92,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
 
     Raises:
         ModelError: not the model of a PSM, a counterweight that outweighs all that the insertion carries, or an error
-            above `tolerance` [N m, N]: joint effects, trust below 1.
+            above `tolerance` [N m, N]: joint effects, feedforward scale below 1.
     """
     arm = model.arm
     plant = shared_plant(arm)
@@ -103,7 +103,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
     q = arm.sample_poses(600, np.random.default_rng(0))
     straight = np.where(np.arange(arm.num_joints) < 3, q, 0.0)
     beta = np.array([p.value for p in model.base_parameters])
-    tau = (model.trust * (model.static_model.regressor(straight)[:, :, : len(beta)] @ beta))[:, :3]
+    tau = (model.feedforward_scale * (model.static_model.regressor(straight)[:, :, : len(beta)] @ beta))[:, :3]
     # (m, 3, 7, 4) torque on yaw, pitch and insertion per mass and first moment of each link of the chain.
     frames = [_frames(alpha, A, theta, D, pose) for pose in straight[:, :3]]
     Y = np.array([_regressor(X, arm.gravity) for X in frames])

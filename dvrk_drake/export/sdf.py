@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.files import LARGEST_BINARY, atomic_write, open_input, read_json_input
+from dvrk_drake.models.files import MAX_BINARY, atomic_write, open_input, read_json_input
 from dvrk_drake.models.sdf_model import DRAKE, PACKAGE_URL, compose_sdf, local_path
 
 #: Relative change below which a link keeps its text: what converting an inertia back and forth rounds off.
@@ -244,7 +244,7 @@ def _parts_of(mesh: Path) -> list[str]:
     """Buffers and images that a glTF file keeps outside of itself."""
     if mesh.suffix != ".gltf":
         return []
-    content = read_json_input(mesh, ArmError, LARGEST_BINARY)
+    content = read_json_input(mesh, ArmError, MAX_BINARY)
     try:
         uris = [part.get("uri", "data:") for kind in ("buffers", "images") for part in content.get(kind, [])]
         names = [uri for uri in uris if not uri.startswith("data:")]

@@ -36,13 +36,13 @@ from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 _ARMS = MODELS_FOLDER / "arms"
 #: Length of the gravity vector, at most [m/s^2].
-LARGEST_GRAVITY = 30.0
+MAX_GRAVITY = 30.0
 #: A gain is too large if this position error [rad, m] demands the whole effort limit of the joint: kp at once, kd if
 #: the error arises within 0.1 s, ki if it lasts for 0.1 s.
-_LEAST_ERROR = (1e-4, 1e-5)
+_MIN_ERROR = (1e-4, 1e-5)
 #: A gain is too small if an error of the whole range of the joint demands less than this share of its effort limit: kp
 #: at once, kd if the error arises within 1 s, ki if it lasts for 1 s.
-_LEAST_SHARE = {"kp": 1e-2, "kd": 1e-4, "ki": 1e-4}
+_MIN_SHARE = {"kp": 1e-2, "kd": 1e-4, "ki": 1e-4}
 
 Part = TypeVar("Part", Mechanism, Instrument)
 
@@ -123,16 +123,16 @@ class Arm:
         """The first gain that is not for this arm, with what is allowed; or "".
 
         A gain must be large enough to move its joint, and so small that the resolution of the position measurement does
-        not demand the whole effort limit, see `_LEAST_SHARE` and `_LEAST_ERROR`.
+        not demand the whole effort limit, see `_MIN_SHARE` and `_MIN_ERROR`.
         """
         if fault := _count_fault("gains.", vars(gains), self.joint_names):
             return fault
         if fault := number_fault(gains):
             return f"gains.{fault}"
         width = self.position_upper - self.position_lower
-        least_error = self.per_joint(*_LEAST_ERROR)
+        least_error = self.per_joint(*_MIN_ERROR)
         for name, rate in (("kp", 1.0), ("kd", 10.0), ("ki", 0.1)):
-            lowest = _LEAST_SHARE[name] * self.effort_limits / width
+            lowest = _MIN_SHARE[name] * self.effort_limits / width
             highest = self.effort_limits / (rate * least_error)
             for i, gain in enumerate(getattr(gains, name)):
                 allowed = Range(float(lowest[i]), float(highest[i]), also=() if name == "kp" else (0.0,))
@@ -442,11 +442,9 @@ def _checked_effects(path: Path, effects: ArmEffects, joints: list[str]) -> ArmE
 
 def _checked_gravity(gravity: ArrayLike) -> NDArray[np.float64]:
     vector = np.asarray(gravity, float)
-    if vector.shape != (3,) or not np.linalg.norm(vector) <= LARGEST_GRAVITY:
+    if vector.shape != (3,) or not np.linalg.norm(vector) <= MAX_GRAVITY:
         numbers = ", ".join(f"{x:g}" for x in vector.ravel())
-        raise ArmError(
-            f"gravity ({numbers}) must be three numbers of a size up to {LARGEST_GRAVITY:g} m/s^2; on Earth 9.8"
-        )
+        raise ArmError(f"gravity ({numbers}) must be three numbers of a size up to {MAX_GRAVITY:g} m/s^2; on Earth 9.8")
     return vector
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.schema_fault import formerly, number_fault, within
 
 #: Steps and noise of efforts: one bit of a dVRK's wrist motor is 1e-5 N m.
 _EFFORT_STEPS = within(1e-9, 100.0, "N m or N")
@@ -33,7 +33,7 @@ class DriveEffect:
     coordinate: str = ""
     kind: str = ""
     scale: float = field(default=0.0, metadata=within(1e-6, 1000.0, also=(0.0,)))
-    coefficient: float = field(default=0.0, metadata=within(-1e6, 1e6, "N m, N m s/rad or N m/rad"))
+    coefficient: float = field(default=0.0, metadata=within(-1e6, 1e6, "N m, N m s/rad or N m/rad") | formerly("value"))
     standard_error: float = field(default=0.0, kw_only=True, metadata=within(0.0, 1e9))
 
     @property

@@ -16,9 +16,9 @@ from typing import IO, Any
 from dvrk_drake.errors import DvrkDrakeError
 
 #: Largest settings or model file [bytes]; a model of a PSM with dynamics has 60 kB.
-LARGEST_TEXT = 4_000_000
+MAX_TEXT = 4_000_000
 #: Largest file that is read as a whole in any other format [bytes].
-LARGEST_BINARY = 256_000_000
+MAX_BINARY = 256_000_000
 
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -64,7 +64,7 @@ def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | Non
     return file
 
 
-def read_input(path: str | Path, error: type[DvrkDrakeError], largest: int = LARGEST_BINARY) -> bytes:
+def read_input(path: str | Path, error: type[DvrkDrakeError], largest: int = MAX_BINARY) -> bytes:
     """Returns the content of a file.
 
     Raises:
@@ -80,7 +80,7 @@ def read_input(path: str | Path, error: type[DvrkDrakeError], largest: int = LAR
     return content
 
 
-def read_text_input(path: str | Path, error: type[DvrkDrakeError], largest: int = LARGEST_TEXT) -> str:
+def read_text_input(path: str | Path, error: type[DvrkDrakeError], largest: int = MAX_TEXT) -> str:
     """Returns the text of a file in UTF-8, with or without a byte-order mark.
 
     Raises:
@@ -93,7 +93,7 @@ def read_text_input(path: str | Path, error: type[DvrkDrakeError], largest: int 
         raise error(f"{path}: not a text file in UTF-8: {cause.reason} at byte {cause.start}") from cause
 
 
-def read_json_input(path: str | Path, error: type[DvrkDrakeError], largest: int = LARGEST_TEXT) -> Any:
+def read_json_input(path: str | Path, error: type[DvrkDrakeError], largest: int = MAX_TEXT) -> Any:
     """Returns the content of a JSON file.
 
     Raises:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
 
 #: Shortest and longest key, length of a new one [bytes]; BLAKE2b has no longer keys.
-_SHORTEST, _LONGEST, _NEW = 16, 64, 32
+_MIN_LENGTH, _MAX_LENGTH, _NEW = 16, 64, 32
 #: Length of a message authentication code [bytes].
 MAC_SIZE = 16
 #: A message without a code ends with its size, zero; one with a code ends with this and the code.
@@ -40,8 +40,8 @@ class MessageKey:
         Raises:
             KeyFileError: the key is shorter or longer.
         """
-        if not _SHORTEST <= len(key) <= _LONGEST:
-            raise KeyFileError(f"a key has {_SHORTEST} to {_LONGEST} bytes; this one has {len(key)}")
+        if not _MIN_LENGTH <= len(key) <= _MAX_LENGTH:
+            raise KeyFileError(f"a key has {_MIN_LENGTH} to {_MAX_LENGTH} bytes; this one has {len(key)}")
         self._hash = hashlib.blake2b(key=key, digest_size=MAC_SIZE)
 
     @classmethod
@@ -55,13 +55,13 @@ class MessageKey:
             mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
             if mode & (stat.S_IRWXG | stat.S_IRWXO):
                 raise KeyFileError(f"{path}: other users may access this key (mode {mode:04o}); run: chmod 600 {path}")
-            key = file.read(_LONGEST + 1) or b""
+            key = file.read(_MAX_LENGTH + 1) or b""
         try:
             return cls(key)
         except KeyFileError as error:
-            more = "more" if len(key) > _LONGEST else str(len(key))
+            more = "more" if len(key) > _MAX_LENGTH else str(len(key))
             raise KeyFileError(
-                f"{path}: not a key of {_SHORTEST} to {_LONGEST} bytes, it has {more}; "
+                f"{path}: not a key of {_MIN_LENGTH} to {_MAX_LENGTH} bytes, it has {more}; "
                 "make one: dvrk-drake key --output FILE"
             ) from error
 

@@ -11,6 +11,7 @@ import dataclasses
 import difflib
 import math
 import types
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from numbers import Integral, Real
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -21,6 +22,8 @@ _ONE = {bool: "true or false", int: "a whole number", float: "a number", str: "a
 _MANY = {bool: "true or false", int: "whole numbers", float: "numbers", str: "texts"}
 #: Key in the metadata of a field: the `Range` of all numbers in it.
 RANGE = "range"
+#: Key in the metadata of a field: its name in files of earlier versions.
+FORMERLY = "formerly"
 #: Unit -> another unit that a number may be in by mistake, and its size.
 _MISTAKEN = {
     "rad": ("degrees", math.pi / 180),
@@ -31,9 +34,9 @@ _MISTAKEN = {
     "kg": ("g", 1e-3),
 }
 #: Whole numbers are below this in size.
-_LARGEST_INT = 2**63
+_MAX_INT = 2**63
 #: A value is quoted up to so many letters.
-_LONGEST = 60
+_MAX_LENGTH = 60
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +81,43 @@ def within(
 ) -> dict[str, Range]:
     """Metadata of a field whose numbers must be in a range, see `Range`."""
     return {RANGE: Range(low, high, unit, also, either_sign)}
+
+
+def formerly(name: str) -> dict[str, str]:
+    """Metadata of a field that files of earlier versions call `name`; `with_current_keys` renames it."""
+    return {FORMERLY: name}
+
+
+def with_current_keys(schema: Any, content: Any, where: str) -> Any:
+    """Returns the content of a file with the keys of earlier versions renamed, see `formerly`.
+
+    Args:
+        schema: Dataclass that the content is read into.
+        content: Content of the file, not checked yet. It is not changed.
+        where: Name of the file, for the warning.
+
+    Warns:
+        FutureWarning: once per renamed key, with its new name.
+    """
+    origin, arguments = get_origin(schema), get_args(schema)
+    if origin in (Union, types.UnionType):
+        (inner,) = (argument for argument in arguments if argument is not types.NoneType)
+        return with_current_keys(inner, content, where)
+    if origin is list and isinstance(content, list):
+        return [with_current_keys(arguments[0], entry, where) for entry in content]
+    if not (dataclasses.is_dataclass(schema) and isinstance(content, dict)):
+        return content
+    hints = get_type_hints(schema)
+    names = {entry.metadata[FORMERLY]: entry.name for entry in dataclasses.fields(schema) if FORMERLY in entry.metadata}
+    current = {}
+    for key, value in content.items():
+        name = names.get(key, key)
+        if name != key and name not in content:
+            warnings.warn(f'{where}: key "{key}" is now "{name}"', FutureWarning, stacklevel=2)
+        else:
+            name = key
+        current[name] = with_current_keys(hints[name], value, where) if name in hints else value
+    return current
 
 
 def number_fault(instance: object) -> str:
@@ -195,7 +235,7 @@ def _fits(schema: type, value: Any) -> bool:
     except (ValueError, OverflowError):
         return False
     if schema is int:
-        return abs(number) < _LARGEST_INT and (not isinstance(value, float) or value.is_integer())
+        return abs(number) < _MAX_INT and (not isinstance(value, float) or value.is_integer())
     return math.isfinite(number)
 
 
@@ -235,7 +275,7 @@ def _keys(schema: Any) -> str:
 def meant(name: object, known: Iterable[str]) -> str:
     """Returns "did you mean ...? " with the known name that is most like a wrong one, or "" without one or with two."""
     of_lower_case = {key.lower(): key for key in known}
-    given = str(name)[:_LONGEST].lower()
+    given = str(name)[:_MAX_LENGTH].lower()
     near = difflib.get_close_matches(given, of_lower_case, 2)
     likeness = [difflib.SequenceMatcher(None, other, given).ratio() for other in near]
     unique = len(set(likeness)) == len(likeness) > 0
@@ -246,5 +286,5 @@ def _quoted(value: Any) -> str:
     if value is None:
         return "empty"
     text = str(value)
-    text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+    text = text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]}..."
     return f'"{text}"' if isinstance(value, str) else text

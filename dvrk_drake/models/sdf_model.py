@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.files import LARGEST_TEXT, read_input
+from dvrk_drake.models.files import MAX_TEXT, read_input
 from dvrk_drake.models.schema_fault import Range
 
 MODELS_FOLDER = Path(__file__).parent
 PACKAGE_URL = "package://dvrk_drake/"
 DRAKE = "{http://drake.mit.edu}"
 #: Deepest nesting of elements; an arm's SDF has 7 levels.
-_DEEPEST = 50
+_MAX_DEPTH = 50
 #: Numbers that SDF files have where a joint has no limit.
 _NO_LIMIT = (-1e16, 1e16, -math.inf, math.inf)
 _MOMENTS, _PRODUCTS = Range(0.0, 50.0, "kg m^2"), Range(-50.0, 50.0, "kg m^2")
@@ -156,7 +156,7 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
 
 def _read(path: Path) -> ElementTree.Element:
     try:
-        root = _parse(read_input(path, ArmError, LARGEST_TEXT))
+        root = _parse(read_input(path, ArmError, MAX_TEXT))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise ArmError(f"{path}: not a readable SDF: {error}") from error
     if root.find("model") is None or [e.tag for e in root.iter() if e.tag in ("model", "include")] != ["model"]:
@@ -182,8 +182,8 @@ def _parse(content: bytes) -> ElementTree.Element:
     for event, element in parser.read_events():
         root = element if root is None else root
         depth += 1 if event == "start" else -1
-        if depth > _DEEPEST:
-            raise ValueError(f"elements are nested deeper than {_DEEPEST} levels")
+        if depth > _MAX_DEPTH:
+            raise ValueError(f"elements are nested deeper than {_MAX_DEPTH} levels")
     parser.close()
     if root is None:
         raise ValueError("it has no element")

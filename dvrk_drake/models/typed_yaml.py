@@ -10,12 +10,12 @@ import yaml
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.files import read_text_input
-from dvrk_drake.models.schema_fault import schema_fault
+from dvrk_drake.models.schema_fault import schema_fault, with_current_keys
 
 Schema = TypeVar("Schema")
 
 #: Deepest nesting and most values, aliases expanded, of a file; a PSM's files have 6 and 6000.
-DEEPEST, MOST_VALUES = 50, 1_000_000
+MAX_DEPTH, MAX_VALUES = 50, 1_000_000
 # libyaml's parser is ten times as fast as the one in Python, and does not slow down where values are nested.
 _FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -51,6 +51,7 @@ def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrak
 
 def typed_content(schema: type[Schema], content: Any, where: str, error: type[DvrkDrakeError], what: str) -> Schema:
     """The same of what was read already, with `where` it is from."""
+    content = with_current_keys(schema, content, where)
     if fault := schema_fault(schema, content, what):
         raise error(f"{where}: {fault}")
     try:
@@ -106,8 +107,8 @@ def _excess(text: str) -> str:
         if isinstance(event, yaml.CollectionStartEvent):
             open_values.append(1)
             open_anchors.append(event.anchor)
-            if len(open_anchors) > DEEPEST:
-                return f"line {event.start_mark.line + 1}: nested deeper than {DEEPEST} levels"
+            if len(open_anchors) > MAX_DEPTH:
+                return f"line {event.start_mark.line + 1}: nested deeper than {MAX_DEPTH} levels"
         elif isinstance(event, yaml.CollectionEndEvent):
             count, anchor = open_values.pop(), open_anchors.pop()
             open_values[-1] += count
@@ -121,8 +122,8 @@ def _excess(text: str) -> str:
             if event.anchor in open_anchors:
                 return f"line {event.start_mark.line + 1}: {event.anchor} contains itself"
             open_values[-1] += values_of.get(event.anchor, 1)
-        if open_values[-1] > MOST_VALUES:
-            return f"more than {MOST_VALUES} values"
+        if open_values[-1] > MAX_VALUES:
+            return f"more than {MAX_VALUES} values"
     return ""
 
 

@@ -19,7 +19,7 @@ from dvrk_drake.processes.teacher import Leg, RestDetector
 from dvrk_drake.recordings.pose_file import CollectionFile
 
 #: The way goes on by no more than this between two statuses [s]: after a pause of the computer it does not jump.
-_LONGEST_STEP = 0.01
+_MAX_STEP = 0.01
 #: How long the arm may take to let efforts act [s].
 _START = 10.0
 #: The arm rests within this [rad], [m] and 1.5 encoder counts for so long [s]; a pose at which it does not within
@@ -106,7 +106,7 @@ class Collector:
         self._q = self._tau = np.zeros(arm.num_joints)
         self._desired = np.zeros(2 * arm.num_joints)
         self._leg_end = 0.0
-        self._stopping = self._led = False
+        self._stopping = self._hand_guided = False
         self._what = "waiting for the arm"
         # The disk may take longer than the arm waits for a command.
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
@@ -115,7 +115,7 @@ class Collector:
     def lead(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:
         """The desired state (2n) after that status. Time goes by the arm's clock, so that a slow one is not hurried."""
         measured = 1e-6 * status.utime
-        self._time += min(max(measured - self._heard, 0.0), _LONGEST_STEP)
+        self._time += min(max(measured - self._heard, 0.0), _MAX_STEP)
         self._heard = measured
         self._answers.add(time)
         # Not controller.acting, which tells of the status before: this one may say already what went wrong.
@@ -125,7 +125,7 @@ class Collector:
         if self.finished:
             return self._desired
         try:
-            if self._led:
+            if self._hand_guided:
                 self._check(status)
             if not self._stopping and self._stopped():
                 self._stopping = True
@@ -180,7 +180,7 @@ class Collector:
                 )
             self._desired = np.concatenate([self._q, np.zeros_like(self._q)])
             yield
-        self._led = True
+        self._hand_guided = True
         self._what = "taking over"
         while not self._controller.ramped:
             yield
@@ -251,6 +251,6 @@ class Collector:
     def _brake(self) -> Steps:
         """To rest, at the end of the leg if that is near; on the way a shorter stop stays inside the limits."""
         self._what = "stopping"
-        if self._led:
+        if self._hand_guided:
             duration = min(_BRAKE, max(self._leg_end - self._time, 1e-3))
             yield from self._follow(Leg.braking(self._desired, duration))

@@ -30,7 +30,7 @@ from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
 _SILENCE, _FIRST_WAIT = 1.0, 10.0
 
 #: Measurements may not be further apart [us]: a PSM held with its own gains swings at 7 ms, an MTM at 10 ms.
-_SLOWEST = 5000
+_MAX_PERIOD = 5000
 
 #: Statuses that wait, beyond which new ones are dropped; and how many are handled at once, so that a flood cannot keep
 #: a controller from answering.
@@ -46,7 +46,7 @@ _RELEASE = 1.0
 _FORGOTTEN = 1.1
 
 #: How long commands may be refused, or watched, without one that acts [s]; the start guard takes a quarter of a second.
-_PATIENCE = 10.0
+_TIMEOUT = 10.0
 
 #: What to do about an arm that has a fault or waits for an operator.
 _RESET = "Look at the arm, then start again with --reset"
@@ -168,9 +168,9 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
         raise ControllerError(f"{name} tells nothing new: its utime or sequence does not increase")
     # The least one: on a busy computer some are missed. Several statuses of one measurement have one utime.
     gaps = np.diff(np.unique(utimes))
-    if min(gaps) > _SLOWEST:
+    if min(gaps) > _MAX_PERIOD:
         raise ControllerError(
-            f"{name} is measured at {1e6 / min(gaps):.0f} Hz; control needs {1e6 / _SLOWEST:.0f} Hz, better 1 kHz"
+            f"{name} is measured at {1e6 / min(gaps):.0f} Hz; control needs {1e6 / _MAX_PERIOD:.0f} Hz, better 1 kHz"
         )
     return status, 1e-6 * (later.utime - status.utime) / (later.sequence - status.sequence)
 
@@ -266,9 +266,9 @@ def control(
         live.answer(status, now)
         if controller.acting:
             acted, before = now, status
-        elif now > acted + _PATIENCE:
+        elif now > acted + _TIMEOUT:
             why = takeover_reason(status, before, answers)
-            raise ControllerError(f"{link.arm.name} lets no command act for {_PATIENCE:g} s; {why}")
+            raise ControllerError(f"{link.arm.name} lets no command act for {_TIMEOUT:g} s; {why}")
         if now >= tell_at:
             tell(live.make(status, now, link.lost))
             tell_at = now + _TELL

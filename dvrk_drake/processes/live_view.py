@@ -16,13 +16,13 @@ from dvrk_drake.processes.control import ArmLink
 from dvrk_drake.systems.arm_view import ArmView
 
 #: Without a status for this long the last pose stays [s]: short enough for a page to close at once.
-_PATIENCE = 0.2
+_TIMEOUT = 0.2
 
 
 def show_status(view: ArmView, link: ArmLink) -> None:
     """Draws the pose of the newest status; where none comes, or it is not finite, the last one stays."""
     try:
-        q = link.next_status(_PATIENCE).position
+        q = link.next_status(_TIMEOUT).position
     except ControllerError:
         return
     if np.all(np.isfinite(q)):

@@ -12,7 +12,7 @@ from collections.abc import Callable
 _PRIORITY = 50
 
 #: So far behind, a loop does not catch up any more but goes on from now [s].
-_FARTHEST_BEHIND = 0.1
+_MAX_DELAY = 0.1
 
 
 class Pace:
@@ -43,7 +43,7 @@ class Pace:
             self._sleep(self._next - now)
         elif now > self._next + self._period:
             self.late += 1
-            if now > self._next + _FARTHEST_BEHIND:
+            if now > self._next + _MAX_DELAY:
                 self._next = now
         self._next += self._period
 

@@ -19,7 +19,7 @@ from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.recordings.pose_file import load_poses_if_any, same_pose, save_poses
 
 #: Least time of a leg [s]: short ones would begin and end with a jerk.
-LEAST_DURATION = 0.3
+MIN_DURATION = 0.3
 
 
 class Leg:
@@ -45,7 +45,7 @@ class Leg:
         It is straight, so between poses inside linear limits it stays inside of them.
         """
         # A cubic from rest to rest is 1.5 times as fast in its middle as on average.
-        duration = max(LEAST_DURATION, 1.5 * float(np.max(np.abs(q_end - q_start) / speed)))
+        duration = max(MIN_DURATION, 1.5 * float(np.max(np.abs(q_end - q_start) / speed)))
         return cls(q_start, np.zeros_like(q_start), q_end, duration)
 
     @classmethod
@@ -112,7 +112,7 @@ class Teacher:
         """
         self.poses = load_poses_if_any(path, controller.arm)
         self._controller, self._path, self._at_rest = controller, path, at_rest
-        self._told, self._report = told, report
+        self._identifiability, self._report = told, report
         self._detector = RestDetector(controller.arm.per_joint(*_REST), _REST_TIME)
         # The disk may take longer than the arm waits for a command.
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
@@ -126,7 +126,7 @@ class Teacher:
         """
         q = np.array(status.position)
         rests = self._detector.rests(time, q)
-        told = self._told()
+        told = self._identifiability()
         if self._writing is not None:
             if not self._writing.done():
                 return

@@ -18,9 +18,9 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.files import open_input, read_input
 
 #: A CSV is read in blocks of this size, and its lines have at most so many characters.
-_BLOCK, _LONGEST_LINE = 1 << 20, 1 << 20
+_BLOCK, _MAX_LINE = 1 << 20, 1 << 20
 #: Largest file whose rows are kept as text [bytes].
-_LARGEST_ROWS = 64_000_000
+_MAX_ROWS = 64_000_000
 
 
 def read_bytes(path: Path) -> bytes:
@@ -111,8 +111,8 @@ class CsvReader:
             # Whole lines; a CR at the end may be half of a CRLF.
             end = max(text.rfind("\n"), text.rfind("\r", 0, -1)) + 1 if block else len(text)
             whole, rest = text[:end], text[end:]
-            if len(rest) > _LONGEST_LINE:
-                raise RecordingError(f"{self._path}: not CSV: has a line of more than {_LONGEST_LINE} characters")
+            if len(rest) > _MAX_LINE:
+                raise RecordingError(f"{self._path}: not CSV: has a line of more than {_MAX_LINE} characters")
             self.has_underscore = self.has_underscore or "_" in whole
             yield from io.StringIO(whole, newline="")
             self._progress(min(1.0, num_read / size))
@@ -128,7 +128,7 @@ def read_rows(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
     Raises:
         RecordingError: the file cannot be read, is too large, is not text, or its cells are not separated by commas.
     """
-    open_input(path, RecordingError, _LARGEST_ROWS).close()
+    open_input(path, RecordingError, _MAX_ROWS).close()
     with CsvReader(path) as reader:
         rows = [(line, [cell.strip() for cell in cells]) for line, cells in reader]
         return rows, reader.sha256()

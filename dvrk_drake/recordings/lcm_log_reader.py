@@ -29,7 +29,7 @@ from dvrk_drake.models.lcm_messages import STATUS_PREFIX, decode, status_channel
 
 _MAGIC = bytes.fromhex("EDA1DA01")
 _HEADER = struct.Struct(">4sqqII")
-_LONGEST_CHANNEL = 1000
+_MAX_CHANNEL = 1000
 
 
 class LcmEvent(NamedTuple):
@@ -114,7 +114,7 @@ def _end_of_event(content: mmap.mmap, start: int) -> int:
         return 0
     magic, _, _, channel_length, data_length = _HEADER.unpack_from(content, start)
     end = start + _HEADER.size + channel_length + data_length
-    if magic != _MAGIC or not 0 < channel_length <= _LONGEST_CHANNEL or end > len(content):
+    if magic != _MAGIC or not 0 < channel_length <= _MAX_CHANNEL or end > len(content):
         return 0
     following = content[end : end + len(_MAGIC)]
     return end if _MAGIC.startswith(following) else 0

@@ -29,9 +29,9 @@ Coordinates = Literal["joint", "actuator"]
 #: A pose further than this outside the limits is refused [rad], [m]; nearer ones are real: stops give way.
 LIMIT_TOLERANCE = 0.2, 0.02
 #: Most rows of a CSV; 15 min at 1 kHz. With these, `check` takes 1.5 GB.
-LARGEST_COUNT = 900_000
+MAX_COUNT = 900_000
 #: Fewest rows of a motion, and the median interval below which rows are samples of one [s].
-LEAST_ROWS, LONGEST_PERIOD = 100, 0.05
+MIN_ROWS, MAX_PERIOD = 100, 0.05
 #: RMS joint speed above which a recording counts as a motion [rad/s], [m/s].
 REST_SPEED = 0.05, 0.005
 #: Poses whose joints all agree this well are one pose [rad], [m].
@@ -103,12 +103,12 @@ class Recording:
 
     @property
     def is_motion(self) -> bool:
-        """Whether its rows are samples of a motion: `LEAST_ROWS` or more, closer than `LONGEST_PERIOD` in time.
+        """Whether its rows are samples of a motion: `MIN_ROWS` or more, closer than `MAX_PERIOD` in time.
 
         Times may go back, see `has_increasing_times`; whether the arm moves tells `motion`.
         """
         t = self.t
-        return t is not None and len(t) >= LEAST_ROWS and float(np.median(np.abs(np.diff(t)))) < LONGEST_PERIOD
+        return t is not None and len(t) >= MIN_ROWS and float(np.median(np.abs(np.diff(t)))) < MAX_PERIOD
 
     @property
     def has_increasing_times(self) -> bool:
@@ -354,8 +354,8 @@ def _read_numbers(
     for line, cells in reader:
         if len(cells) != width:
             raise RecordingError(f"{path}:{line}: has {len(cells)} cells, the header names {width} columns")
-        if len(lines) == LARGEST_COUNT:
-            raise RecordingError(f"{path}:{line}: has more than {LARGEST_COUNT} rows; cut the recording into parts")
+        if len(lines) == MAX_COUNT:
+            raise RecordingError(f"{path}:{line}: has more than {MAX_COUNT} rows; cut the recording into parts")
         if skip_invalid and not all(
             math.isfinite(parse_or_nan(cells[column].strip(), f"{path}:{line}: {header[column]}"))
             for _, columns in parts

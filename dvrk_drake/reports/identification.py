@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.markup import escape
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification
-from dvrk_drake.analysis.dynamic.estimates import LEAST_TOLD
+from dvrk_drake.analysis.dynamic.estimates import MIN_IDENTIFIABILITY
 from dvrk_drake.analysis.dynamic.validation import DynamicValidation
 from dvrk_drake.analysis.recalibration import FOLDS, Recalibration
 from dvrk_drake.analysis.results import Identification, Validation
-from dvrk_drake.analysis.static.doubts import Doubt
+from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
 from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.analysis.verdict import cross_validated_verdicts, rule_text, worst
@@ -62,8 +62,8 @@ def print_identification(
             _print_motion_details(console, result)
     elif isinstance(result, StaticIdentification):
         joints = result.model.joints
-        errors = np.array([j.rms_cross_validation_undoubted for j in joints])
-        torques = np.array([j.rms_zero_torque_undoubted for j in joints])
+        errors = np.array([j.rms_cross_validation_included for j in joints])
+        torques = np.array([j.rms_zero_torque_included for j in joints])
         error = _largest_error(result.model.arm, errors, torques, "cross-validated ")
         _print_verdict(console, verdicts, error, next_command)
         _print_pose_errors(console, result, verdicts)
@@ -102,8 +102,8 @@ def print_validation(
         _print_verdict(console, verdicts, error, next_command)
         _print_motion_validation(console, validation, verbose)
     elif isinstance(validation, StaticValidation):
-        errors = np.array([j.rms_error_undoubted for j in validation.joints])
-        torques = np.array([j.rms_torque_undoubted for j in validation.joints])
+        errors = np.array([j.rms_error_included for j in validation.joints])
+        torques = np.array([j.rms_torque_included for j in validation.joints])
         error = _largest_error(model.arm, errors, torques)
         _print_verdict(console, verdicts, error, next_command)
         _print_pose_validation(console, validation, verbose)
@@ -235,7 +235,9 @@ def _print_links(console: Console, section: DynamicSection, nominal_mass: float)
         errors = np.array(link.standard_errors[:4])
         # First order, mass and first moments taken for independent: the larger of both decides.
         spread = float(np.max(np.hypot(errors[1:], com * errors[0]))) / m
-        remark = "; ".join(link.bounds) + " *" if link.bounds else ("SDF's mass" if link.mass_told < 0.5 else "")
+        remark = (
+            "; ".join(link.bounds) + " *" if link.bounds else ("SDF's mass" if link.mass_identifiability < 0.5 else "")
+        )
         place = ", ".join(f"{x:+.3f}" for x in com)
         table.add_row(link.link, f"{m:.4g}", f"{errors[0]:.1g}", place, f"{spread:.1g}", remark)
     total = sum(link.parameters[0] for link in section.links)
@@ -255,7 +257,7 @@ def _print_base_parameters(console: Console, section: DynamicSection) -> None:
     table = make_table("Base parameters", "", "value", "+-", "unit", "")
     table.columns[0].max_width = _NAME_WIDTH
     for p in section.base_parameters:
-        remark = "" if p.told >= LEAST_TOLD else "from the SDF"
+        remark = "" if p.identifiability >= MIN_IDENTIFIABILITY else "from the SDF"
         if not remark and abs(p.value) < 2 * p.standard_error:
             remark = "zero?"
         table.add_row(escape(p.name), f"{p.value:+.3g}", f"{p.standard_error:.1g}", p.unit, remark)
@@ -314,19 +316,19 @@ def _print_pose_errors(console: Console, result: StaticIdentification, verdicts:
     )  # fmt: skip
     table.columns[-1].justify = "left"
     for j in joints:
-        torque, error, verdict = j.rms_zero_torque_undoubted, j.rms_cross_validation_undoubted, verdicts[j.name]
+        torque, error, verdict = j.rms_zero_torque_included, j.rms_cross_validation_included, verdicts[j.name]
         table.add_row(
             *(j.name, f"{torque:.4f}", f"{error:.4f}", f"{error / torque:.2f}" if torque > 0 else ""),
-            *(f"{j.trust:.2f}", f"{100 * j.coverage:.0f} %", f"{j.num_doubted or ''}", verdict),
+            *(f"{j.feedforward_scale:.2f}", f"{100 * j.coverage:.0f} %", f"{j.num_excluded or ''}", verdict),
             style=_STYLES.get(verdict, ""),
         )
     console.print(table)
-    if result.doubts:
+    if result.excluded:
         console.print("--verbose lists the excluded measurements and why.")
     if poses < result.num_rows:
         console.print(f"{result.num_rows} rows are {poses} distinct poses: repeated samples of a pose are averaged.")
     for j in joints:
-        if j.trust == 0.0:
+        if j.feedforward_scale == 0.0:
             why = "the recording cannot separate its gravity from friction"
             if j.rms_zero_torque == 0.0:
                 why = "no holding torque was measured"
@@ -336,7 +338,7 @@ def _print_pose_errors(console: Console, result: StaticIdentification, verdicts:
 
 def _print_pose_details(console: Console, result: StaticIdentification) -> None:
     """Excluded measurements, parameters and effects with their standard errors, and errors in detail."""
-    _print_excluded(console, result.doubts)
+    _print_excluded(console, result.excluded)
     print_static_parameters(console, result.model)
 
 
@@ -364,7 +366,7 @@ def print_static_parameters(console: Console, model: IdentifiedModel) -> None:
     title = "RMS error [N m; N], and with the excluded measurements*"
     table = make_table(title, "", "fit", "leave-one-out", "torque*", "fit*", "leave-one-out*", "positions [rad; m]")
     for j in model.joints:
-        own = (j.rms_fit_undoubted, j.rms_leave_one_out_undoubted)
+        own = (j.rms_fit_included, j.rms_leave_one_out_included)
         errors = (*own, j.rms_zero_torque, j.rms_fit, j.rms_leave_one_out)
         positions = f"{j.position_lower:+.2f}..{j.position_upper:+.2f}"
         table.add_row(j.name, *(f"{e:.4f}" for e in errors), positions)
@@ -376,12 +378,12 @@ def print_static_parameters(console: Console, model: IdentifiedModel) -> None:
     )
 
 
-def _print_excluded(console: Console, doubts: Sequence[Doubt]) -> None:
-    if not doubts:
+def _print_excluded(console: Console, excluded: Sequence[ExcludedMeasurement]) -> None:
+    if not excluded:
         return
-    console.print(f"Excluded measurements, in {len({d.where for d in doubts})} poses:", style="yellow")
-    for doubt in doubts:
-        console.print(f"  {doubt.where}: {doubt.reason}", style="yellow", markup=False)
+    console.print(f"Excluded measurements, in {len({d.where for d in excluded})} poses:", style="yellow")
+    for measurement in excluded:
+        console.print(f"  {measurement.where}: {measurement.reason}", style="yellow", markup=False)
     console.print()
 
 
@@ -414,22 +416,22 @@ def _print_pose_validation(console: Console, validation: StaticValidation, verbo
     table = make_table(title, "", "measured", "error", "ratio", "excluded", "verdict")
     table.columns[-1].justify = "left"
     for j in validation.joints:
-        ratio = "" if j.relative_error_undoubted is None else f"{j.relative_error_undoubted:.2f}"
-        numbers = (f"{j.rms_torque_undoubted:.4f}", f"{j.rms_error_undoubted:.4f}", ratio, f"{j.num_doubted or ''}")
+        ratio = "" if j.relative_error_included is None else f"{j.relative_error_included:.2f}"
+        numbers = (f"{j.rms_torque_included:.4f}", f"{j.rms_error_included:.4f}", ratio, f"{j.num_excluded or ''}")
         table.add_row(j.name, *numbers, j.verdict, style=_STYLES.get(j.verdict, ""))
     console.print(table)
     console.print()
     if not verbose:
         return
     print_note(console, rule_text(in_motion=False))
-    if validation.doubts:
+    if validation.excluded:
         table = make_table("With the excluded measurements", "", "measured", "error", "ratio")
         for j in validation.joints:
             ratio = "" if j.relative_error is None else f"{j.relative_error:.2f}"
             table.add_row(j.name, f"{j.rms_torque:.4f}", f"{j.rms_error:.4f}", ratio)
         console.print(table)
         console.print()
-    _print_excluded(console, validation.doubts)
+    _print_excluded(console, validation.excluded)
 
 
 def _percent(share: float) -> str:

@@ -16,7 +16,7 @@ from dvrk_drake.analysis.payload.payload import (
     better_links,
     shown_elsewhere,
 )
-from dvrk_drake.analysis.payload.point_mass import LARGEST_MASS
+from dvrk_drake.analysis.payload.point_mass import MAX_MASS
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
 
@@ -109,7 +109,7 @@ def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
         first = elsewhere[0]
         share = f"{100 * first.left_out:.1f} %"
         return said + f"A payload on {first.link} explains the change (cross-validated error {share})."
-    if payload.largest_at_com > LARGEST_MASS:
+    if payload.largest_at_com > MAX_MASS:
         return said + "This motion does not show a mass at the link's centre of mass."
     largest = f"{1e3 * payload.largest_at_com:.3g} g ({100 * CONFIDENCE:.0f} %)"
     return said + f"At the link's centre of mass it is below {largest}."

@@ -12,7 +12,7 @@ from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
 #: Variations in the answer, and failed runs that are printed without `verbose`.
-_MOST = 3
+_MAX_COUNT = 3
 
 
 def print_study(
@@ -30,7 +30,7 @@ def print_study(
     summaries = summarise(study, rows)
     failed = [case for case in study.cases if case.index in rows and rows[case.index].error]
     first = study.measures[0]
-    found = "; ".join(f"{s.variation}: {_headline(first, s)}" for s in summaries[:_MOST])
+    found = "; ".join(f"{s.variation}: {_headline(first, s)}" for s in summaries[:_MAX_COUNT])
     answer = f"{first.column} {found}. {len(rows)} of {len(study.cases)} runs, {len(failed)} failed."
     command = study_path and f"dvrk-drake study {study_path} --output RESULTS.csv --plots FOLDER"
     print_answer(console, answer, command, "yellow" if failed else "green")
@@ -54,11 +54,11 @@ def print_study(
         )
     if len(study.seeds) > 1:
         print_note(console, "Several seeds per pose: runs are not independent, so the intervals are too narrow.")
-    for case in failed if verbose else failed[:_MOST]:
+    for case in failed if verbose else failed[:_MAX_COUNT]:
         text = f"case {case.index}, {case.variation}, pose {case.pose}, seed {case.seed}: {rows[case.index].error}"
         console.print(text, style="yellow", markup=False)
-    if not verbose and len(failed) > _MOST:
-        console.print(f"and {len(failed) - _MOST} more failed runs: --verbose prints them.", style="yellow")
+    if not verbose and len(failed) > _MAX_COUNT:
+        console.print(f"and {len(failed) - _MAX_COUNT} more failed runs: --verbose prints them.", style="yellow")
 
 
 def _headline(measure: Measure, summary: Summary) -> str:

@@ -133,7 +133,9 @@ def _print_joints(console: Console, comparison: Comparison) -> None:
         table = make_table(title, "", *names, "overshoot", f"error [{unit}]", "ripple")
         for which in comparison.gains:
             settling = comparison.table(which, "settling")[:, :, j]
-            worst = [comparison.table(which, name)[0, :, j].max() for name in ("overshoot", "steady_error", "unrest")]
+            worst = [
+                comparison.table(which, name)[0, :, j].max() for name in ("overshoot", "steady_error", "oscillation")
+            ]
             table.add_row(
                 which,
                 *(_slowest(row) for row in settling),

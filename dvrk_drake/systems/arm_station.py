@@ -19,8 +19,8 @@ from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.models.plant import add_arm, set_arm_positions, tree_selector
 from dvrk_drake.systems.arm_effects.drive_step import DriveStep
+from dvrk_drake.systems.arm_effects.drive_with_effects import DriveWithEffects, add_drive_with_effects
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
-from dvrk_drake.systems.arm_effects.real_drive import RealDrive, add_real_drive
 from dvrk_drake.systems.ideal_drive import DrivePorts, PlantJoints, add_ideal_drive
 
 
@@ -142,28 +142,30 @@ class ArmStation(Diagram):
         """
         super().__init__()
         self._arm = arm
-        self._true_arm = plant_arm or arm
+        self._ground_truth_arm = plant_arm or arm
         self._parts: PlantEffects | None = None
         self._drive_step: DriveStep | None = None
         plant_config = plant_config or arm_plant_config()
         if fault := plant_config_fault(plant_config):
             raise StationError(fault)
-        if self._true_arm.joint_names != arm.joint_names:
+        if self._ground_truth_arm.joint_names != arm.joint_names:
             raise StationError(
                 f"plant_arm must have the joints of {arm.name}: {', '.join(arm.joint_names)}; "
-                f"{self._true_arm.name} has {', '.join(self._true_arm.joint_names)}"
+                f"{self._ground_truth_arm.name} has {', '.join(self._ground_truth_arm.joint_names)}"
             )
         builder = DiagramBuilder()
         self._plant, self._scene_graph = AddMultibodyPlant(plant_config, builder)
         # Nothing else is in the plant, so nothing touches the arm unless somebody adds it.
-        self._instance = add_arm(self._plant, self._true_arm, closure, collision_shapes=modify_plant is not None)
+        self._instance = add_arm(
+            self._plant, self._ground_truth_arm, closure, collision_shapes=modify_plant is not None
+        )
         if modify_plant is not None:
             modify_plant(self._plant)
         if effects is not None:
-            self._parts = PlantEffects(self._plant, self._true_arm, self._instance, effects)
+            self._parts = PlantEffects(self._plant, self._ground_truth_arm, self._instance, effects)
         self._plant.Finalize()
         self._drop_idle_shapes()
-        self._joints = PlantJoints(self._plant, self._true_arm, self._instance)
+        self._joints = PlantJoints(self._plant, self._ground_truth_arm, self._instance)
         self._set_default_pose()
         if meshcat is not None:
             # The visualizer deletes its prefix when it starts: one level down, so that a SetTransform stays.
@@ -172,10 +174,17 @@ class ArmStation(Diagram):
         if effects is None or self._parts is None:
             ports = add_ideal_drive(builder, self._plant, self._joints, self._instance)
         else:
-            drive = RealDrive(
-                self._true_arm, self._plant, self._instance, self._joints, self._parts, effects, seed, self._home()
+            drive = DriveWithEffects(
+                self._ground_truth_arm,
+                self._plant,
+                self._instance,
+                self._joints,
+                self._parts,
+                effects,
+                seed,
+                self._home(),
             )
-            ports, self._drive_step = add_real_drive(builder, drive)
+            ports, self._drive_step = add_drive_with_effects(builder, drive)
         self._export(builder, ports)
         builder.BuildInto(self)
         self.set_name(f"{arm.name.lower()}_station")
@@ -204,7 +213,7 @@ class ArmStation(Diagram):
         if q.shape != (self._arm.num_joints,) or not np.all(np.isfinite(q)):
             raise StationError(f"a pose of {self._arm.name} is {self._arm.num_joints} finite numbers; got {q.tolist()}")
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
-        set_arm_positions(self.plant, plant_context, self._true_arm, q)
+        set_arm_positions(self.plant, plant_context, self._ground_truth_arm, q)
         q_plant = self.plant.GetPositions(plant_context)
         if self._parts is not None:
             self._parts.drive.set_positions(q_plant, q)
@@ -247,13 +256,13 @@ class ArmStation(Diagram):
                 self._scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
     def _home(self) -> NDArray[np.float64]:
-        return np.clip(0.0, self._true_arm.position_lower, self._true_arm.position_upper)
+        return np.clip(0.0, self._ground_truth_arm.position_lower, self._ground_truth_arm.position_upper)
 
     def _set_default_pose(self) -> None:
         home = self._home()
         q_plant = self.plant.GetDefaultPositions()
-        tree = tree_selector(self.plant, self._true_arm, self._instance)
-        q_plant[tree] = self._true_arm.linkage.position(home)
+        tree = tree_selector(self.plant, self._ground_truth_arm, self._instance)
+        q_plant[tree] = self._ground_truth_arm.linkage.position(home)
         if self._parts is not None:
             self._parts.drive.set_positions(q_plant, home)
         self.plant.SetDefaultPositions(q_plant)

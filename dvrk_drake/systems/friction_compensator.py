@@ -61,8 +61,8 @@ class FrictionCompensator(LeafSystem):
 
         Args:
             friction: as identified.
-            ratio: share of it that is compensated, 0..`LARGEST_RATIO`.
-            hysteresis_ratio: at least this share, 0..`LARGEST_HYSTERESIS_RATIO`, of the wide hysteresis that moves an
+            ratio: share of it that is compensated, 0..`MAX_RATIO`.
+            hysteresis_ratio: at least this share, 0..`MAX_HYSTERESIS_RATIO`, of the wide hysteresis that moves an
                 arm back where it was led from when it is let go, see `safe_ratios`.
             holding_error: (n,) by which the gravity compensation may be wrong [N m, N]; lowers the ratio where needed.
             widening: the compensation's scales over the identified ones, from 1.

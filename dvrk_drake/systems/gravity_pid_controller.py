@@ -27,7 +27,7 @@ class GravityPidController(LeafSystem):
 
     The law is tau = G(q) + Kp e + Kd de + integral(Ki e dt), the paper's equation 11, with e = q_d - q and
     de = v_d - v for every joint: no position ever enters the damping term. G(q) is the model's static torque
-    (gravity and joint effects, scaled by each joint's trust). Gains are diagonal. In "gravity" mode tau = G(q), in
+    (gravity and joint effects, scaled by each joint's feedforward scale). Gains are diagonal. In "gravity" mode tau = G(q), in
     "damped" mode tau = G(q) - Kd v: whatever G is wrong by, the arm creeps and does not run away.
 
     .. pydrake_system::
@@ -127,7 +127,7 @@ class GravityPidController(LeafSystem):
         self.DeclareStateOutputPort(name="effort", state_index=effort)
         self.DeclareStateOutputPort(name="gravity_effort", state_index=gravity_effort)
         self.DeclareStateOutputPort(name="fault", state_index=fault)
-        self._trust_and_limits = np.array([model.trust, limits])
+        self._scales_and_limits = np.array([model.feedforward_scale, limits])
         # Reading each parameter at each update costs 5 us; a cache entry that holds them as one array costs 1 us.
         self._settings = self.DeclareCacheEntry(
             "settings",
@@ -186,7 +186,7 @@ class GravityPidController(LeafSystem):
     def _calc_settings(self, context: Context, settings: AbstractValue) -> None:
         gains = [context.get_numeric_parameter(index).get_value() for index in self._gains]
         mode = int(context.get_numeric_parameter(self._mode).GetAtIndex(0))
-        settings.set_value((np.vstack([gains, self._trust_and_limits]), mode))
+        settings.set_value((np.vstack([gains, self._scales_and_limits]), mode))
 
     def _make_update(
         self, step: Callable[..., None], theta: NDArray[np.float64], restart: bool

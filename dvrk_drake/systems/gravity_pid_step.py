@@ -22,7 +22,7 @@ def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
 
     - `state`, `desired` (2n) and `has_desired`: the inputs;
     - `restart`: whether this is the update at initialization;
-    - `period` [s]; `mode`: index into `Mode`; `per_joint` (5, n): kp, kd, ki, trust, effort limits; `theta`;
+    - `period` [s]; `mode`: index into `Mode`; `per_joint` (5, n): kp, kd, ki, feedforward_scale, effort limits; `theta`;
     - changed in place: `effort`, `gravity`, `fault` (1), `integral`, `latched_q` and `last_q`, the pose that is
       regulated without `desired` and the last finite one. NaN: no such pose yet.
     """
@@ -44,7 +44,7 @@ def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
         last_q,
     ):
         n = effort.size
-        kp, kd, ki, trust, limit = per_joint[0], per_joint[1], per_joint[2], per_joint[3], per_joint[4]
+        kp, kd, ki, feedforward_scale, limit = per_joint[0], per_joint[1], per_joint[2], per_joint[3], per_joint[4]
         hold, damped = mode == HOLD, mode == DAMPED
 
         if restart:
@@ -66,7 +66,7 @@ def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
         else:
             torque_into(last_q, theta, gravity)
             for i in range(n):
-                gravity[i] *= trust[i]
+                gravity[i] *= feedforward_scale[i]
         if faulty or not hold:
             latched_q[:] = np.nan
             for i in range(n):

@@ -20,7 +20,7 @@ from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
 from dvrk_drake.models.loop_closure import Closure
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.schema_fault import formerly, number_fault, within
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, plant_config_fault
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
@@ -35,8 +35,8 @@ class ArmConfig:
         closure: how the linkage's loops are held: "ball" or "mimic".
         gravity: (3,) in the base frame [m/s^2]; the arm's own if left out.
         effects: more of them in the drive of the simulated arm, of position alone; controllers do not know them.
-        stretch: actuator -> cable of the simulated arm that stretches, beside those of `real_arm`.
-        real_arm: parts of the arm's own `effects` that the simulation has, by name; ["all"] for all of them.
+        stretch: actuator -> cable of the simulated arm that stretches, beside those of `simulated_effects`.
+        simulated_effects: parts of the arm's own `effects` that the simulation has, by name; ["all"] for all of them.
         seed: of all noise.
     """
 
@@ -45,7 +45,7 @@ class ArmConfig:
     gravity: list[float] | None = field(default=None, metadata=GRAVITIES)
     effects: list[DriveEffect] = field(default_factory=list)
     stretch: dict[str, Cable] = field(default_factory=dict)
-    real_arm: list[str] = field(default_factory=list)
+    simulated_effects: list[str] = field(default_factory=list, metadata=formerly("real_arm"))
     seed: int = field(default=0, metadata=within(0, 2**63 - 1))
 
     @cached_property
@@ -56,14 +56,14 @@ class ArmConfig:
 
     @property
     def all_effects(self) -> ArmEffects | None:
-        """What the simulated arm has beside its links: `real_arm`, `effects` and `stretch`; None if there is nothing.
+        """What the simulated arm has beside its links: `simulated_effects`, `effects` and `stretch`; None if there is nothing.
 
         Raises:
             ArmError: a name that is no part.
         """
-        if not (self.real_arm or self.effects or self.stretch):
+        if not (self.simulated_effects or self.effects or self.stretch):
             return None
-        own = self.mounted_arm.effects.only(self.real_arm)
+        own = self.mounted_arm.effects.only(self.simulated_effects)
         return own.joined(ArmEffects(cables=self.effects, stretch=self.stretch))
 
     def arm_fault(self) -> str:
@@ -80,7 +80,7 @@ class ArmConfig:
         if fault := number_fault(self):
             return fault
         try:
-            arm.effects.only(self.real_arm)
+            arm.effects.only(self.simulated_effects)
             ArmEffects(stretch=self.stretch).check(arm.joint_names)
         except ArmError as error:
             return f"simulated arm: {error}"

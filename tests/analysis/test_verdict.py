@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from command_output import refusal
 
-from dvrk_drake.analysis.static.static_identification import LEAST_TORQUE
+from dvrk_drake.analysis.static.static_identification import MIN_TORQUE
 from dvrk_drake.analysis.static.validation import validate_static
 from dvrk_drake.analysis.verdict import (
     GOOD_RATIO,
@@ -87,7 +87,7 @@ def test_a_small_error_is_noise_or_held_by_friction(name):
     for joint, limit in zip(arm.joint_names, arm.effort_limits, strict=True):
         assert arm.effects.effort.noise[joint] < 0.1 * SMALL_ERROR * limit
         assert (friction[joint] > SMALL_ERROR * limit) == (joint != "roll")
-    assert SMALL_ERROR == LEAST_TORQUE
+    assert SMALL_ERROR == MIN_TORQUE
 
 
 ARM = load_arm("mtmr")
@@ -105,7 +105,7 @@ def poses(truth, seed=0, count=20):
 
 def wrong_model(truth):
     """Joints 1 and 7 are off, all others are exact."""
-    joints = [dataclasses.replace(j, trust=0.0) if i in (0, 6) else j for i, j in enumerate(truth.joints)]
+    joints = [dataclasses.replace(j, feedforward_scale=0.0) if i in (0, 6) else j for i, j in enumerate(truth.joints)]
     return dataclasses.replace(truth, joints=joints)
 
 
@@ -138,8 +138,8 @@ def test_measurements_at_a_stop_do_not_count(truth):
     tau[3, 1] = -3.0
     validation = validate_static(truth, Recording(q=q, tau=tau))
     shoulder = validation.joints[1]
-    assert shoulder.num_doubted >= 1
-    assert shoulder.relative_error > GOOD_RATIO > shoulder.relative_error_undoubted
+    assert shoulder.num_excluded >= 1
+    assert shoulder.relative_error > GOOD_RATIO > shoulder.relative_error_included
     assert shoulder.verdict == "good"
 
 
@@ -253,8 +253,12 @@ def test_run_warns_before_it_looks_for_the_arm(files, monkeypatch, capsys):
 
 
 def test_cross_validation_gives_verdicts_by_the_same_rule(truth):
-    def statistics(j, effort, error, trust):
-        changes = {"rms_zero_torque_undoubted": effort, "rms_cross_validation_undoubted": error, "trust": trust}
+    def statistics(j, effort, error, feedforward_scale):
+        changes = {
+            "rms_zero_torque_included": effort,
+            "rms_cross_validation_included": error,
+            "feedforward_scale": feedforward_scale,
+        }
         return dataclasses.replace(j, **changes)
 
     pairs = [(1.0, 0.1, 1.0), (1.0, 0.9, 1.0), (1.0, 2.0, 1.0), (1.0, 2.0, 0.0), (0.0, 0.0, 1.0)]

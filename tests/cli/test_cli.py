@@ -395,9 +395,10 @@ def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
     )
     write_recording(Recording(q=recording.q + 1.5 * np.eye(7)[5], tau=recording.tau), bad)
     assert "wrist_yaw (q6)" in fails(capsys, "validate", bad, "--model", model)
-    (tmp_path / "m.yaml").write_text(model.read_text().replace("trust", "thrust"))
-    assert 'm.yaml: joints[0]: key "thrust" is unknown; did you mean "trust"? allowed in joints: name' in fails(
-        capsys, "validate", poses, "--model", tmp_path / "m.yaml"
+    (tmp_path / "m.yaml").write_text(model.read_text().replace("feedforward_scale", "thrust"))
+    assert (
+        'm.yaml: joints[0]: key "thrust" is unknown; did you mean "feedforward_scale"? allowed in joints: name'
+        in fails(capsys, "validate", poses, "--model", tmp_path / "m.yaml")
     )
     assert not out.exists()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.csv", "m.yaml"]

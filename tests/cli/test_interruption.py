@@ -12,7 +12,10 @@ STUDY = "scenario: psm\nset: [duration=1]\nmeasures: [{kind: drift, time: 1}]\n"
 #: Command with its options, and the function that does its work.
 COMMANDS = {
     "simulate": (["--arm", "psm", "--output", "o.csv", "--plots", "new/p"], "experiments.simulation.simulate"),
-    "transparency": (["--arm", "mtml", "--output", "o.csv", "--plots", "new/p"], "experiments.transparency.feel"),
+    "transparency": (
+        ["--arm", "mtml", "--output", "o.csv", "--plots", "new/p"],
+        "experiments.transparency.simulate_operator",
+    ),
     "study": (["study.yaml", "--output", "o.csv", "--plots", "new/p"], "experiments.study.study.run_study_locally"),
     "tune": (["--arm", "mtml", "--output", "o.yaml", "--plots", "new/p"], "experiments.tuning.tuning.tune_arm"),
     "reproduce": (["fig7", "--folder", "new/p"], "reports.reproduction.run.reproduce"),

@@ -50,9 +50,9 @@ def test_on_a_terminal_each_step_has_a_bar_and_its_number(terminal, capsys):
 
 
 def test_finished_bars_give_way(terminal):
-    names = [f"step{i}" for i in range(support.MOST_BARS + 3)]
+    names = [f"step{i}" for i in range(support.MAX_BARS + 3)]
     with Steps(*names) as steps:
         for name in names:
             steps(name, 1.0)
-        assert len(steps._progress.tasks) == support.MOST_BARS
+        assert len(steps._progress.tasks) == support.MAX_BARS
         assert steps._progress.tasks[-1].description == f"{len(names)} of {len(names)}: {names[-1]}"

@@ -14,7 +14,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.cli.demo import reproduce as command
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
-from dvrk_drake.experiments.ground_truth import GroundTruth, unlike_its_drawing
+from dvrk_drake.experiments.ground_truth import GroundTruth, perturbed_ground_truth
 from dvrk_drake.experiments.reproduction import published
 from dvrk_drake.experiments.reproduction.drift_experiment import (
     BAND,
@@ -24,7 +24,6 @@ from dvrk_drake.experiments.reproduction.drift_experiment import (
     release,
     release_all,
 )
-from dvrk_drake.experiments.reproduction.laboratory import Extent, Identified, Laboratory
 from dvrk_drake.experiments.reproduction.mechanisms import mechanism_errors, published_row, recomputed_table
 from dvrk_drake.experiments.reproduction.published import (
     PAPER_ARM,
@@ -33,6 +32,7 @@ from dvrk_drake.experiments.reproduction.published import (
     paper_torque,
     with_zeroed,
 )
+from dvrk_drake.experiments.reproduction.session import Identified, ReproductionSession, SampleSizes
 from dvrk_drake.experiments.reproduction.step_response import (
     PERIOD,
     paper_simulated_arm,
@@ -170,7 +170,7 @@ def test_table_1_alone_is_a_page(no_recordings, tmp_path):
 
 
 def test_what_is_finished_is_written_though_the_rest_fails(no_recordings, monkeypatch, tmp_path):
-    def fails(laboratory):
+    def fails(session):
         raise KeyboardInterrupt
 
     monkeypatch.setitem(run._MAKERS, "fig7", fails)
@@ -209,7 +209,7 @@ def test_a_joint_is_held_if_it_never_left():
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
     """A true arm, derived and compiled once."""
-    return unlike_its_drawing(PAPER_ARM, tmp_path_factory.mktemp("truth"), seed=8)
+    return perturbed_ground_truth(PAPER_ARM, tmp_path_factory.mktemp("truth"), seed=8)
 
 
 @pytest.mark.slow
@@ -287,22 +287,22 @@ def test_a_led_arm_stays_if_its_wide_hysteresis_is_compensated(tmp_path):
     assert np.all(gone[1:3] > 0.04) and np.all(kept < BAND[0])
 
 
-def exact_laboratory(truth, folder, executor, extent):
+def exact_laboratory(truth, folder, executor, sample_sizes):
     """One whose MTM was identified without any error."""
     file = folder / "exact.yaml"
     truth.model.save(file)
     q = ARM.sample_poses(20, np.random.default_rng(9))
     poses = Recording(q=q, tau=truth.model.holding_torque(q), source="computed")
-    laboratory = Laboratory(folder, PaperRecordings(None), executor, extent=extent)
-    laboratory.__dict__["mtm"] = Identified(truth, poses, truth.model, file)
-    return laboratory
+    session = ReproductionSession(folder, PaperRecordings(None), executor, sample_sizes=sample_sizes)
+    session.__dict__["mtm"] = Identified(truth, poses, truth.model, file)
+    return session
 
 
 @pytest.mark.slow
 def test_figure_5_writes_what_it_names_and_holds_with_an_exact_model(truth, tmp_path):
-    extent = Extent(releases=3, paper_releases=2, led_releases=1, duration=1.0)
+    sample_sizes = SampleSizes(releases=3, paper_releases=2, hand_guided_releases=1, duration=1.0)
     with ThreadPoolExecutor(1) as executor:
-        section = reproduce_figure_5(exact_laboratory(truth, tmp_path, executor, extent))
+        section = reproduce_figure_5(exact_laboratory(truth, tmp_path, executor, sample_sizes))
     page = write_page(tmp_path, [section], []).read_text()
     assert len(section.figures) == 2
     assert all((tmp_path / figure).read_bytes().startswith(b"\x89PNG") for figure in section.figures)
@@ -319,7 +319,7 @@ def test_figure_5_writes_what_it_names_and_holds_with_an_exact_model(truth, tmp_
 @pytest.mark.slow
 def test_the_hand_feels_less_with_each_compensation(truth, tmp_path):
     with ThreadPoolExecutor(1) as executor:
-        section = reproduce_transparency(exact_laboratory(truth, tmp_path, executor, Extent(path_poses=2)))
+        section = reproduce_transparency(exact_laboratory(truth, tmp_path, executor, SampleSizes(path_poses=2)))
     force = [float(row[1]) for row in section.tables[0].rows]
     assert force[0] > force[2] > force[3] > 0  # limp, ours, ours with friction compensation
     assert (tmp_path / "transparency.png").read_bytes().startswith(b"\x89PNG")

@@ -42,11 +42,11 @@ def test_reaches_its_targets_at_their_times_and_rests_there():
 
 @pytest.mark.slow
 def test_the_led_handle_arrives_while_joint_4_sticks():
-    """What examples/real_arm.yaml says of joint 4: the handle's pose is six numbers, and joints 6 and 7 do its part."""
-    example = str(ROOT / "examples" / "real_arm.yaml")
+    """What examples/simulated_effects.yaml says of joint 4: the handle's pose is six numbers, and joints 6 and 7 do its part."""
+    example = str(ROOT / "examples" / "simulated_effects.yaml")
     with_friction, without = (
         simulate(load_scenario(example, ["duration=3", *settings])).state_true[-1, :7]
-        for settings in ([], ["real_arm=[cables, springs, stops, saturation, encoder, effort, delay]"])
+        for settings in ([], ["simulated_effects=[cables, springs, stops, saturation, encoder, effort, delay]"])
     )
     arm = load_arm("mtml")
     led = np.array(load_scenario(example, []).hand.path[-1].pose)
@@ -152,8 +152,8 @@ def test_a_recording_of_it_is_read_by_the_other_verbs(tmp_path, capsys, monkeypa
         ("duration=long", 'psm: duration is "long"; allowed: a number'),
         ("controller.parameter_error=abc", 'psm: controller.parameter_error is "abc"; allowed: a number'),
         ("controler.mode=hold", 'key "controler" is unknown; did you mean "controller"? allowed in a scenario'),
-        ("real_arm=all", 'psm: real_arm is "all"; allowed: a list of texts, e.g. [all]'),
-        ("real_arm=[al]", "unknown effect al; allowed: all, friction"),
+        ("simulated_effects=all", 'psm: simulated_effects is "all"; allowed: a list of texts, e.g. [all]'),
+        ("simulated_effects=[al]", "unknown effect al; allowed: all, friction"),
         ("targets=3", "targets is 3; allowed: a list of tables with the keys time, pose"),
         ("seed=1.5", "seed is 1.5; allowed: a whole number"),
         ("stretch.yaw.stiffness=soft", 'stretch.yaw.stiffness is "soft"; allowed: a number'),

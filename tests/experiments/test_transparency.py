@@ -11,7 +11,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import handle_frame
 from dvrk_drake.errors import ScenarioError
-from dvrk_drake.experiments.transparency import Compensation, feel, rambling_path, recorded_path
+from dvrk_drake.experiments.transparency import Compensation, random_path, recorded_path, simulate_operator
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.recording import Recording
 
@@ -25,28 +25,28 @@ def resting(seconds):
 
 
 def test_a_hand_that_holds_a_compensated_arm_still_feels_nothing():
-    felt = feel(ARM, resting(1.5), Compensation("gravity", MODEL))
-    assert felt.rms_force < 1e-6 and felt.rms_torque < 1e-6
-    assert felt.deviation.max() < 1e-6
+    forces = simulate_operator(ARM, resting(1.5), Compensation("gravity", MODEL))
+    assert forces.rms_force < 1e-6 and forces.rms_torque < 1e-6
+    assert forces.deviation.max() < 1e-6
 
 
 def test_a_hand_that_holds_a_limp_arm_still_does_the_work_of_lifting_it():
     """At rest J' F = holding torque: where the arm came to rest in the hand's grip."""
-    felt = feel(ARM, resting(3.0), Compensation("nothing"))
-    assert felt.rms_force > 1.0
+    forces = simulate_operator(ARM, resting(3.0), Compensation("nothing"))
+    assert forces.rms_force > 1.0
     # The handle sags until spring times way is the force, of the stiffness that Grip states.
-    late = felt.time > 2.9
+    late = forces.time > 2.9
     np.testing.assert_allclose(
-        np.linalg.norm(felt.force[late], axis=1), 600.0 * felt.deviation[late], rtol=0.02, atol=0
+        np.linalg.norm(forces.force[late], axis=1), 600.0 * forces.deviation[late], rtol=0.02, atol=0
     )
 
 
 @pytest.mark.slow
 def test_each_compensation_takes_more_off_the_hand():
-    path = rambling_path(ARM, poses=3)
+    path = random_path(ARM, poses=3)
     friction = ARM.effects.only(["friction", "encoder", "delay"])
     listed = [Compensation("nothing"), Compensation("gravity", MODEL), Compensation("friction", MODEL, 0.6)]
-    limp, gravity, both = (feel(ARM, path, one, effects=friction) for one in listed)
+    limp, gravity, both = (simulate_operator(ARM, path, one, effects=friction) for one in listed)
     assert limp.rms_force > 2 * gravity.rms_force
     assert gravity.rms_force > 1.3 * both.rms_force
     assert gravity.rms_torque > both.rms_torque
@@ -83,16 +83,16 @@ def test_a_psm_is_led_at_its_instrument():
     pose = np.clip(0.1, psm.position_lower, psm.position_upper)
     path = PiecewisePolynomial.ZeroOrderHold([0.0, 1.1], np.array([pose, pose]).T)
     assert (
-        feel(psm, path, Compensation("SDF", IdentifiedModel.from_arm(psm))).rms_force < 1e-4
+        simulate_operator(psm, path, Compensation("SDF", IdentifiedModel.from_arm(psm))).rms_force < 1e-4
     )  # the loops' pins give a little
-    assert feel(psm, path, Compensation("nothing")).rms_force > 0.5
+    assert simulate_operator(psm, path, Compensation("nothing")).rms_force > 0.5
 
 
 def test_the_verb_writes_its_table(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("dvrk_drake.experiments.transparency.rambling_path", lambda arm: resting(1.2))
+    monkeypatch.setattr("dvrk_drake.experiments.transparency.random_path", lambda arm: resting(1.2))
     model, table = tmp_path / "ours.yaml", tmp_path / "table.csv"
     MODEL.save(model)
-    arguments = ["transparency", "--arm", "mtml", "--model", str(model), "--real-arm", "friction"]
+    arguments = ["transparency", "--arm", "mtml", "--model", str(model), "--simulated-effects", "friction"]
     assert main([*arguments, "--output", str(table), "--plots", str(tmp_path / "plots")]) == 0
     with open(table) as stream:
         rows = list(csv.DictReader(stream))
@@ -107,7 +107,7 @@ def test_the_verb_writes_its_table(tmp_path, capsys, monkeypatch):
     [
         (["--friction-ratio", "1"], "between 0 and 0.6"),
         (["--model", "nothing.yaml"], "nothing.yaml: no such file"),
-        (["--real-arm", "wings"], "unknown effect wings; allowed: all, friction"),
+        (["--simulated-effects", "wings"], "unknown effect wings; allowed: all, friction"),
         (["--frame", "dh_9"], 'MTML: its SDF has no frame "dh_9"; it has dh_0, dh_1'),
         (["--speed", "2"], "--speed is that of a recorded motion; name one with --path"),
         (["--path", "nowhere.csv"], "nowhere.csv"),

@@ -276,7 +276,7 @@ def test_measures_of_a_known_step():
     assert measured.steady_error[2] == pytest.approx(0.5 * goal[2])
     assert np.isinf(measured.settling[3])  # it comes into the band again and again and never stays
     assert measured.overshoot[3] == pytest.approx(0.1, rel=1e-2)
-    np.testing.assert_allclose(measured.unrest, [0, 0, 0, 0, 0.2, 0, 0], rtol=1e-2, atol=1e-12)
+    np.testing.assert_allclose(measured.oscillation, [0, 0, 0, 0, 0.2, 0, 0], rtol=1e-2, atol=1e-12)
 
 
 def test_best_gains_settle_most_often_and_then_fastest():

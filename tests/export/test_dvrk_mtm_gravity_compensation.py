@@ -195,7 +195,7 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
         compensation_from_model(eccentric)
     with pytest.raises(ModelError, match=r"masses are estimates of the SDF.*dvrk-drake identify") as refusal:
         compensation_from_model(eccentric)
-    assert "leans" not in str(refusal.value) and "trust" not in str(refusal.value)
+    assert "leans" not in str(refusal.value) and "feedforward_scale" not in str(refusal.value)
     # The line names a tolerance that is enough.
     compensation_from_model(eccentric, CompensationOptions(tolerance=0.0025))
     spring = balanced()
@@ -204,10 +204,10 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
         compensation_from_model(spring)
     # A quartic over +-2.44 rad misses 0.05 sin(q) by a few hundredths of it, not more.
     compensation_from_model(spring, CompensationOptions(tolerance=0.05 * 0.08))
-    for change in ({"trust": 0.5}, {"gravity": LEANING}):
+    for change in ({"feedforward_scale": 0.5}, {"gravity": LEANING}):
         model = balanced()
-        if "trust" in change:
-            model.joints[4].trust = change["trust"]
+        if "feedforward_scale" in change:
+            model.joints[4].feedforward_scale = change["feedforward_scale"]
         else:
             model.arm = model.arm.with_gravity(change["gravity"])
             model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters

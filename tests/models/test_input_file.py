@@ -19,7 +19,7 @@ from dvrk_drake.experiments.study.study_file import load_study
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.arm_schema import load_gains
-from dvrk_drake.models.files import LARGEST_TEXT
+from dvrk_drake.models.files import MAX_TEXT
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 from dvrk_drake.models.typed_yaml import parse_yaml
 from dvrk_drake.processes.simulated_arm import load_driver
@@ -89,7 +89,7 @@ def test_a_file_that_may_not_be_read_is_refused(name, tmp_path):
 def test_a_file_larger_than_any_in_use_is_refused(name, tmp_path):
     path = tmp_path / name
     with path.open("wb") as stream:
-        stream.truncate(LARGEST_TEXT + 1)
+        stream.truncate(MAX_TEXT + 1)
     with pytest.raises(DvrkDrakeError, match=r"4\.0 MB; allowed: at most 4 MB"):
         READERS[name](str(path))
 
@@ -179,7 +179,7 @@ def test_limits_in_degrees_are_refused(key, tmp_path):
         load_arm(str(path))
 
 
-@pytest.mark.parametrize("key", ["base_parameters[3].value", "joints[2].trust", "joints[0].rms_fit"])
+@pytest.mark.parametrize("key", ["base_parameters[3].value", "joints[2].feedforward_scale", "joints[0].rms_fit"])
 @pytest.mark.parametrize("number", [math.nan, math.inf])
 def test_a_model_with_a_number_that_is_none_is_refused(key, number, tmp_path, capsys):
     model = IdentifiedModel.from_arm(ARM)
@@ -200,7 +200,9 @@ def test_a_model_with_a_number_that_is_none_is_refused(key, number, tmp_path, ca
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["model.yaml", "r.csv"]
 
 
-@pytest.mark.parametrize("key", ["format", "gravity", "base_parameters[0].value", "joints[6].trust", "provenance.rank"])
+@pytest.mark.parametrize(
+    "key", ["format", "gravity", "base_parameters[0].value", "joints[6].feedforward_scale", "provenance.rank"]
+)
 def test_a_model_with_a_missing_key_is_refused(key, tmp_path):
     path = tmp_path / "model.yaml"
     IdentifiedModel.from_arm(ARM).save(path)
@@ -254,7 +256,7 @@ def test_blocks_do_not_change_what_is_read(block, end, tmp_path, monkeypatch):
 def test_a_csv_with_too_many_rows_or_too_long_lines_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "recording.csv"
     path.write_text(f"{HEADER}\n" + f"{ROW}\n" * 4)
-    monkeypatch.setattr(recording, "LARGEST_COUNT", 3)
+    monkeypatch.setattr(recording, "MAX_COUNT", 3)
     with pytest.raises(RecordingError, match=r":5: has more than 3 rows; cut the recording into parts"):
         read_recording(path)
     path.write_text(f"{HEADER}\n" + "1" * 3_000_000)

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from patience import PATIENCE
+from waiting import TIMEOUT
 
 from dvrk_drake import lcmtypes
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
@@ -18,7 +18,7 @@ def test_committed_python_is_what_lcm_gen_makes(tmp_path):
     if not LCM_GEN.exists():
         pytest.skip(f"no {LCM_GEN}: the lcm wheel ships it")
     sources = sorted(str(path) for path in FOLDER.glob("*.lcm"))
-    subprocess.run([LCM_GEN, "-p", "--ppath", tmp_path, *sources], check=True, timeout=PATIENCE)
+    subprocess.run([LCM_GEN, "-p", "--ppath", tmp_path, *sources], check=True, timeout=TIMEOUT)
     made = {path.name: path.read_text() for path in (tmp_path / "dvrk_drake" / "lcmtypes").glob("*.py")}
     assert len(made) == 3
     assert made == {path.name: path.read_text() for path in FOLDER.glob("*.py")}

@@ -98,7 +98,9 @@ IN_OBJECTS = {f"{schema.__name__}.{key_of(p)}": (p, f) for schema in OBJECTS for
 def test_no_schema_is_passed_over():
     assert len(IN_FILES) > 120
     assert len(IN_OBJECTS) > 50
-    assert {"ModelFile.joints[0].trust", "DvrkDriver.guard.expiry", "Mechanism.gains.kp[0]"} <= set(IN_FILES)
+    assert {"ModelFile.joints[0].feedforward_scale", "DvrkDriver.guard.expiry", "Mechanism.gains.kp[0]"} <= set(
+        IN_FILES
+    )
     assert {"Arm.effort_limits", "Arm.gains.kp[0]", "Arm.linkage.matrix"} <= set(IN_OBJECTS)
 
 
@@ -305,7 +307,7 @@ def test_a_pose_in_degrees_that_says_so_is_read(own_psm):
     [
         ("base_parameters[0].value", -1e300, r"allowed: -100000\.\.100000 kg, kg m or kg m\^2"),
         ("base_parameters[0].standard_error", -1.0, r"allowed: 0\.\.1e\+09"),
-        ("joints[1].trust", 1.5, r"allowed: 0\.\.1"),
+        ("joints[1].feedforward_scale", 1.5, r"allowed: 0\.\.1"),
         ("joints[1].rms_fit", 1e300, "allowed: 0"),
         ("joints[0].position_lower", -180.0, r"allowed: -50\.\.50 rad or m; is it in degrees or mm\?"),
         ("gravity[2]", -1e300, r"allowed: -30\.\.30 m/s\^2"),

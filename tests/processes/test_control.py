@@ -410,7 +410,7 @@ def copy_of(status, **fields):
 
 
 def test_an_arm_that_lets_no_command_act_is_given_up_with_the_reason(controller, monkeypatch):
-    monkeypatch.setattr("dvrk_drake.processes.control._PATIENCE", 0.3)
+    monkeypatch.setattr("dvrk_drake.processes.control._TIMEOUT", 0.3)
     link = GuardedArm()
     link.status.effort_measured = list(2 * LIMIT)  # more than commands may use
     with pytest.raises(ControllerError, match=r"lets no command act for 0.3 s; the last refusal is: "):

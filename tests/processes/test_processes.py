@@ -7,7 +7,7 @@ import sys
 import lcm
 import numpy as np
 import pytest
-from patience import PATIENCE
+from waiting import TIMEOUT
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -73,7 +73,7 @@ def test_realtime_is_real_time_and_locks_memory():
         "print(len(make_realtime()), os.sched_getscheduler(0) == os.SCHED_FIFO, "
         "'VmLck:\\t       0 kB' not in open('/proc/self/status').read())"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=True)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=TIMEOUT, check=True)
     if result.stdout.split()[0] != "0":
         pytest.skip("no permission for real-time scheduling, locked memory or cores that stay awake")
     assert result.stdout.split() == ["0", "True", "True"]
@@ -110,7 +110,7 @@ def test_a_network_without_a_route_is_an_error():
             ["unshare", "-rn", sys.executable, "-c", code],
             capture_output=True,
             text=True,
-            timeout=PATIENCE,
+            timeout=TIMEOUT,
             check=False,
         )
     except OSError:

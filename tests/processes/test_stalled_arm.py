@@ -13,10 +13,10 @@ from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 STALLS = pytest.mark.parametrize("seconds", [0.02, 0.05, 0.2, 1.0])
 #: From the beginning of a stall until 0.5 s after it, of an arm that is held; its efforts balance its weight [rad, m].
-FARTHEST_AT_REST = 1e-4
+MAX_DISTANCE_AT_REST = 1e-4
 #: The speed at which the first joint is moved [rad/s], and how far it goes beyond speed times stall [rad]: it is held
 #: where it is found and comes to rest.
-SPEED, FARTHEST_BEYOND = 0.1, 0.01
+SPEED, MAX_DISTANCE_BEYOND = 0.1, 0.01
 
 
 class Loop:
@@ -90,7 +90,7 @@ def test_an_arm_at_rest_stays_there_whoever_is_stopped(name, side, seconds):
     before = len(loop.moved)
     getattr(loop, f"stall_of_the_{side}")(seconds)
     farthest, _ = loop.check(seconds < 0.05, before)
-    assert farthest < FARTHEST_AT_REST
+    assert farthest < MAX_DISTANCE_AT_REST
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
@@ -108,5 +108,5 @@ def test_an_arm_in_motion_comes_to_rest_whoever_is_stopped(name, side, seconds):
     acted = {"bridge": seconds, "process": 0.0, "controller": 0.05}[side]
     farthest, last = loop.check(False, before)
     print(f"{name}, {side} stopped for {seconds} s at {SPEED} rad/s: {farthest:.4f} rad or m")
-    assert farthest < SPEED * acted + FARTHEST_BEYOND
+    assert farthest < SPEED * acted + MAX_DISTANCE_BEYOND
     assert last < 5e-3  # it creeps to its pose

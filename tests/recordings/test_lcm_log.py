@@ -5,7 +5,7 @@ import resource
 import lcm
 import numpy as np
 import pytest
-from rests import motion_with_rests
+from static_poses import motion_with_pauses
 from status_logs import ARM, START, N, log_bytes, statuses
 
 from dvrk_drake.cli import main
@@ -216,7 +216,7 @@ def test_commands_read_a_log_as_they_read_a_csv(tmp_path, capsys):
 def test_a_log_of_a_moving_arm_identifies_it_by_its_rests(tmp_path, capsys):
     """At 1 kHz from pose to pose, with a friction on the way that would spoil a model."""
     generator = np.random.default_rng(5)
-    recording = motion_with_rests(ARM, ARM.sample_poses(16, generator, margin=0.05), generator, 1.0, 1.0, 1000.0)
+    recording = motion_with_pauses(ARM, ARM.sample_poses(16, generator, margin=0.05), generator, 1.0, 1.0, 1000.0)
     messages = []
     for k, (q, qd, tau) in enumerate(zip(recording.q, recording.qd, recording.tau, strict=True)):
         (status,) = statuses(1, utime=START + 1000 * k, sequence=k)

@@ -19,7 +19,7 @@ from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import RandomPoses, Study, Variation
 from dvrk_drake.experiments.study.table import Row
-from dvrk_drake.experiments.transparency import Felt
+from dvrk_drake.experiments.transparency import OperatorForces
 from dvrk_drake.experiments.tuning.model_based import ArmDesign, JointDesign, JointFacts
 from dvrk_drake.experiments.tuning.procedure import JointProcedure, Ultimate
 from dvrk_drake.experiments.tuning.sampled_loop import Margins
@@ -140,12 +140,12 @@ def tuned(console, verbose):
     tuning.print_tuning(console, found, verbose=verbose)
 
 
-def felt(console, verbose):
+def forces(console, verbose):
     t = np.linspace(0.0, 12.0, 100)
     vectors = np.random.default_rng(0).normal(size=(100, 3))
     names = ("nothing", "model A", "model A, friction 0.5")
     off = np.abs(vectors[:, 0]) / 100
-    results = [Felt(name, t, vectors / 10, (4 - k) * vectors, off) for k, name in enumerate(names)]
+    results = [OperatorForces(name, t, vectors / 10, (4 - k) * vectors, off) for k, name in enumerate(names)]
     transparency.print_transparency(console, dvrk.load_arm("mtml"), results, verbose=verbose)
 
 
@@ -211,7 +211,7 @@ CASES = {
     ),
     "study": (r"held exact: \d+ of 12 runs; another one: \d+ of 12 runs\.", studied),
     "tune": (r"Gains of method model are better than the arm's own: ", tuned),
-    "transparency": (r"Smallest interaction force at the handle: \d+\.\d\d N RMS with model A, friction 0\.5", felt),
+    "transparency": (r"Smallest interaction force at the handle: \d+\.\d\d N RMS with model A, friction 0\.5", forces),
     "demo": (r"Released without dry friction, MTML turns by at most 0\.0123 rad", demonstrated),
     "teleop": (
         r"The tip follows the handle within 0\.500 mm",

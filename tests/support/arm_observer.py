@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import lcm
 import numpy as np
-from patience import PATIENCE, wait_until
+from waiting import TIMEOUT, wait_until
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.processes.pace import make_realtime
@@ -31,7 +31,7 @@ class Observer:
         """Ends its threads: those of LCM read every message of the network, in real time."""
         self.running.remove(self)
         self.ended.set()
-        self.thread.join(PATIENCE)
+        self.thread.join(TIMEOUT)
 
     def listen(self, name, url):
         # Scheduling is a thread's own. LCM's reading thread, which is started here, inherits it; processes do not,

@@ -9,14 +9,14 @@ import tempfile
 from pathlib import Path
 
 import lcm_controller
-from patience import PATIENCE
+from waiting import TIMEOUT
 
 from dvrk_drake import cli
 
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
 
 #: The configuration of a driver that is seldom too strict for a busy computer.
-PATIENT_DRIVER = Path(__file__).with_name("patient_driver.yaml")
+PATIENT_DRIVER = Path(__file__).with_name("long_timeout_driver.yaml")
 
 FORKSERVER = multiprocessing.get_context("forkserver")
 FORKSERVER.set_forkserver_preload(["lcm_precompiled"])
@@ -36,7 +36,7 @@ class Forked:
 
     def wait(self):
         """The exit code."""
-        self.process.join(PATIENCE)
+        self.process.join(TIMEOUT)
         assert self.poll() is not None, f"does not end: {self.said()}"
         return self.poll()
 
@@ -65,7 +65,7 @@ class CommandLine(Forked):
         os.close(descriptor)
 
     def wait(self):
-        return self.process.wait(PATIENCE)
+        return self.process.wait(TIMEOUT)
 
     def poll(self):
         return self.process.poll()

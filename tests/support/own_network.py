@@ -16,7 +16,7 @@ Tests wait for conditions, and pass on a busy computer. There are two exceptions
 - Any test that failed while the computer stood still: a thread that sleeps 10 ms at a time was `STANDSTILL` late. The
   time limits of the processes under test (no status for 1 s, for example) expire then.
 
-The last line of a run states the number of retries. A run with more than `MOST_RETRIES` fails.
+The last line of a run states the number of retries. A run with more than `MAX_RETRIES` fails.
 """
 
 import os
@@ -34,11 +34,11 @@ import pytest
 INSIDE = "DVRK_DRAKE_OWN_NETWORK"
 NETWORK = "ip link set lo up && ip link set lo multicast on && ip route add 239.255.0.0/16 dev lo"
 #: Retries in one run of pytest, of all files and tests together.
-MOST_RETRIES = 4
+MAX_RETRIES = 4
 #: A delay of a sleeping thread that only a computer that stands still explains [s].
 STANDSTILL = 0.4
 #: Ends a run inside that hangs [s].
-LONGEST_RUN = 1800
+MAX_RUN = 1800
 
 inside = pytest.mark.skipif(INSIDE not in os.environ, reason="runs in a network of its own, started by the test below")
 outside = pytest.mark.skipif(INSIDE in os.environ, reason="is inside already")
@@ -73,7 +73,7 @@ def run_inside(request):
             steady = {name.partition("[")[0] for name in failed} - watchdogs
             if steady and delay.seconds < STANDSTILL:
                 raise AssertionError(f"failed: {', '.join(failed)}")
-            if len(retries) + len(failed) > MOST_RETRIES:
+            if len(retries) + len(failed) > MAX_RETRIES:
                 raise AssertionError(f"failed: {', '.join(failed)}, after {len(retries)} retries")
             retries += failed
 
@@ -104,7 +104,7 @@ def pytest_terminal_summary(terminalreporter, config):
     if retries is not None:
         names = f": {', '.join(retries)}" if retries else ""
         count = f"{len(retries)} {'retry' if len(retries) == 1 else 'retries'}"
-        terminalreporter.write_line(f"UDP tests: {count} of at most {MOST_RETRIES}{names}")
+        terminalreporter.write_line(f"UDP tests: {count} of at most {MAX_RETRIES}{names}")
 
 
 def _run(test_file, memory):
@@ -121,7 +121,7 @@ def _run(test_file, memory):
         env=environment,
         capture_output=True,
         text=True,
-        timeout=LONGEST_RUN,
+        timeout=MAX_RUN,
         check=False,
     )
     print(done.stdout[-6000:], done.stderr[-3000:])

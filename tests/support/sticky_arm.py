@@ -47,7 +47,7 @@ def random_poses(arm, count, seed=0, margin=0.1):
 
 
 class StickyArm:
-    """An arm whose joints do not feel one another: weight, dry friction that truly sticks, efforts as commanded."""
+    """An arm whose joints do not affect one another: weight, dry friction that truly sticks, efforts as commanded."""
 
     def __init__(self, arm, model, friction, q):
         self.arm, self.model, self.friction = arm, model, friction

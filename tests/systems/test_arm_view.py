@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from patience import wait_until
+from waiting import wait_until
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status

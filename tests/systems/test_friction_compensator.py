@@ -10,8 +10,8 @@ from scipy.optimize import linprog
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.friction_compensation import (
-    LARGEST_HYSTERESIS_RATIO,
-    LARGEST_RATIO,
+    MAX_HYSTERESIS_RATIO,
+    MAX_RATIO,
     Friction,
     safe_ratios,
 )
@@ -90,7 +90,7 @@ class Compensator:
 def test_all_of_it_without_widening_is_a_share_of_the_identified_friction():
     q, v = motion(1, 1000)
     np.testing.assert_allclose(
-        Compensator(ratio=LARGEST_RATIO, widening=1.0).run(q, v), LARGEST_RATIO * friction_of_arm(q, v), atol=1e-12
+        Compensator(ratio=MAX_RATIO, widening=1.0).run(q, v), MAX_RATIO * friction_of_arm(q, v), atol=1e-12
     )
 
 
@@ -104,13 +104,13 @@ def test_no_motion_gets_energy_from_it(seed, delay):
     seen_v = v + 1e-3 * generator.standard_normal(v.shape)
     late = np.concatenate([np.repeat(seen_q[:1], delay, 0), seen_q])[: len(q)]
     late_v = np.concatenate([np.repeat(seen_v[:1], delay, 0), seen_v])[: len(q)]
-    given = Compensator(ratio=LARGEST_RATIO, hysteresis_ratio=LARGEST_HYSTERESIS_RATIO).run(late, late_v)
+    given = Compensator(ratio=MAX_RATIO, hysteresis_ratio=MAX_HYSTERESIS_RATIO).run(late, late_v)
     dq = np.diff(q, axis=0)
     taken = friction_of_arm(q, v)
     energy = np.cumsum(np.einsum("mi,mi->m", (taken - given)[1:], dq))
     # What the compensation's elements can store, and so give back once: ratio c d / 2, d wider by a half.
     stored = sum(
-        LARGEST_HYSTERESIS_RATIO * c * 1.5 * e.scale / 2
+        MAX_HYSTERESIS_RATIO * c * 1.5 * e.scale / 2
         for e, c in zip(EFFECTS, COEFFICIENTS, strict=True)
         if e.kind == "presliding"
     )
@@ -126,7 +126,7 @@ def test_a_hand_feels_less():
     assert 0.35 * work < left < 0.6 * work
 
 
-@pytest.mark.parametrize("ratio", [0.3, LARGEST_RATIO])
+@pytest.mark.parametrize("ratio", [0.3, MAX_RATIO])
 def test_the_friction_that_remains_holds_any_error_of_the_gravity_compensation(ratio):
     error = np.array([0.02, 0.03, 0.02, 0.01, 0.003, 0.002, 0.0004])
     ratios = safe_ratios(FRICTION, ratio, error)
@@ -159,15 +159,15 @@ def test_what_springs_back_is_compensated_first_and_never_more_than_is_safe_alon
     without = safe_ratios(FRICTION, 0.0, NO_EFFORT)
     ratios = safe_ratios(FRICTION, 0.0, NO_EFFORT, hysteresis_ratio=0.8)
     np.testing.assert_allclose(ratios, np.where(wide, 0.8, without), atol=ROUNDING)
-    both = safe_ratios(FRICTION, LARGEST_RATIO, NO_EFFORT, hysteresis_ratio=LARGEST_HYSTERESIS_RATIO)
+    both = safe_ratios(FRICTION, MAX_RATIO, NO_EFFORT, hysteresis_ratio=MAX_HYSTERESIS_RATIO)
     dry = np.array([effect.kind != "viscous" for effect in FRICTION.effects])
-    np.testing.assert_allclose(both[wide], LARGEST_HYSTERESIS_RATIO, atol=ROUNDING)
-    assert np.all(both[dry & ~wide] <= LARGEST_RATIO + ROUNDING)
+    np.testing.assert_allclose(both[wide], MAX_HYSTERESIS_RATIO, atol=ROUNDING)
+    assert np.all(both[dry & ~wide] <= MAX_RATIO + ROUNDING)
     for name in {effect.coordinate for effect in FRICTION.effects}:
         here = dry & [effect.coordinate == name for effect in FRICTION.effects]
-        assert np.sum((both * COEFFICIENTS)[here]) == pytest.approx(LARGEST_RATIO * np.sum(COEFFICIENTS[here]))
+        assert np.sum((both * COEFFICIENTS)[here]) == pytest.approx(MAX_RATIO * np.sum(COEFFICIENTS[here]))
     alone = Friction.of(ARM, [ActuatorEffect("joint.elbow_pitch", "presliding", 0.2)], [0.03])
-    assert safe_ratios(alone, 0.0, NO_EFFORT, hysteresis_ratio=0.9) == pytest.approx(LARGEST_RATIO)
+    assert safe_ratios(alone, 0.0, NO_EFFORT, hysteresis_ratio=0.9) == pytest.approx(MAX_RATIO)
 
 
 def test_without_friction_to_spare_nothing_is_compensated():
@@ -176,7 +176,7 @@ def test_without_friction_to_spare_nothing_is_compensated():
 
 
 def test_it_begins_with_nothing_and_after_a_nan_again():
-    compensator = Compensator(ratio=LARGEST_RATIO)
+    compensator = Compensator(ratio=MAX_RATIO)
     q = np.full(7, 0.2)
     still = np.zeros(7)
     assert np.all(compensator.step(q, still) == 0)
@@ -186,7 +186,7 @@ def test_it_begins_with_nothing_and_after_a_nan_again():
 
 
 def test_the_sum_stays_inside_the_effort_limits():
-    compensator = Compensator(ratio=LARGEST_RATIO)
+    compensator = Compensator(ratio=MAX_RATIO)
     compensator.system.GetInputPort("effort_wanted").FixValue(compensator.context, 0.999 * ARM.effort_limits)
     compensator.step(np.zeros(7), np.zeros(7))
     effort = compensator.step(np.full(7, 0.1), np.full(7, 1.0), "effort")
@@ -237,7 +237,7 @@ def test_a_push_dies_away_on_an_arm_with_a_third_less_friction_than_identified_a
         ARM.effects.without("cables").without("springs"), friction=laws, delay=DelayEffect(measurement=1, command=1)
     )
     station = ArmStation(ARM, effects=effects, seed=seed)
-    friction = FrictionCompensator(Friction.of_arm(ARM), ratio=LARGEST_RATIO, hysteresis_ratio=LARGEST_HYSTERESIS_RATIO)
+    friction = FrictionCompensator(Friction.of_arm(ARM), ratio=MAX_RATIO, hysteresis_ratio=MAX_HYSTERESIS_RATIO)
     builder = DiagramBuilder()
     add_closed_loop(
         builder, station, GravityPidController(IdentifiedModel.from_arm(ARM), mode="gravity"), friction=friction
@@ -277,9 +277,9 @@ def released(ratio, error, holding_error, seconds=1.5):
 @pytest.mark.slow
 def test_a_released_arm_stays_though_its_gravity_is_not_known_exactly_and_would_not_with_less_care():
     error = np.array([0.01, 0.015, -0.015, 0.01, 0.003, 0.002, 0.0004])
-    assert np.all(released(LARGEST_RATIO, error, np.abs(error)) < 0.015)
+    assert np.all(released(MAX_RATIO, error, np.abs(error)) < 0.015)
     more = np.array([1, 2, 2, 2, 1, 1, 1]) * error
-    assert np.any(released(LARGEST_RATIO, more, np.zeros(7)) > 0.1)
+    assert np.any(released(MAX_RATIO, more, np.zeros(7)) > 0.1)
     assert np.all(
-        released(LARGEST_RATIO, more, np.abs(more)) < 0.04
+        released(MAX_RATIO, more, np.abs(more)) < 0.04
     )  # as without any: the fine friction cannot hold as much

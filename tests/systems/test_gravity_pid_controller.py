@@ -255,7 +255,7 @@ def test_simulator_holds_the_output_between_updates():
 
 
 def test_trust_scales_the_gravity():
-    joints = [dataclasses.replace(joint, trust=0.25) for joint in MODEL.joints]
+    joints = [dataclasses.replace(joint, feedforward_scale=0.25) for joint in MODEL.joints]
     bench = Bench(model=dataclasses.replace(MODEL, joints=joints), mode="gravity", effort_limits=UNLIMITED)
     np.testing.assert_allclose(bench.initialize(POSES[0]), 0.25 * MODEL.holding_torque(POSES[0]), atol=1e-12)
 

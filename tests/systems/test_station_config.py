@@ -20,7 +20,7 @@ FILE = """
 arm: psm
 closure: ball
 gravity: [0, 9.81, 0]
-real_arm: [friction]
+simulated_effects: [friction]
 seed: 3
 plant: {time_step: 0.002, contact_model: point}
 simulator: {target_realtime_rate: 0.0, start_time: 1.0}
@@ -37,7 +37,7 @@ def path(tmp_path):
 
 def test_a_file_is_read_with_drakes_loader_and_keeps_what_it_leaves_out(path):
     config = load_station_config(path)
-    assert (config.arm, config.closure, config.seed, config.real_arm) == ("psm", "ball", 3, ["friction"])
+    assert (config.arm, config.closure, config.seed, config.simulated_effects) == ("psm", "ball", 3, ["friction"])
     assert (config.plant.time_step, config.plant.contact_model) == (0.002, "point")
     assert config.plant.discrete_contact_approximation == "sap" and not config.plant.use_sampled_output_ports
     assert config.driver.status_period == 0.002

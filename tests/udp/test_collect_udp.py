@@ -10,7 +10,7 @@ import pytest
 from arm_observer import Observer, holds, takes_efforts
 from arm_processes import PATIENT_DRIVER, dvrk_drake
 from own_network import inside, outside, run_inside
-from patience import wait_until
+from waiting import wait_until
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel

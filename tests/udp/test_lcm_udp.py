@@ -18,7 +18,7 @@ import pytest
 from arm_observer import NETWORK_URL, Observer, check_clock, holds, takes_efforts
 from arm_processes import FORKSERVER, PATIENT_DRIVER, POSES, CommandLine, Forked, start_arm, start_controller, start_run
 from own_network import inside, outside, run_inside, watchdog
-from patience import PATIENCE, wait_until
+from waiting import TIMEOUT, wait_until
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
@@ -373,14 +373,14 @@ class Logged:
 
     def __exit__(self, *exception):
         self.logger.send_signal(signal.SIGINT)
-        self.logger.wait(PATIENCE)
+        self.logger.wait(TIMEOUT)
 
     def count(self, name):
         return sum(event.channel == f"DVRK_COMMAND_{name.upper()}" for event in lcm.EventLog(str(self.path), "r"))
 
     def play(self):
         command = [LCM_TOOLS / "lcm-logplayer", f"--speed={SLOWLY}", "-l", self.url, self.path]
-        subprocess.run(command, check=True, timeout=PATIENCE, capture_output=True)
+        subprocess.run(command, check=True, timeout=TIMEOUT, capture_output=True)
 
 
 @inside

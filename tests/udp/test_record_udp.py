@@ -11,8 +11,8 @@ import lcm
 import numpy as np
 import pytest
 from own_network import end, inside, outside, run_inside, start
-from patience import PATIENCE, wait_until
 from status_logs import ARM, log_bytes, statuses
+from waiting import TIMEOUT, wait_until
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.recordings.lcm_log_reader import LcmLogReader, measurements
@@ -70,7 +70,7 @@ def played(tmp_path_factory):
 
 
 def play(path, *options):
-    subprocess.run([TOOLS / "lcm-logplayer", *options, path], check=True, timeout=PATIENCE, capture_output=True)
+    subprocess.run([TOOLS / "lcm-logplayer", *options, path], check=True, timeout=TIMEOUT, capture_output=True)
 
 
 def rows_in(path):
@@ -115,7 +115,7 @@ def test_a_live_arm_is_logged_and_recorded_with_the_same_numbers(tmp_path):
             assert line == "starting the simulated MTML\n" or "warning: " in line  # scheduling may not be permitted
         logger = start_logger(paths[0])
         for recorder in start_records(paths[1:], "--duration", "2"):
-            assert recorder.wait(PATIENCE) == 0, recorder.stdout.read()
+            assert recorder.wait(TIMEOUT) == 0, recorder.stdout.read()
             assert "rows" in recorder.stdout.read()
         end_logger(logger, paths[0])
     finally:
@@ -205,9 +205,9 @@ def test_silence_is_explained(tmp_path, played):
         "messages left out, no lcmt_dvrk_status, or one of another version",
     }
     for arm, process in waiting.items():
-        assert process.wait(PATIENCE) == 2
+        assert process.wait(TIMEOUT) == 2
         assert messages[arm] in process.stdout.read()
     ended.set()
-    assert alone.wait(PATIENCE) == 2
+    assert alone.wait(TIMEOUT) == 2
     assert "does the arm's process or bridge run, on this network?" in alone.stdout.read()
     assert not list(tmp_path.glob("*.csv"))

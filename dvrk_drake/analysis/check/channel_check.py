@@ -11,33 +11,33 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
 from dvrk_drake.analysis.check.findings import Finding
-from dvrk_drake.analysis.static.doubts import find_doubts
-from dvrk_drake.analysis.static.static_identification import LEAST_POSES, average_repeated_poses
+from dvrk_drake.analysis.static.excluded_measurements import find_excluded
+from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_repeated_poses
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
 
 #: A hypothesis is accepted if it raises the log-likelihood by this much. On the public motions as recorded no exchange
 #: gains anything; on damaged ones the right one gains 25 or more, in most cases hundreds.
-SURE = 20.0
+MIN_GAIN = 20.0
 #: An arm is nearly its own mirror image: inverted channels are accepted only from here on. On the public motions as
 #: recorded they gain up to 46.
-SURE_OF_MIRROR = 100.0
+MIN_MIRROR_GAIN = 100.0
 #: Friction disturbs efforts at rest: there, exchanged ones are accepted from the first on, inverted or scaled ones from
 #: the second. On the public poses as recorded they gain up to 10, 31 and 19.
-SURE_AT_REST, SURE_OF_EFFORT_AT_REST = 30.0, 40.0
+MIN_GAIN_AT_REST, MIN_EFFORT_GAIN_AT_REST = 30.0, 40.0
 #: Hypotheses whose gain is less than this below the largest are named too.
-ALIKE = 10.0
+SIMILAR_GAIN = 10.0
 #: Multiples of the recorded effort that are tried.
 SCALES = (0.5, 2.0)
 #: Friction dissipates the power that the arm's file states within this factor. The public recordings of one PSM on two
 #: days lie between 0.96 and 1.54.
 FRICTION_FACTOR = 1.7
 #: A position offset is reported from this size on [rad], [m], and from this number of standard errors on.
-LEAST_OFFSET, OFFSET_ERRORS = (0.06, 0.006), 3.3
+MIN_OFFSET, OFFSET_ERRORS = (0.06, 0.006), 3.3
 #: The zero of a joint is judged only if an offset of this size would be significant [rad], [m].
-TOLERATED_OFFSET = 0.1, 0.01
+MAX_UNDETECTED_OFFSET = 0.1, 0.01
 #: A longer motion is checked in equal parts of at most this duration [s], which bounds the memory that a fit takes.
-LONGEST_PART = 120.0
+MAX_SEGMENT_DURATION = 120.0
 #: Exchanged channels may exceed the arm's limits by this much more than the recorded ones [rad], [m].
 LIMIT_MARGIN = 0.02, 0.002
 
@@ -65,7 +65,7 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
     """
     if not recording.motion(arm):
         poses = _poses_in_order(recording, arm)
-        if len(poses) < LEAST_POSES:
+        if len(poses) < MIN_POSES:
             return []
         fit = ChannelFit(poses, arm)
         found = _likeliest([[*_hypotheses(fit), *_scales_at_rest(fit)]], at_rest=True)
@@ -81,11 +81,11 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
 
 
 def _parts(recording: Recording) -> list[Recording]:
-    """Equal parts of a motion, none longer than `LONGEST_PART`."""
+    """Equal parts of a motion, none longer than `MAX_SEGMENT_DURATION`."""
     t, qd = recording.t, recording.qd
-    if t is None or t[-1] - t[0] <= LONGEST_PART:
+    if t is None or t[-1] - t[0] <= MAX_SEGMENT_DURATION:
         return [recording]
-    edges = np.linspace(t[0], t[-1], int(np.ceil((t[-1] - t[0]) / LONGEST_PART)) + 1)
+    edges = np.linspace(t[0], t[-1], int(np.ceil((t[-1] - t[0]) / MAX_SEGMENT_DURATION)) + 1)
     tau = recording.measured_effort()
     return [
         replace(
@@ -106,14 +106,14 @@ def _likeliest(parts: list[list[Finding]], *, at_rest: bool = False) -> list[Fin
     gains: dict[tuple, list[Finding]] = {}
     for finding in chain(*parts):
         gains.setdefault((finding.kind, finding.joints, finding.what), []).append(finding)
-    least = {"exchanged channels": SURE_AT_REST if at_rest else SURE, "inverted channel": SURE_OF_MIRROR}
-    sure_of_effort = SURE_OF_EFFORT_AT_REST if at_rest else SURE
+    least = {"exchanged channels": MIN_GAIN_AT_REST if at_rest else MIN_GAIN, "inverted channel": MIN_MIRROR_GAIN}
+    sure_of_effort = MIN_EFFORT_GAIN_AT_REST if at_rest else MIN_GAIN
     sums = [replace(same[0], size=sum(finding.size for finding in same)) for same in gains.values()]
     sums = sorted(sums, key=lambda finding: -finding.size)
     best = next((finding for finding in sums if finding.size > least.get(finding.kind, sure_of_effort)), None)
     if best is None:
         return []
-    alike = [f.what.partition(":")[0] for f in sums if f is not best and f.size > max(best.size - ALIKE, 0.0)]
+    alike = [f.what.partition(":")[0] for f in sums if f is not best and f.size > max(best.size - SIMILAR_GAIN, 0.0)]
     return [replace(best, advice=f"{best.advice}; nearly as likely: {', '.join(alike)}") if alike else best]
 
 
@@ -139,7 +139,7 @@ def _poses_in_order(recording: Recording, arm: Arm) -> Recording:
     Efforts beyond a limit stay: they may be those of another joint.
     """
     poses = average_repeated_poses(recording.in_joint_coordinates(arm), arm)
-    at_stop = [doubt.row for doubt in find_doubts(replace(poses, tau=np.zeros_like(poses.q)), arm)]
+    at_stop = [measurement.row for measurement in find_excluded(replace(poses, tau=np.zeros_like(poses.q)), arm)]
     in_order = np.setdiff1d(np.arange(len(poses)), at_stop)
     return replace(poses, q=poses.q[in_order], tau=poses.measured_effort()[in_order], qd=None, t=None, lines=None)
 
@@ -243,7 +243,7 @@ def _scales(fit: ChannelFit) -> Iterator[Finding]:
             what = f"friction of its actuator dissipates {ratio:.2g} times the power that the arm's file states"
         else:
             scale, gain = _best_scale(fit, i)
-            if gain < SURE:
+            if gain < MIN_GAIN:
                 continue
             ratio = 1 / scale
             what = f"effort of its actuator is about {ratio:g} times what the arm's inertia needs"
@@ -296,7 +296,7 @@ def _offsets(fit: ChannelFit) -> Iterator[Finding]:
     Offsets of joints with parallel axes look alike, so the warning also names the other candidates.
     """
     arm, hidden, found = fit.arm, [], {}
-    least, tolerated = arm.per_joint(*LEAST_OFFSET), arm.per_joint(*TOLERATED_OFFSET)
+    least, tolerated = arm.per_joint(*MIN_OFFSET), arm.per_joint(*MAX_UNDETECTED_OFFSET)
     for i in range(arm.num_joints):
         offset, error = fit.position_offset(i)
         if OFFSET_ERRORS * error > tolerated[i]:
@@ -318,7 +318,7 @@ def _offsets(fit: ChannelFit) -> Iterator[Finding]:
 
 def _undetectable(arm: Arm, joints: list[int]) -> Iterator[Finding]:
     if joints:
-        what = f"an offset of {TOLERATED_OFFSET[0]} rad ({TOLERATED_OFFSET[1]} m) in their positions would not show"
+        what = f"an offset of {MAX_UNDETECTED_OFFSET[0]} rad ({MAX_UNDETECTED_OFFSET[1]} m) in their positions would not show"
         advice = "this recording cannot tell it from the links' centres of mass; check the zeros of these encoders"
         names = ", ".join(arm.joint_names[i] for i in joints)
         yield Finding("note", "undetectable offset", names, what, advice, tuple(joints))

@@ -26,18 +26,18 @@ from dvrk_drake.recordings.recording import REST_SPEED, Recording
 #: size. Of simple friction, and of offsets, springs and cables of unknown size: as shares of the RMS effort.
 LINK_DEVIATION, EFFECT_DEVIATION, FRICTION_DEVIATION, POSITION_DEVIATION = 0.3, 0.5, 0.1, 1.0
 #: Of the base's tilt [rad], and of a position offset [rad], [m]; the least of a rotor's inertia [kg m^2; kg].
-TILT_DEVIATION, OFFSET_DEVIATION, LEAST_ROTOR_DEVIATION = 0.05, (0.1, 0.01), 3e-6
+TILT_DEVIATION, OFFSET_DEVIATION, MIN_ROTOR_DEVIATION = 0.05, (0.1, 0.01), 3e-6
 #: Final samples in a period of the effort's cut-off frequency; time left out at each end, where filters swing in [s].
 OVERSAMPLING, ENDS = 2.5, 1.0
 #: Independent measurements of an effort that count at most: errors of the model do not average out.
-MOST_INDEPENDENT = 220.0
+MAX_INDEPENDENT = 220.0
 #: The error of an actuator is not taken for less than this share of its effort.
-LEAST_ERROR = 0.02
+MIN_ERROR = 0.02
 #: A joint that covers less over poses at rest is left out [rad], [m].
-LEAST_RANGE = 0.1, 0.01
+MIN_RANGE = 0.1, 0.01
 #: Directions of the rigid body's parameters are left out where a prior deviation along them changes the efforts by less
 #: than this share, squared.
-LEAST_INFORMATION = 1e-6
+MIN_INFORMATION = 1e-6
 #: Step of the derivative with respect to a position [rad, m].
 _STEP = 1e-3
 
@@ -88,8 +88,8 @@ class ChannelFit:
             self._v = self._vd = np.zeros_like(self._q)
             self._tau = recording.in_actuator_coordinates(arm).measured_effort()
             independent = len(recording)
-            moves = np.ptp(arm.transmission.position(self._q), axis=0) > arm.per_joint(*LEAST_RANGE)
-        self._independent = min(independent, MOST_INDEPENDENT)
+            moves = np.ptp(arm.transmission.position(self._q), axis=0) > arm.per_joint(*MIN_RANGE)
+        self._independent = min(independent, MAX_INDEPENDENT)
         measured = np.any(self._tau != 0, axis=0)
         self.used, self.resting = np.flatnonzero(moves & measured), np.flatnonzero(~moves & measured)
         self.log_likelihood = 0.0
@@ -144,7 +144,7 @@ class ChannelFit:
         num_links = 10 * len(regressor.links)
         prior = regressor.values[: self._base.base.shape[1]]
         deviations = [LINK_DEVIATION * LinkScale.of(link).deviations for link in regressor.links]
-        rotors = np.maximum(LINK_DEVIATION * prior[num_links:], LEAST_ROTOR_DEVIATION)
+        rotors = np.maximum(LINK_DEVIATION * prior[num_links:], MIN_ROTOR_DEVIATION)
         deviation = np.concatenate([*deviations, rotors])
         Y = regressor.regressor(q, v, vd)
         effort = np.sqrt(np.mean(self._tau**2, axis=0))
@@ -158,7 +158,7 @@ class ChannelFit:
             scaled = to_base * deviation
             information += scaled.T @ (filtered.T @ filtered) @ scaled / (len(filtered) * effort[i] ** 2)
         values, vectors = np.linalg.eigh(information)
-        directions = vectors[:, values > LEAST_INFORMATION]
+        directions = vectors[:, values > MIN_INFORMATION]
         self._to_parameters = deviation[:, None] * directions
         tilts = TILT_DEVIATION * np.linalg.norm(self.arm.gravity) * self._weights_of_unit_gravity(q)
         self._drive = drive = _drive_effects(self.arm, self._q, self._v, self.moves)
@@ -205,11 +205,11 @@ class ChannelFit:
         weights = self._independent / (0.1**2 * efforts)
         for _ in range(4):
             x = NonNegativeFit(total.weighted(weights) + prior, precision, non_negative, np.arange(size)).solve()
-            errors = np.maximum(total.squared_errors(x), LEAST_ERROR**2 * efforts)
+            errors = np.maximum(total.squared_errors(x), MIN_ERROR**2 * efforts)
             weights = self._independent / errors
         at_rest = tau[:, self.resting]
         constants = np.sum((at_rest - np.mean(at_rest, axis=0)) ** 2, axis=0)
-        errors = np.append(errors, np.maximum(constants, LEAST_ERROR**2 * np.sum(at_rest**2, axis=0)))
+        errors = np.append(errors, np.maximum(constants, MIN_ERROR**2 * np.sum(at_rest**2, axis=0)))
         likelihood = -0.5 * self._independent * float(np.sum(np.log(errors)))
         likelihood -= 0.5 * float(np.sum(precision * (x - mean) ** 2))
         return likelihood, x, total.weighted(weights)[:-1, :-1] + np.diag(precision)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport
-from dvrk_drake.analysis.signals.effort_lag import LAG_STEP, LONGEST_LAG, EffortLag, effort_lag
+from dvrk_drake.analysis.signals.effort_lag import LAG_STEP, MAX_LAG, EffortLag, effort_lag
 from dvrk_drake.analysis.signals.low_pass import resample
 from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionSignals, motion_signals
 from dvrk_drake.analysis.signals.noise import cut_offs, narrow_band, spectra
@@ -22,23 +22,23 @@ from dvrk_drake.analysis.signals.true_time import (
     velocity_agreement,
 )
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import LONGEST_PERIOD, REST_SPEED, Recording
+from dvrk_drake.recordings.recording import MAX_PERIOD, REST_SPEED, Recording
 
 #: Below this share, repeated rows are chance.
-LEAST_REPEATED = 0.005
+MIN_REPEATED = 0.005
 #: A block of channels that repeats itself in so much more rows comes from a slower topic.
-LEAST_EXTRA = 0.05
+MIN_EXTRA = 0.05
 #: A gap: an interval of so many median ones, and at least this long [s].
-GAP, LEAST_GAP = 5.0, LONGEST_PERIOD
+GAP, MIN_GAP = 5.0, MAX_PERIOD
 #: A clock that is off by more than this share of an interval is worth a line.
-LEAST_JITTER = 0.05
+MIN_JITTER = 0.05
 #: A sign is wrong if Coulomb friction is so many standard errors below 0; or if the motor's work is below minus this
 #: share, and Coulomb friction below 0 as far as it can be told.
-SURE, OPPOSITE = 5.0, 0.05
+MIN_GAIN, OPPOSITE = 5.0, 0.05
 #: Joints whose speeds correlate more can hardly be told apart.
-TOGETHER = 0.95
+MIN_CORRELATION = 0.95
 #: Shorter motions are too short to judge lags, signs and noise [s].
-LEAST_DURATION = 10.0
+MIN_DURATION = 10.0
 
 
 def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tuple[RecordingReport, list[Finding]]:
@@ -53,9 +53,9 @@ def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tup
     report = replace(
         report, rate=rate, duration=duration, jitter=clock.jitter, repeated=float(np.mean(repeated_rows(actuators)))
     )
-    if duration < LEAST_DURATION or rate < 2 / LONGEST_PERIOD:
+    if duration < MIN_DURATION or rate < 2 / MAX_PERIOD:
         what = f"{duration:.3g} s at {rate:.3g} Hz"
-        advice = f"lags, noise and repetition are judged from {LEAST_DURATION:g} s at {2 / LONGEST_PERIOD:g} Hz on"
+        advice = f"lags, noise and repetition are judged from {MIN_DURATION:g} s at {2 / MAX_PERIOD:g} Hz on"
         return report, [*findings, Finding("warning", "short or slow", "t", what, advice, size=duration)]
     signals = motion_signals(actuators, 20.0, rate=min(rate, GRID_RATE))
     moving = np.sqrt(np.mean(signals.v**2, axis=0)) > arm.per_joint(*REST_SPEED)
@@ -94,18 +94,18 @@ def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
         for name, block in (("q", actuators.q), ("qd", actuators.qd), ("tau", actuators.tau))
         if block is not None and np.any(block)
     }
-    if whole > LEAST_REPEATED:
+    if whole > MIN_REPEATED:
         shares = ", ".join(f"{name} alone {share:.1%}" for name, share in blocks.items())
         what = f"{whole:.1%} repeat the row before ({shares})"
         advice = "a slower topic was polled: they are left out, and true times are made; record each message once"
         findings.append(Finding("warning", "repeated rows", "rows", what, advice, size=whole))
     for name, share in blocks.items():
         # What never changes is said elsewhere.
-        if whole + LEAST_EXTRA < share < 1 - 2 / len(actuators):
+        if whole + MIN_EXTRA < share < 1 - 2 / len(actuators):
             what = f"{share:.1%} of the rows repeat {name} but not the rest"
             advice = "it comes from a slower topic than the rest, and is up to one of its intervals late"
             findings.append(Finding("warning", "repeated channel", name, what, advice, size=share))
-    if clock.reconstructed and clock.jitter > LEAST_JITTER:
+    if clock.reconstructed and clock.jitter > MIN_JITTER:
         what = f"q and qd say that rows are off their times: true intervals deviate by {clock.jitter:.0%} (1 sigma)"
         advice = "times are made from q and qd; record the controller's own time stamps"
         findings.append(Finding("warning", "jitter", "t", what, advice, size=clock.jitter))
@@ -114,7 +114,7 @@ def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
 
 def _gaps(t: NDArray[np.float64], interval: float) -> NDArray[np.int_]:
     """Rows before a gap."""
-    return np.flatnonzero(np.diff(t) > max(GAP * interval, LEAST_GAP))
+    return np.flatnonzero(np.diff(t) > max(GAP * interval, MIN_GAP))
 
 
 def _longest_piece(recording: Recording, gaps: NDArray[np.int_]) -> Recording:
@@ -171,8 +171,8 @@ def _lags(lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
     for j in np.flatnonzero(lags.determined):
         lag, error = 1e3 * float(lags.lag[j]), 1e3 * float(lags.standard_error[j])
         size = f"{abs(lag):.1f} ms (standard error {error:.1f})"
-        if abs(lags.lag[j]) > LONGEST_LAG - LAG_STEP:
-            size = f"{1e3 * LONGEST_LAG:.0f} ms or more"
+        if abs(lags.lag[j]) > MAX_LAG - LAG_STEP:
+            size = f"{1e3 * MAX_LAG:.0f} ms or more"
         what = f"tau{j + 1} looks {size} {'late' if lag > 0 else 'early'}"
         advice = "a delay, or friction that builds up over some way: fit hysteresis before you shift it"
         findings.append(Finding("note", "effort lag", names[j], what, advice, (int(j),), float(lags.lag[j])))
@@ -185,7 +185,7 @@ def _together(signals: MotionSignals, moving: NDArray[np.bool_], names: tuple[st
         return []
     correlation = np.abs(np.corrcoef(signals.v[:, index].T))
     findings = []
-    for a, b in np.argwhere(np.triu(correlation, 1) > TOGETHER):
+    for a, b in np.argwhere(np.triu(correlation, 1) > MIN_CORRELATION):
         i, j = int(index[a]), int(index[b])
         what = f"move together (correlation of their speeds {correlation[a, b]:.3f})"
         advice = "their inertia and friction cannot be told apart; move them independently"
@@ -205,7 +205,7 @@ def _signs(work: NDArray[np.float64], lags: EffortLag, names: tuple[str, ...]) -
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = lags.coulomb / lags.coulomb_error
     # Work alone does not tell: gravity and inertia may give it through the other joints.
-    wrong = (errors < -SURE) | ((work < -OPPOSITE) & (errors < 0))
+    wrong = (errors < -MIN_GAIN) | ((work < -OPPOSITE) & (errors < 0))
     findings = []
     for j in np.flatnonzero(wrong):
         what = (

@@ -13,17 +13,17 @@ from dvrk_drake.analysis.check.motion_check import check_motion
 from dvrk_drake.analysis.check.pose_check import check_poses
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.static_segments import find_poses
-from dvrk_drake.analysis.static.doubts import check_effort_unit
+from dvrk_drake.analysis.static.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.static.static_identification import usable_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.recording import LEAST_ROWS, REST_SPEED, Recording
+from dvrk_drake.recordings.recording import MIN_ROWS, REST_SPEED, Recording
 
 #: A joint that moves less has never moved [rad], [m].
-LEAST_RANGE = 0.02, 0.002
+MIN_RANGE = 0.02, 0.002
 #: A joint that covers less than this share of its limits hardly tells its parameters.
-LEAST_COVERAGE = 0.1
+MIN_COVERAGE = 0.1
 #: Beyond its limits by more than this, a pose is worth a line [rad], [m].
 LIMIT_MARGIN = 0.005, 0.0005
 #: A motion's effort beyond its limit by this factor is a spike of the measurement, whatever the limit's own error.
@@ -110,13 +110,13 @@ def _positions(joints: Recording, arm: Arm, numbers: tuple[JointSignals, ...]) -
                 "no arm goes there, its links would cross: are these positions of actuators (--coordinates actuator)?"
             )
         findings.append(Finding(severity, "outside limits", names[i], what, advice, moved, float(excess[row, i])))
-    still = [j for j, least in enumerate(arm.per_joint(*LEAST_RANGE)) if numbers[j].range < least]
+    still = [j for j, least in enumerate(arm.per_joint(*MIN_RANGE)) if numbers[j].range < least]
     for j, joint in enumerate(numbers):
         if j in still:
             what = f"never moves: its positions cover {joint.range:.2g} {'m' if arm.prismatic[j] else 'rad'}"
             advice = "nothing of it can be identified, and what it carries only together; record it moving"
             findings.append(Finding("warning", "never moves", joint.name, what, advice, (j,), joint.range))
-        elif joint.coverage < LEAST_COVERAGE:
+        elif joint.coverage < MIN_COVERAGE:
             what = f"covers {joint.coverage:.1%} of its range"
             advice = "its parameters will be uncertain and valid there only; let it move further"
             findings.append(Finding("warning", "little excitation", joint.name, what, advice, (j,), joint.coverage))
@@ -128,7 +128,7 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str
         advice = "the motors were off or are not recorded"
         return [Finding("refusal", "no effort", "efforts", "all of them are always 0", advice)]
     findings = []
-    least_range = arm.per_joint(*LEAST_RANGE)
+    least_range = arm.per_joint(*MIN_RANGE)
     for j, name in enumerate(arm.joint_names):
         if not np.any(tau[:, j]):
             advice = "its motor was off or is not recorded; nothing of it can be identified"
@@ -141,7 +141,7 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str
             advice = "such peaks may be clipped or spikes of the current's measurement"
             severity: Severity = "note"
             if kind == "motion" and most > IMPOSSIBLE_EFFORT:
-                # A pose may press on a stop, and is doubted later; in a motion a few such rows spoil the whole fit.
+                # A pose may press on a stop, and is excluded later; in a motion a few such rows spoil the whole fit.
                 severity = "refusal"
                 advice = (
                     "no motor of this arm does that; mend or remove the spikes, or correct the limit in the arm's file"
@@ -199,7 +199,7 @@ def _time(recording: Recording, kind: str) -> list[Finding]:
 def _time_factor(recording: Recording) -> float | None:
     """Recorded over true time, where most joints that move agree on it within 10 %; None where they do not tell."""
     t, q, qd = recording.t, recording.q, recording.qd
-    if t is None or qd is None or len(t) < LEAST_ROWS:
+    if t is None or qd is None or len(t) < MIN_ROWS:
         return None
     # Over several rows, jitter and repeated rows cancel.
     way = np.diff(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import drive_effects, dynamic_columns, optional_effects
-from dvrk_drake.analysis.dynamic.effect_selection import choose_effects, left_out_errors
+from dvrk_drake.analysis.dynamic.effect_selection import cross_validate, select_effects
 from dvrk_drake.analysis.dynamic.estimates import DynamicEstimates, base_parameter_estimates, parameter_covariance
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.results import Identification
@@ -30,7 +30,7 @@ from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
 #: An effect whose effort is below this share of the actuators' is left out of the model.
-LEAST_EFFECT = 1e-4
+MIN_EFFECT = 1e-4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -64,7 +64,7 @@ def identify_dynamic(
     cross-validation over the phases of the motion. The links' parameters are those nearest to the recording that bodies
     can have, the SDF's where it says nothing (`consistent_parameters`). The direction of gravity is found along where
     the arm's file says that its base may tilt. The cross-validated errors are of models that know nothing of the phases
-    they predict (`left_out_errors`).
+    they predict (`cross_validate`).
 
     Args:
         recording: a motion with t and tau, in either coordinates.
@@ -82,10 +82,10 @@ def identify_dynamic(
     period = period_of(grid)
     problem = motion_problem(grid, tau, period)
     progress(0.2)
-    choice = choose_effects(problem, lambda share: progress(0.2 + 0.3 * share))
+    choice = select_effects(problem, lambda share: progress(0.2 + 0.3 * share))
     problem, chosen = choice.problem, choice.chosen
     fit = problem.consistent(chosen, choice.weights)
-    left_out = left_out_errors(choice, fit.x[: problem.num_rigid], lambda share: progress(0.55 + 0.45 * share))
+    left_out = cross_validate(choice, fit.x[: problem.num_rigid], lambda share: progress(0.55 + 0.45 * share))
     _refuse_worse_than_zero(recording, grid, np.sqrt(left_out / np.maximum(problem.efforts, np.finfo(float).tiny)))
     left = residuals(problem, chosen, fit)
     covariance = parameter_covariance(problem, fit, left, grid.rate, grid.settings.effort_cut_off, period)
@@ -168,7 +168,7 @@ def _section(
     effects = []
     for k, effect in enumerate(problem.columns.effects[c] for c in chosen):
         value = float(fit.x[p + k])
-        if value**2 * problem.effect_precision[chosen[k]] > LEAST_EFFECT**2:
+        if value**2 * problem.effect_precision[chosen[k]] > MIN_EFFECT**2:
             effects.append(
                 DriveEffect(effect.coordinate, effect.kind, effect.scale, value, standard_error=float(sd[p + k]))
             )

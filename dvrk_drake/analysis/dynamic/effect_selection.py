@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
 from dvrk_drake.analysis.dynamic.problem import ConsistentProgram, DynamicProblem
-from dvrk_drake.analysis.dynamic.stepwise_selection import EffectSelection
+from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
 
 #: Times that a lean base and the parameters of the links are found in turn; a third changes no error by 0.01 %.
-TURNS = 2
+NUM_TILT_ITERATIONS = 2
 #: Folds that are left out together where a model is judged: what a motion does for longer is more like another motion.
-TOGETHER = 2
+MIN_CORRELATION = 2
 
 
 @dataclass(frozen=True, eq=False)
-class EffectChoice:
+class EffectSelection:
     """Effects and direction of gravity that fit a motion best.
 
     Attributes:
@@ -31,7 +31,7 @@ class EffectChoice:
     """
 
     problem: DynamicProblem
-    selection: EffectSelection
+    selection: StepwiseSelection
     start: NDArray[np.int_]
     found: NDArray[np.int_]
     x: NDArray[np.float64]
@@ -47,29 +47,29 @@ class EffectChoice:
         return self.selection.weights
 
 
-def choose_effects(problem: DynamicProblem, progress: Callable[[float], object] = lambda _: None) -> EffectChoice:
+def select_effects(problem: DynamicProblem, progress: Callable[[float], object] = lambda _: None) -> EffectSelection:
     """Finds the direction of gravity with what every drive has; adds effects that the motion asks for."""
     tilts = len(problem.columns.tilts)
     start = np.append(np.arange(problem.num_always), problem.num_effects + np.arange(tilts))
     phi = problem.prior
     # The tilt times the links' parameters is no linear unknown.
-    for turn in range(TURNS if tilts else 0):
-        progress(0.5 * turn / TURNS)
+    for turn in range(NUM_TILT_ITERATIONS if tilts else 0):
+        progress(0.5 * turn / NUM_TILT_ITERATIONS)
         x = problem.selection(phi, folds=False).fit(start)
         phi = problem.rigid_parameters(x)
         problem = replace(problem, tilt=x[-tilts:])
     selection = problem.selection(phi)
     found = selection.choose(start, problem.candidates, lambda share: progress(0.5 + 0.5 * share))
     x = selection.fit(found)
-    return EffectChoice(replace(problem, tilt=x[-tilts:]) if tilts else problem, selection, start, found, x)
+    return EffectSelection(replace(problem, tilt=x[-tilts:]) if tilts else problem, selection, start, found, x)
 
 
-def left_out_errors(
-    choice: EffectChoice, phi: NDArray[np.float64], progress: Callable[[float], object] = lambda _: None
+def cross_validate(
+    choice: EffectSelection, phi: NDArray[np.float64], progress: Callable[[float], object] = lambda _: None
 ) -> NDArray[np.float64]:
     """(n,) sum of squares that models leave of phases of which they know nothing.
 
-    Every `TOGETHER` folds are predicted by the effects, the direction of gravity and the consistent parameters that the
+    Every `MIN_CORRELATION` folds are predicted by the effects, the direction of gravity and the consistent parameters that the
     others give.
 
     Args:
@@ -81,7 +81,7 @@ def left_out_errors(
         IdentificationError: the solver did not converge.
     """
     problem, tilts = choice.problem, len(choice.problem.columns.tilts)
-    firsts = range(0, choice.selection.equations.folds, TOGETHER)
+    firsts = range(0, choice.selection.equations.folds, MIN_CORRELATION)
     parts = []
     for first in firsts:
         parts.append(_part(choice, first))
@@ -99,16 +99,16 @@ def left_out_errors(
         T[:b, : problem.num_rigid] = problem.columns.base
         T[b + np.searchsorted(used, chosen), problem.num_rigid + np.arange(len(chosen))] = 1.0
         T[-1 - tilts :, -1] = np.append(problem.tilt[:tilts] - tilt, 1.0)
-        learnt = equations.without_fold(first, TOGETHER).weighted(weights)
+        learnt = equations.without_fold(first, MIN_CORRELATION).weighted(weights)
         y = ConsistentProgram(problem, chosen).solve(T.T @ learnt @ T)
-        errors += equations.of_fold(first, TOGETHER).squares(T @ np.append(-y, 1.0))
+        errors += equations.of_fold(first, MIN_CORRELATION).squares(T @ np.append(-y, 1.0))
     return errors
 
 
-def _part(choice: EffectChoice, first: int) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+def _part(choice: EffectSelection, first: int) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
     """Indices of the effects, weights of the actuators and tilt that the phases without a part say."""
     problem = choice.problem
-    selection = choice.selection.without(first, TOGETHER)
+    selection = choice.selection.without(first, MIN_CORRELATION)
     found = selection.choose(choice.start, problem.candidates)
     x = selection.fit(found)
     return found[found < problem.num_effects], selection.weights, x[len(x) - len(problem.columns.tilts) :]

@@ -75,7 +75,7 @@ MEMORY = 1.0
 #: Rows are taken this many times as often as the cut-off of the low-pass needs.
 _OVERSAMPLING = 2.0
 #: Two passes that overlap by less than this share of the motion do not tell what repeats.
-_LEAST_OVERLAP = 0.2
+_MIN_OVERLAP = 0.2
 
 
 def parameter_covariance(
@@ -159,7 +159,7 @@ def error_covariance(
     covariance = np.zeros(count + reach)
     covariance[: reach + 1] = near[reach:]
     shift = 0 if period is None else round(period * rate)
-    if reach < shift and (count - shift - reach) > _LEAST_OVERLAP * count:
+    if reach < shift and (count - shift - reach) > _MIN_OVERLAP * count:
         again = lags[shift - reach : shift + reach + 1] * window
         for start in range(shift, count + reach, shift):
             until = min(start + reach + 1, len(covariance))
@@ -185,7 +185,7 @@ def _inverse(H: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 #: A base parameter of which the motion took away less than this share of the prior's variance is not told by it.
-LEAST_TOLD = 0.5
+MIN_IDENTIFIABILITY = 0.5
 #: What rubs at any speed: `dry_friction` sums these up.
 DRY_KINDS = ("coulomb", "presliding")
 
@@ -211,7 +211,7 @@ class DynamicEstimates:
                     [float(v) for v in x],
                     float(np.linalg.eigvalsh(pseudo_inertia(x))[0]),
                     [float(v) for v in np.sqrt(variance)],
-                    _told(variance[0], self._prior[10 * k, 10 * k]),
+                    _identifiability(variance[0], self._prior[10 * k, 10 * k]),
                     reached_bounds(x, link, self._problem.boxes[link.link]),
                 )
             )
@@ -232,12 +232,12 @@ class DynamicEstimates:
         names = (*base.base.names, *(str(self._effects[k - p]) for k in there))
         uncertainty = ParameterUncertainty.of_covariance(names, to_all @ self._covariance @ to_all.T)
         estimates = [
-            MotionParameterEstimate(name, unit, float(value), float(error), _told(error**2, variance))
+            MotionParameterEstimate(name, unit, float(value), float(error), _identifiability(error**2, variance))
             for name, unit, value, error, variance in zip(
                 base.base.names, base.base.units, values, uncertainty.standard_errors, before, strict=False
             )
         ]
-        told = {estimate.name for estimate in estimates if estimate.told >= LEAST_TOLD}
+        told = {estimate.name for estimate in estimates if estimate.identifiability >= MIN_IDENTIFIABILITY}
         pairs = uncertainty.strong_correlations()
         return estimates, [
             CorrelatedEstimates(pair.first, pair.second, pair.correlation) for pair in pairs if pair.first in told
@@ -259,7 +259,7 @@ class DynamicEstimates:
         return friction
 
 
-def _told(variance: float, before: float) -> float:
+def _identifiability(variance: float, before: float) -> float:
     return float(np.clip(1 - variance / before, 0.0, 1.0))
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 #: Exchanges of unknowns between positive and 0 that are tried.
-MOST_EXCHANGES = 10
+MAX_EXCHANGES = 10
 #: Indices of an actuator's own columns among all, and these (r, c); the others are 0 for it.
 OwnColumns = tuple[NDArray[np.int_], NDArray[np.float64]]
 
@@ -208,7 +208,7 @@ class NonNegativeFit:
         """
         H, b = S[bound[:, None], bound], S[bound, -1]
         positive = np.append(self._positive, np.ones(len(b) - len(self._positive), dtype=bool))
-        for _ in range(MOST_EXCHANGES):
+        for _ in range(MAX_EXCHANGES):
             y = np.zeros(len(b))
             y[positive] = np.linalg.solve(H[np.ix_(positive, positive)], b[positive])
             wrong = np.where(positive, y <= 0, H @ y < b)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DynamicColumns
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations, OwnColumns
-from dvrk_drake.analysis.dynamic.stepwise_selection import EffectSelection
+from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
 from dvrk_drake.dynamics.actuator_effects import POSITION_KINDS
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.inertial_parameters import rotor_links
@@ -26,7 +26,7 @@ from dvrk_drake.dynamics.physical_consistency import (
 #: Deviation of an inertial parameter from the SDF's, as a share of the link's own size; chosen by cross-validation.
 LINK_DEVIATION = 0.3
 #: Least deviation of a rotor's inertia, and its least value as a share of the SDF's [kg m^2].
-LEAST_ROTOR_DEVIATION, LEAST_ROTOR_SHARE = 3e-6, 0.1
+MIN_ROTOR_DEVIATION, MIN_ROTOR_SHARE = 3e-6, 0.1
 #: Deviation of an effect about 0, as a share of the RMS efforts it acts on: of friction, of which there are many shapes
 #: that add up; of torques by position that a drive is known to have, which gravity may balance; of all others.
 FRICTION_DEVIATION, KNOWN_DEVIATION, EFFECT_DEVIATION = 0.1, 1.0, 0.3
@@ -100,7 +100,7 @@ class DynamicProblem:
         for link, deviation in zip(self.regressor.links, links, strict=True):
             if link.link in balanced:
                 deviation[1:4] *= _BALANCE
-        rotors = np.maximum(LINK_DEVIATION * self.prior[10 * len(links) :], LEAST_ROTOR_DEVIATION)
+        rotors = np.maximum(LINK_DEVIATION * self.prior[10 * len(links) :], MIN_ROTOR_DEVIATION)
         return np.asarray(np.concatenate([*links, rotors]), dtype=float)
 
     @cached_property
@@ -128,7 +128,7 @@ class DynamicProblem:
         """Number of rows."""
         return len(self.columns.tau)
 
-    def selection(self, phi: NDArray[np.float64] | None = None, *, folds: bool = True) -> EffectSelection:
+    def selection(self, phi: NDArray[np.float64] | None = None, *, folds: bool = True) -> StepwiseSelection:
         """The choice of effects, with the rigid body reduced to what the recording can tell.
 
         Args:
@@ -149,7 +149,7 @@ class DynamicProblem:
         fold, edge = (self.fold, self.edge) if folds else (np.zeros_like(self.fold), None)
         precision = [np.ones(informative), self.effect_precision, np.full(tilts, 1 / (9.81 * TILT_DEVIATION) ** 2)]
         non_negative = [effect.dissipative for effect in self.columns.effects]
-        return EffectSelection(
+        return StepwiseSelection(
             equations=NormalEquations.of(columns, informative + self.num_effects + tilts, left, fold, edge),
             efforts=np.array([np.sum(self.columns.tau[fold == f] ** 2, axis=0) for f in range(fold.max() + 1)]),
             rows=np.bincount(fold),
@@ -257,7 +257,7 @@ class ConsistentProgram:
         self._problem = problem
         links = problem.regressor.links
         effects = [problem.columns.effects[k] for k in chosen]
-        rotors = LEAST_ROTOR_SHARE * problem.prior[10 * len(links) :]
+        rotors = MIN_ROTOR_SHARE * problem.prior[10 * len(links) :]
         dissipative = [0.0 if effect.dissipative else -np.inf for effect in effects]
         self.lower = np.concatenate([np.full(10 * len(links), -np.inf), rotors, dissipative])
         self.precision = np.concatenate([problem.deviation**-2, problem.effect_precision[chosen]])

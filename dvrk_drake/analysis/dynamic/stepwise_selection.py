@@ -13,15 +13,15 @@ from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalE
 
 #: An effect must lower the cross-validated error, relative and averaged over the actuators, by this much. What gains
 #: less is chosen by chance: on the public motions other phases choose others, which predict the left-out phases worse.
-LEAST_GAIN = 0.005
+MIN_GAIN = 0.005
 #: So many of the effects that promise most are tried at every step.
 TRIALS = 8
 #: An actuator's error is not taken for less than this share of its effort.
-LEAST_ERROR = 0.02
+MIN_ERROR = 0.02
 
 
 @dataclass
-class EffectSelection:
+class StepwiseSelection:
     """The choice of effects on one motion, in unknowns that are 0 before the recording.
 
     Attributes:
@@ -50,7 +50,7 @@ class EffectSelection:
         self._efforts = np.sum(self.efforts, axis=0)
         self.weights = self._weights(np.full(len(self._efforts), 0.1**2))
 
-    def without(self, first: int, count: int) -> EffectSelection:
+    def without(self, first: int, count: int) -> StepwiseSelection:
         """The choice that knows nothing of some folds: `count` from `first` on."""
         kept = self.equations.others(first, count)
         return replace(
@@ -84,7 +84,7 @@ class EffectSelection:
     def choose(
         self, start: NDArray[np.int_], candidates: NDArray[np.int_], report: Callable[[float], object] = lambda _: None
     ) -> NDArray[np.int_]:
-        """Adds candidates to `start` while `LEAST_GAIN` is had, and drops those that are no longer of use.
+        """Adds candidates to `start` while `MIN_GAIN` is had, and drops those that are no longer of use.
 
         Args:
             start, candidates: indices of effects, from 0.
@@ -96,13 +96,13 @@ class EffectSelection:
             self.fit(chosen)
             tries = self._promising(chosen, np.setdiff1d(candidates, chosen))
             best, errors = self.cross_validated(chosen, tries.tolist())
-            if not errors or min(errors) > best - LEAST_GAIN:
+            if not errors or min(errors) > best - MIN_GAIN:
                 break
             chosen = np.union1d(chosen, tries[[np.argmin(errors)]])
         for k in np.intersect1d(candidates, chosen):
             without = np.setdiff1d(chosen, [k])
             error, _ = self.cross_validated(without)
-            if error < best + LEAST_GAIN / 2:
+            if error < best + MIN_GAIN / 2:
                 chosen, best = without, error
         return chosen
 
@@ -129,5 +129,5 @@ class EffectSelection:
 
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         """One over the variance of an independent measurement, from the squared relative errors."""
-        variance = np.maximum(squared, LEAST_ERROR**2) * self._efforts / np.sum(self.rows)
+        variance = np.maximum(squared, MIN_ERROR**2) * self._efforts / np.sum(self.rows)
         return np.asarray(self.independent / variance)

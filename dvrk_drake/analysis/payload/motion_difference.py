@@ -61,9 +61,9 @@ class Whitening:
 
 
 #: A motion that does not repeat may have begun so much sooner or later than the other [s].
-LONGEST_SHIFT = 5.0
+MAX_SHIFT = 5.0
 #: Both recordings must have so much of the motion [s].
-LEAST_OVERLAP = 5.0
+MIN_OVERLAP = 5.0
 #: Of the low-pass that the difference is behind [Hz]: what a payload adds is as slow as the motion, the rest is noise.
 CUT_OFF = 5.0
 #: By how much of an actuator's RMS effort torques that depend on its position may change: 0.4 to 9 % (RMS 5.6 %),
@@ -186,11 +186,11 @@ def _shift(reference: MotionGrid, other: MotionGrid, period: float | None, recor
     def apart(shift: int) -> float:
         """Half the mean squared difference, x[i + shift] against y[i]."""
         first, last = max(0, -shift), min(len(y), len(x) - shift)
-        if last - first < LEAST_OVERLAP * GRID_RATE:
+        if last - first < MIN_OVERLAP * GRID_RATE:
             return np.inf
         return float(np.mean((x[first + shift : last + shift : step] - y[first:last:step]) ** 2)) / 2
 
-    reach = round((LONGEST_SHIFT if period is None else period / 2) * GRID_RATE)
+    reach = round((MAX_SHIFT if period is None else period / 2) * GRID_RATE)
     coarse = min(range(-reach, reach + 1, step), key=apart)
     best = min(range(coarse - step, coarse + step + 1), key=apart)
     if not apart(best) < SAME_MOTION**2:

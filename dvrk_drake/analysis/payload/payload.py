@@ -31,11 +31,11 @@ CONFIDENCE = 0.95
 #: Links whose left-out error is within this of the best explain the recording as well.
 SAME_ERROR = 1.05
 #: Two recordings whose efforts differ by less than this share of them are one.
-LEAST_DIFFERENCE = 1e-6
+MIN_DIFFERENCE = 1e-6
 #: Order of the autoregression that whitens the errors, and how often it is fitted.
 AUTOREGRESSION, WHITENED = 2, 2
 #: An actuator that the payload loads by less than this share of its difference tells nothing of it.
-LEAST_LOAD = 1e-6
+MIN_LOAD = 1e-6
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ def estimate_payload(
     difference = motion_difference(reference, loaded, model)
     progress(0.2)
     grid = difference.grid
-    if np.sqrt(np.mean(difference.tau**2)) < LEAST_DIFFERENCE * np.sqrt(np.mean(loaded.measured_effort() ** 2)):
+    if np.sqrt(np.mean(difference.tau**2)) < MIN_DIFFERENCE * np.sqrt(np.mean(loaded.measured_effort() ** 2)):
         raise RecordingError(
             f"{loaded.source or 'recording'}: shows no difference from the reference: they are the same recording"
         )
@@ -309,7 +309,7 @@ def _estimate(link: LinkInertia, columns: NDArray[np.float64], difference: Motio
     rows, arm = len(difference.tau), difference.grid.arm
     rms = np.sqrt(np.stack(plain.budget(body, problems.plain_weights)) / rows)
     actuators = [
-        PayloadActuator(name, change, own, left, 1 - (left / change) ** 2 if own > LEAST_LOAD * change else None)
+        PayloadActuator(name, change, own, left, 1 - (left / change) ** 2 if own > MIN_LOAD * change else None)
         for name, (change, own, left) in zip(arm.joint_names, rms.T.tolist(), strict=True)
     ]
     with_it, without = (

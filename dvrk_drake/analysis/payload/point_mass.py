@@ -13,9 +13,9 @@ from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
 #: It lies within this of the link's own centre of mass, along each axis [m]; no arm is longer.
 REACH = 1.0
 #: Heaviest one [kg].
-LARGEST_MASS = 10.0
+MAX_MASS = 10.0
 #: A coordinate whose standard error would exceed this is not determined [m].
-LEAST_KNOWN = 0.5
+MIN_KNOWN = 0.5
 #: Where the search begins beside the link's own centre of mass [m].
 _STARTS = (0.15, 0.4)
 _RIGID = 10
@@ -87,7 +87,7 @@ class PointMassProblem:
             # What ends at the edge of the search is as unknown as what has no edge.
             unknown = np.where(np.abs(body.place - self.com) > REACH - 1e-6, np.inf, errors[1:])
             worst = int(np.argmax(np.where(determined, unknown, 0.0)))
-            if not determined[worst] or not unknown[worst] > LEAST_KNOWN:
+            if not determined[worst] or not unknown[worst] > MIN_KNOWN:
                 return body, weights, errors
             start, determined = None, determined & (np.arange(3) != worst)
 
@@ -172,7 +172,7 @@ class PointMassProblem:
         bodies = []
         for offset in offsets:
             unit = point_mass_parameters(1.0, self.com + offset)
-            mass = float(np.clip(float(unit @ b) / max(float(unit @ H @ unit), _TINY), 1e-3, LARGEST_MASS / 2))
+            mass = float(np.clip(float(unit @ b) / max(float(unit @ H @ unit), _TINY), 1e-3, MAX_MASS / 2))
             bodies.append(self._refine(reduced, weights, PointMass(mass, self.com + offset, determined)))
         return min(bodies, key=lambda body: float(weights @ _left_by(reduced, body)))
 
@@ -180,7 +180,7 @@ class PointMassProblem:
         A, b = _rows(reduced, weights)
         free = np.concatenate([[True], start.determined])
         lower = np.concatenate([[0.0], self.com - REACH])[free]
-        upper = np.concatenate([[LARGEST_MASS], self.com + REACH])[free]
+        upper = np.concatenate([[MAX_MASS], self.com + REACH])[free]
         full = np.concatenate([[start.mass], start.place])
 
         def whole(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from dvrk_drake.analysis.signals.motion_grid import MotionSignals
 #: Of the low-pass that efforts and what explains them get [Hz].
 CUT_OFF = 20.0
 #: Delays that are tried [s], and their step.
-LONGEST_LAG, LAG_STEP = 0.04, 0.0025
+MAX_LAG, LAG_STEP = 0.04, 0.0025
 #: Left out at each end, where filters swing in [s].
 ENDS = 1.0
 #: Coulomb friction is smoothed over this share of the RMS speed.
@@ -21,14 +21,14 @@ SMOOTHING = 0.1
 #: Parts of the motion whose estimates give the standard errors.
 PARTS = 5
 #: A delay is told only if it takes the variance that is left down by this factor, and exceeds so many standard errors.
-LEAST_GAIN, LEAST_ERRORS = 1.12, 5.0
+MIN_GAIN, MIN_ERRORS = 1.12, 5.0
 
 
 class EffortLag(NamedTuple):
     """How late tau is behind the motion, and its step where the speed changes its sign; (n,) each.
 
     Attributes:
-        lag: that leaves least of tau unexplained [s], at most `LONGEST_LAG`; nan where the joint or its effort rests.
+        lag: that leaves least of tau unexplained [s], at most `MAX_LAG`; nan where the joint or its effort rests.
         standard_error: of it, from `PARTS` parts of the motion [s].
         gain: variance left without a delay over that with it [1].
         determined: whether the lag is one: large gain, and many standard errors.
@@ -55,7 +55,7 @@ def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
         moving: (n,) which of them move.
     """
     rate = signals.rate
-    start = max(int(ENDS * rate), int(LONGEST_LAG * rate))
+    start = max(int(ENDS * rate), int(MAX_LAG * rate))
     inner = slice(start, len(signals.t) - start)
     tau = low_pass(signals.tau, rate, CUT_OFF)
     angles = signals.q[:, moving]
@@ -69,7 +69,7 @@ def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
         result[j] = *_fit(tau[:, j], Q, inner, rate), *_coulomb(columns, tau[inner, j])
     lag, error, gain, size, size_error = result.T
     with np.errstate(invalid="ignore"):
-        determined = (gain > LEAST_GAIN) & (np.abs(lag) > LEAST_ERRORS * error)
+        determined = (gain > MIN_GAIN) & (np.abs(lag) > MIN_ERRORS * error)
     return EffortLag(lag, error, gain, determined, size, size_error)
 
 
@@ -85,7 +85,7 @@ def _fit(tau: NDArray[np.float64], Q: NDArray[np.float64], inner: slice, rate: f
     """Lag [s], its standard error [s] and its gain, for what spans the columns of Q."""
     step = max(round(LAG_STEP * rate), 1)
     shifts = np.arange(-(inner.start // step), inner.start // step + 1) * step
-    shifts = shifts[np.abs(shifts) <= LONGEST_LAG * rate]
+    shifts = shifts[np.abs(shifts) <= MAX_LAG * rate]
     shifted = np.column_stack([tau[inner.start + s : inner.stop + s] for s in shifts])
     squares = (shifted - Q @ (Q.T @ shifted)) ** 2
     left = np.sum(squares, axis=0)

@@ -19,7 +19,7 @@ GRID_RATE = 400.0
 #: Left out at each end, where filters swing in [s].
 ENDS = 1.0
 #: Shortest motion, and least rate of its rows, that tell anything [s, Hz].
-LEAST_DURATION, LEAST_RATE = 5.0, 50.0
+MIN_DURATION, MIN_RATE = 5.0, 50.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,10 +163,10 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock:
     clock = clock or true_time(recording)
     duration = float(clock.t[-1] - clock.t[0])
     rate = (len(recording) - 1) / duration
-    if duration < LEAST_DURATION or rate < LEAST_RATE:
+    if duration < MIN_DURATION or rate < MIN_RATE:
         raise RecordingError(
             f"{recording.source or 'recording'}: {duration:.1f} s at {rate:.0f} Hz; a dynamic model needs a motion of "
-            f"at least {LEAST_DURATION:g} s at {LEAST_RATE:g} Hz"
+            f"at least {MIN_DURATION:g} s at {MIN_RATE:g} Hz"
         )
     t = _even_times(clock, GRID_RATE)
     raw = resample(clock.t, recording.q[clock.rows], t)

@@ -11,13 +11,13 @@ from scipy.ndimage import median_filter
 #: Length of the pieces whose periodograms are averaged [s]; 1 / it is the resolution [Hz].
 PIECE = 2.56
 #: Lowest cut-off that is proposed [Hz].
-LEAST_CUT_OFF = 2.0
+MIN_CUT_OFF = 2.0
 #: A narrow band: noise above this many times what it is on both sides.
 PEAK = 4.0
 #: Its edges: where the noise falls below this share of its peak; at most this many octaves apart.
 EDGE, WIDEST = 0.15, 2.0
 #: It matters from this share of the signal's RMS on.
-LEAST_SHARE = 0.03
+MIN_SHARE = 0.03
 
 
 class Spectra(NamedTuple):
@@ -61,7 +61,7 @@ def spectra(x: NDArray[np.float64], rate: float, period: float | None) -> Spectr
 
 
 def cut_offs(of: Spectra) -> NDArray[np.float64]:
-    """(n,) the lowest frequency above which the signal is under the noise [Hz], at least `LEAST_CUT_OFF`.
+    """(n,) the lowest frequency above which the signal is under the noise [Hz], at least `MIN_CUT_OFF`.
 
     Both are smoothed over five lines. Where the signal is above the noise up to the end, that is half the rate.
     """
@@ -69,7 +69,7 @@ def cut_offs(of: Spectra) -> NDArray[np.float64]:
     result = []
     for signal, noise in zip(of.signal.T, of.noise.T, strict=True):
         under = np.convolve(signal, kernel, "same") < np.convolve(noise, kernel, "same")
-        under &= of.frequency >= LEAST_CUT_OFF
+        under &= of.frequency >= MIN_CUT_OFF
         result.append(of.frequency[np.argmax(under)] if np.any(under) else of.frequency[-1])
     return np.array(result)
 
@@ -91,6 +91,6 @@ def narrow_band(of: Spectra, joint: int) -> Band | None:
     f, step = of.frequency, of.frequency[1]
     total = np.sum(of.signal[:, joint] + of.noise[:, joint])
     share = float(np.sqrt(np.sum(of.noise[lower : upper + 1, joint]) / total))
-    if share < LEAST_SHARE or f[upper] > f[lower] * 2**WIDEST:
+    if share < MIN_SHARE or f[upper] > f[lower] * 2**WIDEST:
         return None
     return Band(float(f[lower] - step / 2), float(f[upper] + step / 2), share)

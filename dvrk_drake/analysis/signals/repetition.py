@@ -12,7 +12,7 @@ from dvrk_drake.analysis.signals.motion_grid import GRID_RATE, MotionGrid
 #: (RMS over the joints that move).
 SAME_MOTION = 0.1
 #: The second pass must cover at least this share of the period.
-LEAST_OVERLAP = 0.25
+MIN_OVERLAP = 0.25
 #: Left out at each end, where the filter swings in [s].
 ENDS = 1.0
 
@@ -43,7 +43,7 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
     # sum over t of (x(t) - x(t + T))^2, from running sums of squares and the autocorrelation.
     first, last = squares[count - 1 - lags], squares[-1] - np.concatenate([[0.0], squares[:-1]])[lags]
     difference = np.maximum(first + last - 2 * product, 0) / (count - lags) / (2 * x.shape[1])
-    longest = int(count / (1 + LEAST_OVERLAP))
+    longest = int(count / (1 + MIN_OVERLAP))
     inner = difference[1:longest]
     is_minimum = (inner[1:-1] <= inner[:-2]) & (inner[1:-1] < inner[2:]) & (inner[1:-1] < SAME_MOTION**2)
     if not np.any(is_minimum):

@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.signals.low_pass import low_pass
-from dvrk_drake.analysis.static.static_identification import LEAST_POSES, average_repeated_poses
+from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_repeated_poses
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import LEAST_ROWS, LONGEST_PERIOD, Recording
+from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_ROWS, Recording
 
 #: Cut-off of the zero-phase low-pass for speeds [Hz], at most half the rate of a motion, and its order.
 CUT_OFF, ORDER = 10.0, 4
 #: At rest: all joints slower than this [rad/s], [m/s], for this long [s], and within this of its begin [rad], [m].
-SLOWEST, LEAST_REST, SAME_REST = (0.02, 0.002), 0.3, (0.01, 0.001)
+MAX_REST_SPEED, MIN_REST, SAME_REST = (0.02, 0.002), 0.3, (0.01, 0.001)
 
 
-def rest_poses(recording: Recording, arm: Arm) -> Recording | None:
+def static_poses(recording: Recording, arm: Arm) -> Recording | None:
     """One row for each pose at which the arm rests for 0.3 s: means over the later half, when it has settled.
 
     Rests at one pose are averaged. A gap in the times ends a rest: nobody knows what the arm did meanwhile.
@@ -43,9 +43,9 @@ def rest_poses(recording: Recording, arm: Arm) -> Recording | None:
         return None
     tau = moving.measured_effort()
     v = smooth_velocity(moving)
-    still = np.all(np.abs(v) < arm.per_joint(*SLOWEST), axis=1)
-    still &= np.diff(t, append=t[-1]) < LONGEST_PERIOD
-    least = round(LEAST_REST / float(np.median(np.diff(t))))
+    still = np.all(np.abs(v) < arm.per_joint(*MAX_REST_SPEED), axis=1)
+    still &= np.diff(t, append=t[-1]) < MAX_PERIOD
+    least = round(MIN_REST / float(np.median(np.diff(t))))
     runs = list(stationary_runs(still, moving.q, arm.per_joint(*SAME_REST), least))
     later = [run[len(run) // 2 :] for run in runs]
     rests = replace(
@@ -88,15 +88,15 @@ def stationary_runs(
 #: Slow: below this share of the joint's top speed, and of its top acceleration.
 SLOW_SPEED, SLOW_ACCELERATION = 0.1, 0.2
 #: Rows closer than this are averaged [s].
-LEAST_PERIOD = 0.005
+MIN_PERIOD = 0.005
 #: Fewest consecutive samples that make a slow part.
-LEAST_SAMPLES = 3
+MIN_SAMPLES = 3
 #: A slow part ends where any joint is further than this from where it began [rad], [m]; those of one joint whose poses
 #: agree this well are repetitions of one.
 SAME_PART = 0.05, 0.005
 
 
-class SlowParts(NamedTuple):
+class LowSpeedSegments(NamedTuple):
     """Slow parts of a motion, one row each.
 
     Attributes:
@@ -108,12 +108,12 @@ class SlowParts(NamedTuple):
     measured: NDArray[np.bool_]
 
 
-def slow_parts(recording: Recording, arm: Arm) -> SlowParts:
+def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
     """Finds them, joint by joint, and averages each with its repetitions.
 
     While other joints still move, their velocities and accelerations leave a little inertial torque in it; and dry
     friction stays in it, of either sign. Both are errors here: a motion wants dynamic identification, or rests of the
-    whole arm (`rest_poses`).
+    whole arm (`static_poses`).
 
     Raises:
         RecordingError: no efforts, or another arm's.
@@ -125,7 +125,7 @@ def slow_parts(recording: Recording, arm: Arm) -> SlowParts:
     if moving.qd is None or not (moving.is_motion and moving.has_increasing_times):
         raise IdentificationError(
             f"{where}: slow parts need a motion: qd1..qd{arm.num_joints}, and t that increases by less than "
-            f"{LONGEST_PERIOD} s, over {LEAST_ROWS} rows or more"
+            f"{MAX_PERIOD} s, over {MIN_ROWS} rows or more"
         )
     moving = _thinned(moving)
     tau, t = moving.measured_effort(), np.asarray(moving.t)
@@ -133,7 +133,7 @@ def slow_parts(recording: Recording, arm: Arm) -> SlowParts:
     vd = np.gradient(v, t, axis=0)
     # The 99 % quantile, not the maximum: one spike must not make everything else slow.
     is_slow = np.abs(v) < SLOW_SPEED * np.quantile(np.abs(v), 0.99, axis=0)
-    is_slow &= np.diff(t, append=t[-1])[:, None] < LONGEST_PERIOD
+    is_slow &= np.diff(t, append=t[-1])[:, None] < MAX_PERIOD
     is_slow &= np.abs(vd) < SLOW_ACCELERATION * np.quantile(np.abs(vd), 0.99, axis=0)
     parts = [
         (joint, rows) for joint in range(arm.num_joints) for rows in _parts_of(is_slow[:, joint], joint, moving, arm)
@@ -153,7 +153,7 @@ def slow_parts(recording: Recording, arm: Arm) -> SlowParts:
         t=None,
         lines=None if moving.lines is None else moving.lines[[rows[0] for _, rows in parts]],
     )
-    return SlowParts(means, measured)
+    return LowSpeedSegments(means, measured)
 
 
 def _thinned(recording: Recording) -> Recording:
@@ -161,7 +161,7 @@ def _thinned(recording: Recording) -> Recording:
     t, qd, tau = recording.t, recording.qd, recording.measured_effort()
     if t is None or qd is None:
         return recording
-    size = int(LEAST_PERIOD / float(np.median(np.diff(t))) + 1e-6)
+    size = int(MIN_PERIOD / float(np.median(np.diff(t))) + 1e-6)
     if size < 2:
         return recording
     blocks = len(t) // size
@@ -196,7 +196,7 @@ def _parts_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Ar
     same = arm.per_joint(*SAME_PART)
     parts: list[NDArray[np.int_]] = []
     means = np.empty((0, arm.num_joints))
-    for run in _longest_of_each_pass(stationary_runs(is_slow, moving.q, same, LEAST_SAMPLES)):
+    for run in _longest_of_each_pass(stationary_runs(is_slow, moving.q, same, MIN_SAMPLES)):
         q = moving.q[run].mean(axis=0)
         alike = np.flatnonzero(np.all(np.abs(means - q) < same, axis=1))
         if len(alike):
@@ -210,7 +210,7 @@ def _parts_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Ar
 
 
 #: What must be said where slow parts are used.
-SLOW_PARTS_NOTE = (
+LOW_SPEED_NOTE = (
     "where a joint is slow is taken for a pose of it; friction stays in its torque, and other joints may move: trust "
     "the ten-fold errors, and another day's recording, not the fit"
 )
@@ -232,13 +232,13 @@ class Poses(NamedTuple):
     moves: bool = False
 
 
-def find_poses(recording: Recording, arm: Arm, take_slow_parts: bool = False) -> Poses:
-    """The rests of a motion if there are `LEAST_POSES`, else its slow parts if wanted, else the recording as it is.
+def find_poses(recording: Recording, arm: Arm, with_low_speed_segments: bool = False) -> Poses:
+    """The rests of a motion if there are `MIN_POSES`, else its slow parts if wanted, else the recording as it is.
 
     Args:
         recording: poses or a motion, in either coordinates.
         arm: which was recorded.
-        take_slow_parts: of a motion without enough rests, see `slow_parts`.
+        with_low_speed_segments: of a motion without enough rests, see `low_speed_segments`.
 
     Raises:
         RecordingError: the recording does not fit the arm, has no efforts, or is a motion whose times go back.
@@ -246,18 +246,18 @@ def find_poses(recording: Recording, arm: Arm, take_slow_parts: bool = False) ->
     """
     recording.check_fits(arm)
     _check_times(recording, arm)
-    rests = rest_poses(recording, arm)
-    if rests is not None and len(rests) >= LEAST_POSES:
+    rests = static_poses(recording, arm)
+    if rests is not None and len(rests) >= MIN_POSES:
         return Poses(rests, None, f"{len(rests)} poses at which the arm rests are taken; {len(recording)} rows")
-    if take_slow_parts:
-        return Poses(*slow_parts(recording, arm), note=SLOW_PARTS_NOTE)
+    if with_low_speed_segments:
+        return Poses(*low_speed_segments(recording, arm), note=LOW_SPEED_NOTE)
     return Poses(recording, None, "", moves=rests is not None and bool(recording.motion(arm)))
 
 
 def _check_times(recording: Recording, arm: Arm) -> None:
     """Refuses a motion whose times do not increase: it would be taken for poses."""
     t = recording.t
-    if t is None or len(t) < LEAST_ROWS or recording.has_increasing_times:
+    if t is None or len(t) < MIN_ROWS or recording.has_increasing_times:
         return
     if recording.is_motion or recording.motion(arm):
         row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1

@@ -19,7 +19,7 @@ CUT_OFF = 10.0
 #: A channel agrees if its gain is this close to 1, and its lag below this [s].
 GAIN_TOLERANCE, LAG_TOLERANCE = 0.03, 0.004
 #: Below this RMS speed nothing can be said [rad/s, m/s].
-LEAST_SPEED = 1e-3
+MIN_SPEED = 1e-3
 #: Left out at each end, where filters swing in [s]; at most a tenth of the motion.
 ENDS = 0.5
 _FIT_ITERATIONS = 5
@@ -59,9 +59,9 @@ def velocity_agreement(q: NDArray[np.float64], qd: NDArray[np.float64], rate: fl
 def _fit(v: NDArray[np.float64], qd: NDArray[np.float64], inner: slice) -> tuple[float, float, float]:
     """Gain, lag [samples] and mismatch: Gauss-Newton from no lag."""
     size = float(np.sqrt(np.mean(qd[inner] ** 2)))
-    if float(np.sqrt(np.mean(v[inner] ** 2))) < LEAST_SPEED:
+    if float(np.sqrt(np.mean(v[inner] ** 2))) < MIN_SPEED:
         return np.nan, np.nan, np.nan
-    if size < LEAST_SPEED:
+    if size < MIN_SPEED:
         return 0.0, 0.0, 1.0
     index = np.arange(len(v), dtype=float)
     gain, lag = 1.0, 0.0
@@ -79,13 +79,13 @@ def _fit(v: NDArray[np.float64], qd: NDArray[np.float64], inner: slice) -> tuple
 #: Two values closer than this share of their channel's RMS are the same: coordinates may have been converted.
 SAME_VALUE = 1e-9
 #: Fewest rows, and fewest joints whose qd agrees with dq/dt, that tell a time.
-LEAST_ROWS, LEAST_JOINTS = 100, 2
+MIN_ROWS, MIN_JOINTS = 100, 2
 #: The recorded times are kept unless they leave this many times the variance that made ones leave.
 WORSE = 3.0
 #: Slower than this the recorded times are right [Hz].
 DRIFT = 0.3
 #: Shortest interval between two different rows, as a share of the mean.
-SHORTEST = 0.02
+MIN_LENGTH = 0.02
 _ITERATIONS = 8
 
 
@@ -123,7 +123,7 @@ def true_time(recording: Recording) -> TrueTime:
     t = increasing_times(recording)
     rows = np.flatnonzero(~repeated_rows(recording))
     own = t[rows]
-    if recording.qd is None or len(rows) < LEAST_ROWS:
+    if recording.qd is None or len(rows) < MIN_ROWS:
         return TrueTime(rows, own, 0.0, False)
     q, qd, mean = recording.q[rows], recording.qd[rows], float(np.mean(np.diff(own)))
     made = own
@@ -131,7 +131,7 @@ def true_time(recording: Recording) -> TrueTime:
     for _ in range(2):
         even = np.linspace(own[0], own[-1], len(own))
         agrees = velocity_agreement(resample(made, q, even), resample(made, qd, even), 1 / mean).agrees
-        if np.sum(agrees) < LEAST_JOINTS:
+        if np.sum(agrees) < MIN_JOINTS:
             return TrueTime(rows, own, 0.0, False)
         dq, mean_qd = np.diff(q[:, agrees], axis=0), ((qd[1:] + qd[:-1]) / 2)[:, agrees]
         intervals, noise = _intervals(dq, mean_qd, mean)
@@ -146,7 +146,7 @@ def _without_drift(own: NDArray[np.float64], made: NDArray[np.float64], mean: fl
     """The made times that keep to the recorded ones on the whole: an error of qd of a percent makes a drift of ms."""
     lead = made - own
     intervals = np.diff(own + lead - low_pass(lead, 1 / mean, DRIFT))
-    return own[0] + np.concatenate([[0.0], np.cumsum(np.maximum(intervals, SHORTEST * mean))])
+    return own[0] + np.concatenate([[0.0], np.cumsum(np.maximum(intervals, MIN_LENGTH * mean))])
 
 
 def repeated_rows(recording: Recording) -> NDArray[np.bool_]:
@@ -194,7 +194,7 @@ def _intervals(
         # Expectation and maximisation: what is uncertain of an interval belongs to both variances.
         noise = np.mean((dq - qd * intervals[:, None]) ** 2 + qd**2 / precision[:, None], axis=0) + tiny
         spread = float(np.mean((intervals - mean) ** 2 + 1 / precision))
-    return np.maximum(intervals, SHORTEST * mean), noise
+    return np.maximum(intervals, MIN_LENGTH * mean), noise
 
 
 def _left(

@@ -31,19 +31,19 @@ EFFECT_PRIOR = {"offset": 0.03, "cable sine": 0.3, "cable cosine": 0.3, "spring"
 #: Least standard deviation of a torque measurement, as a share of the effort limit.
 SIGMA_FLOOR = 2e-3
 #: An effect must lower the sum of squared left-out residuals (in sigma) by this much a coefficient: about log(poses).
-LEAST_GAIN = 4.0
+MIN_GAIN = 4.0
 #: And by this many of its own standard errors over poses.
-LEAST_SIGNIFICANCE = 1.5
+MIN_SIGNIFICANCE = 1.5
 #: A cable or spring is considered if its coordinate moved by this much [rad]: less, and a sine or spring would fit the
 #: servo's error, a cosine be an offset.
-LEAST_SPAN = {"cable sine": 0.25, "cable cosine": 1.5, "spring": 0.25}
+MIN_SPAN = {"cable sine": 0.25, "cable cosine": 1.5, "spring": 0.25}
 
 
 class StaticProblem:
     """The regression of one recording's torques on base parameters and any choice of effects."""
 
     def __init__(self, arm: Arm, q: NDArray[np.float64], tau: NDArray[np.float64], usable: NDArray[np.bool_]):
-        """Of poses q (m, n) and torques tau (m, n) with `usable` (m, n) False where a measurement is doubted."""
+        """Of poses q (m, n) and torques tau (m, n) with `usable` (m, n) False where a measurement is excluded."""
         from dvrk_drake.dynamics.static_model import compile_static_model  # sympy takes 0.3 s, and motions need none
 
         self.arm, self.q, self.tau, self.usable = arm, q, tau, usable
@@ -99,7 +99,7 @@ def _known_spring(problem: StaticProblem, joint: str) -> list[ActuatorEffect]:
     if "spring" not in problem.arm.identification.known_effects.get(name, []):
         return []
     x = position_along(problem.arm, name, problem.q)
-    return [spring_over(name, x)] if np.ptp(x) >= LEAST_SPAN["spring"] else []
+    return [spring_over(name, x)] if np.ptp(x) >= MIN_SPAN["spring"] else []
 
 
 def _cables(problem: StaticProblem, coordinate: str) -> list[ActuatorEffect]:
@@ -107,13 +107,13 @@ def _cables(problem: StaticProblem, coordinate: str) -> list[ActuatorEffect]:
         return []
     span = np.ptp(position_along(problem.arm, coordinate, problem.q))
     kinds = ("cable sine", "cable cosine")
-    return [ActuatorEffect(coordinate, kind, 1.0) for kind in kinds if span >= LEAST_SPAN[kind]]
+    return [ActuatorEffect(coordinate, kind, 1.0) for kind in kinds if span >= MIN_SPAN[kind]]
 
 
 def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
     """Adds the effect (or all of one joint's) that lowers the leave-one-out error most, until none clearly does.
 
-    "Clearly": by more than `LEAST_GAIN` per coefficient and by more than 1.5 of the gain's own standard errors over
+    "Clearly": by more than `MIN_GAIN` per coefficient and by more than 1.5 of the gain's own standard errors over
     poses. Squared errors are capped at nine variances so that no single pose decides.
     """
     chosen: tuple[ActuatorEffect, ...] = ()
@@ -130,9 +130,7 @@ def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
                 trial = problem.fit((*chosen, *candidate), iterations=3, start=current.sigma)
                 gains = loss - _loss(problem, trial, current.sigma)
                 gain = gains.sum()
-                clear = gain > LEAST_SIGNIFICANCE * gains.std() * np.sqrt(len(gains)) and gain > LEAST_GAIN * len(
-                    candidate
-                )
+                clear = gain > MIN_SIGNIFICANCE * gains.std() * np.sqrt(len(gains)) and gain > MIN_GAIN * len(candidate)
                 if clear and gain > best_gain:
                     best_gain, best = gain, candidate
         if not best:
@@ -150,7 +148,7 @@ def _says_the_same(effect: ActuatorEffect, chosen: Sequence[ActuatorEffect]) -> 
 
 def _loss(problem: StaticProblem, fit: RobustFit, sigma: NDArray[np.float64]) -> NDArray[np.float64]:
     """(m,) capped squared leave-one-out error of each pose in units of sigma."""
-    return (np.minimum((fit.fit.left_out_residuals / sigma) ** 2, 9.0) * problem.usable).sum(axis=1)
+    return (np.minimum((fit.fit.leave_one_out_residuals / sigma) ** 2, 9.0) * problem.usable).sum(axis=1)
 
 
 @cache

@@ -19,13 +19,13 @@ class LinearFit:
         theta: (p,).
         covariance: (p, p) of theta, for unit variance of the weighted residuals.
         residuals: (m, n) measured minus fitted, of every measurement, also those with no weight.
-        left_out_residuals: (m, n) measured minus what a fit to all other poses predicts.
+        leave_one_out_residuals: (m, n) measured minus what a fit to all other poses predicts.
     """
 
     theta: NDArray[np.float64]
     covariance: NDArray[np.float64]
     residuals: NDArray[np.float64]
-    left_out_residuals: NDArray[np.float64]
+    leave_one_out_residuals: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -95,17 +95,17 @@ def robust_fit(
         start: (n,) standard deviations to start from; by default the spread of tau itself.
     """
     sigma = np.maximum(_spread(tau, usable) if start is None else start, sigma_floor)
-    trusted = usable.astype(float)
-    fit = weighted_fit(X, tau, trusted / sigma**2, prior_precision)
+    weights = usable.astype(float)
+    fit = weighted_fit(X, tau, weights / sigma**2, prior_precision)
     for _ in range(iterations):
         scale = np.maximum(_spread(fit.residuals, usable), sigma_floor)
         u = np.abs(fit.residuals) / scale
         huber = np.where(u <= HUBER_LIMIT, 1.0, HUBER_LIMIT / np.maximum(u, HUBER_LIMIT))
-        trusted = usable * np.where(u <= REJECTION_LIMIT, huber, 0.0)
-        squares = (trusted * fit.residuals**2).sum(axis=0) / np.maximum(trusted.sum(axis=0), 1.0)
+        weights = usable * np.where(u <= REJECTION_LIMIT, huber, 0.0)
+        squares = (weights * fit.residuals**2).sum(axis=0) / np.maximum(weights.sum(axis=0), 1.0)
         sigma = np.maximum(np.sqrt(squares), sigma_floor)
-        fit = weighted_fit(X, tau, trusted / sigma**2, prior_precision)
-    return RobustFit(fit, sigma, usable & (trusted == 0.0))
+        fit = weighted_fit(X, tau, weights / sigma**2, prior_precision)
+    return RobustFit(fit, sigma, usable & (weights == 0.0))
 
 
 def rms(values: NDArray[np.float64]) -> float:

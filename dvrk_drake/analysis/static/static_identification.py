@@ -11,8 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.results import Identification
-from dvrk_drake.analysis.static.doubts import Doubt, check_effort_unit, find_doubts, outlier_doubts, usable_measurements
 from dvrk_drake.analysis.static.effect_selection import StaticProblem, select_effects
+from dvrk_drake.analysis.static.excluded_measurements import (
+    ExcludedMeasurement,
+    check_effort_unit,
+    exclude_outliers,
+    find_excluded,
+    usable_measurements,
+)
 from dvrk_drake.analysis.static.linear_fit import LinearFit, rms, weighted_fit
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import (
@@ -29,16 +35,16 @@ from dvrk_drake.recordings.recording import REST_SPEED, SAME_POSE, Recording
 Method = Literal["robust", "paper"]
 
 #: Fewest distinct poses that are accepted.
-LEAST_POSES = 8
+MIN_POSES = 8
 #: A joint whose measured torque stays below this share of its effort limit says nothing about its model, unless
 #: leave-one-out explains most of it: less than the second share of it is left.
-LEAST_TORQUE, CLEAR_GAIN_RATIO = 0.02, 0.5
+MIN_TORQUE, CLEAR_GAIN_RATIO = 0.02, 0.5
 #: Nor does one that moved by less than this share of its range: its torque elsewhere would be a guess.
-LEAST_MOTION = 0.02
+MIN_MOTION = 0.02
 #: The same for low-speed segments of a motion: over less, friction has the same direction in all of them.
-LEAST_SEGMENT_MOTION = 0.05
+MIN_SEGMENT_MOTION = 0.05
 #: Leave-one-out must lower the RMS error to this share of zero torque's, or the joint's torque is scaled down.
-LEAST_GAIN_RATIO = 0.98
+MIN_GAIN_RATIO = 0.98
 FOLDS = 10
 
 
@@ -47,15 +53,15 @@ class StaticIdentification(Identification):
     """A model identified from poses.
 
     Attributes:
-        doubts: measurements that were left out, and why.
+        excluded: measurements that were left out, and why.
         residuals: (m, n) measured minus fitted efforts [N m; N].
-        left_out_residuals: (m, n) the same for poses predicted from all others.
+        leave_one_out_residuals: (m, n) the same for poses predicted from all others.
         measured: (m, n) False where an effort is no holding torque.
     """
 
-    doubts: list[Doubt]
+    excluded: list[ExcludedMeasurement]
     residuals: NDArray[np.float64]
-    left_out_residuals: NDArray[np.float64]
+    leave_one_out_residuals: NDArray[np.float64]
     measured: NDArray[np.bool_]
 
 
@@ -79,7 +85,7 @@ def identify_static(
         arm: the arm it was recorded on.
         method: see above.
         progress: called with the finished share, 0..1.
-        measured: (m, n) False where an effort is no holding torque, as `slow_parts` gives it; by default all are.
+        measured: (m, n) False where an effort is no holding torque, as `low_speed_segments` gives it; by default all are.
 
     Raises:
         RecordingError: the recording does not fit the arm or has no efforts.
@@ -95,12 +101,12 @@ def identify_static(
     Y = gravity_model.regressor(recording.q)
     stacked = Y.reshape(-1, Y.shape[2]) if measured is None else Y[measured]
     rank = int(np.linalg.matrix_rank(stacked, tol=1e-9 * np.linalg.norm(stacked, 2)))
-    doubts = find_doubts(recording, arm, measured)
+    excluded = find_excluded(recording, arm, measured)
     if measured is None:
         measured = np.ones(tau.shape, dtype=bool)
-    usable = usable_measurements(tau.shape, doubts) & measured
+    usable = usable_measurements(tau.shape, excluded) & measured
     effects: tuple[ActuatorEffect, ...] = ()
-    trust = np.ones(arm.num_joints)
+    feedforward_scale = np.ones(arm.num_joints)
     validated = np.full_like(tau, np.nan)
     if method == "paper":
         if rank < Y.shape[2]:
@@ -111,7 +117,7 @@ def identify_static(
         fit = weighted_fit(Y, tau, measured.astype(float), np.zeros(Y.shape[2]))
         # Unit weights: the covariance takes its scale from the residuals, as the textbook does.
         variance = np.sum(fit.residuals[measured] ** 2) / (np.sum(measured) - Y.shape[2])
-        validated, sd = fit.left_out_residuals, np.sqrt(variance * np.diag(fit.covariance))
+        validated, sd = fit.leave_one_out_residuals, np.sqrt(variance * np.diag(fit.covariance))
     else:
         problem = StaticProblem(arm, recording.q, tau, usable)
         progress(0.0)
@@ -119,13 +125,13 @@ def identify_static(
         progress(1 / (FOLDS + 1))
         robust = problem.fit(effects)
         fit, sd = robust.fit, np.sqrt(np.diag(robust.fit.covariance))
-        doubts = doubts + outlier_doubts(recording, arm, robust.outliers, fit.residuals)
+        excluded = excluded + exclude_outliers(recording, arm, robust.outliers, fit.residuals)
         usable = usable & ~robust.outliers
-        trust = _trust(problem, fit.left_out_residuals, usable)
+        feedforward_scale = _feedforward_scales(problem, fit.leave_one_out_residuals, usable)
         validated = _cross_validate(problem, progress)
         if not np.all(measured):
-            trust = np.where(_segments_support(problem, validated, usable), trust, 0.0)
-    fit = _scaled(fit, tau, trust)
+            feedforward_scale = np.where(_segments_support(problem, validated, usable), feedforward_scale, 0.0)
+    fit = _scaled(fit, tau, feedforward_scale)
     model = IdentifiedModel(
         arm=arm,
         base_parameters=[
@@ -136,7 +142,7 @@ def identify_static(
             DriveEffect(effect.coordinate, effect.kind, effect.scale, float(value), standard_error=float(error))
             for effect, value, error in zip(effects, fit.theta[Y.shape[2] :], sd[Y.shape[2] :], strict=True)
         ],
-        joints=_statistics(recording, arm, fit, validated, measured, usable, trust),
+        joints=_statistics(recording, arm, fit, validated, measured, usable, feedforward_scale),
         provenance=Provenance(
             recording=recording.source,
             sha256=recording.sha256,
@@ -150,9 +156,9 @@ def identify_static(
     return StaticIdentification(
         model=model,
         recording=recording,
-        doubts=doubts,
+        excluded=excluded,
         residuals=fit.residuals,
-        left_out_residuals=fit.left_out_residuals,
+        leave_one_out_residuals=fit.leave_one_out_residuals,
         measured=measured,
     )
 
@@ -201,35 +207,37 @@ def _check_rest(recording: Recording, arm: Arm) -> None:
     if motion := recording.motion(arm):
         raise IdentificationError(
             f"{recording.source}: the arm moves ({motion}); static identification needs poses at rest, below "
-            f"{REST_SPEED[0]} rad/s, or the slow parts of a motion (--slow-parts)"
+            f"{REST_SPEED[0]} rad/s, or the slow parts of a motion (--low-speed-segments)"
         )
 
 
 def _check_poses(recording: Recording, arm: Arm) -> None:
-    if len(recording) < LEAST_POSES:
+    if len(recording) < MIN_POSES:
         raise IdentificationError(
             f"{recording.source}: has {len(recording)} distinct pose{'s' * (len(recording) != 1)}, too few to identify "
-            f"from; at least {LEAST_POSES}, better 40 or more that cover the arm's range"
+            f"from; at least {MIN_POSES}, better 40 or more that cover the arm's range"
         )
     check_effort_unit(recording, arm)
 
 
-def _trust(problem: StaticProblem, left_out: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _feedforward_scales(
+    problem: StaticProblem, left_out: NDArray[np.float64], usable: NDArray[np.bool_]
+) -> NDArray[np.float64]:
     """(n,) scale of each joint's torque that leave-one-out supports: 1 unless it is no better than zero torque."""
     arm = problem.arm
-    least_motion = LEAST_MOTION * (arm.position_upper - arm.position_lower)
-    trust = np.ones(arm.num_joints)
+    least_motion = MIN_MOTION * (arm.position_upper - arm.position_lower)
+    feedforward_scale = np.ones(arm.num_joints)
     for j in range(arm.num_joints):
         use = usable[:, j]
         measured, predicted = problem.tau[use, j], (problem.tau - left_out)[use, j]
         ratio = rms(measured - predicted) / max(rms(measured), 1e-12)
-        small = rms(measured) < LEAST_TORQUE * arm.effort_limits[j]
+        small = rms(measured) < MIN_TORQUE * arm.effort_limits[j]
         if not np.any(use) or np.ptp(problem.q[use, j]) <= least_motion[j] or (small and ratio > CLEAR_GAIN_RATIO):
-            trust[j] = 0.0
-        elif ratio > LEAST_GAIN_RATIO:
+            feedforward_scale[j] = 0.0
+        elif ratio > MIN_GAIN_RATIO:
             power = np.sum(predicted**2)
-            trust[j] = float(np.clip(measured @ predicted / power, 0.0, 1.0)) if power > 0 else 1.0
-    return trust
+            feedforward_scale[j] = float(np.clip(measured @ predicted / power, 0.0, 1.0)) if power > 0 else 1.0
+    return feedforward_scale
 
 
 def _segments_support(
@@ -238,20 +246,20 @@ def _segments_support(
     """Returns (n,) whether low-speed segments of a motion support a torque on each joint.
 
     Few segments or a short travel cannot separate gravity from friction, which leave-one-out does not show: the
-    left-out segment and its neighbours have the same friction. A joint needs `LEAST_POSES` segments over
-    `LEAST_SEGMENT_MOTION` of its range, and a cross-validated error below that of zero torque.
+    left-out segment and its neighbours have the same friction. A joint needs `MIN_POSES` segments over
+    `MIN_SEGMENT_MOTION` of its range, and a cross-validated error below that of zero torque.
     """
     arm = problem.arm
     supported = np.zeros(arm.num_joints, dtype=bool)
-    for j, travel in enumerate(LEAST_SEGMENT_MOTION * (arm.position_upper - arm.position_lower)):
+    for j, travel in enumerate(MIN_SEGMENT_MOTION * (arm.position_upper - arm.position_lower)):
         use = usable[:, j]
-        if np.sum(use) >= LEAST_POSES and np.ptp(problem.q[use, j]) >= travel:
-            supported[j] = rms(validated[use, j]) < LEAST_GAIN_RATIO * rms(problem.tau[use, j])
+        if np.sum(use) >= MIN_POSES and np.ptp(problem.q[use, j]) >= travel:
+            supported[j] = rms(validated[use, j]) < MIN_GAIN_RATIO * rms(problem.tau[use, j])
     return supported
 
 
 def _cross_validate(problem: StaticProblem, progress: Callable[[float], object]) -> NDArray[np.float64]:
-    """(m, n) residuals of ten-fold cross-validation, effects and trust chosen anew in every fold."""
+    """(m, n) residuals of ten-fold cross-validation, effects and feedforward_scale chosen anew in every fold."""
     poses = len(problem.q)
     folds = np.random.default_rng(0).permutation(poses) % min(FOLDS, poses)
     residuals = np.empty_like(problem.tau)
@@ -259,20 +267,22 @@ def _cross_validate(problem: StaticProblem, progress: Callable[[float], object])
         rest = problem.subset(folds != fold)
         effects = select_effects(rest)
         robust = rest.fit(effects)
-        trust = _trust(rest, robust.fit.left_out_residuals, rest.usable & ~robust.outliers)
+        feedforward_scale = _feedforward_scales(
+            rest, robust.fit.leave_one_out_residuals, rest.usable & ~robust.outliers
+        )
         out = problem.subset(folds == fold)
-        residuals[folds == fold] = out.tau - trust * (out.regressor(effects) @ robust.fit.theta)
+        residuals[folds == fold] = out.tau - feedforward_scale * (out.regressor(effects) @ robust.fit.theta)
         progress((fold + 2) / (FOLDS + 1))
     return residuals
 
 
-def _scaled(fit: LinearFit, tau: NDArray[np.float64], trust: NDArray[np.float64]) -> LinearFit:
-    """The fit's residuals with each joint's prediction scaled by its trust."""
+def _scaled(fit: LinearFit, tau: NDArray[np.float64], feedforward_scale: NDArray[np.float64]) -> LinearFit:
+    """The fit's residuals with each joint's prediction scaled by its feedforward_scale."""
     return LinearFit(
         fit.theta,
         fit.covariance,
-        tau - trust * (tau - fit.residuals),
-        tau - trust * (tau - fit.left_out_residuals),
+        tau - feedforward_scale * (tau - fit.residuals),
+        tau - feedforward_scale * (tau - fit.leave_one_out_residuals),
     )
 
 
@@ -283,7 +293,7 @@ def _statistics(
     validated: NDArray[np.float64],
     measured: NDArray[np.bool_],
     usable: NDArray[np.bool_],
-    trust: NDArray[np.float64],
+    feedforward_scale: NDArray[np.float64],
 ) -> list[JointStatistics]:
     tau = recording.measured_effort()
     statistics = []
@@ -295,13 +305,13 @@ def _statistics(
                 name=name,
                 rms_zero_torque=rms(tau[every, j]),
                 rms_fit=rms(fit.residuals[every, j]),
-                rms_leave_one_out=rms(fit.left_out_residuals[every, j]),
-                rms_zero_torque_undoubted=rms(tau[use, j]),
-                rms_fit_undoubted=rms(fit.residuals[use, j]),
-                rms_leave_one_out_undoubted=rms(fit.left_out_residuals[use, j]),
-                rms_cross_validation_undoubted=rms(validated[use, j]),
-                num_doubted=int(np.sum(every & ~use)),
-                trust=float(trust[j]),
+                rms_leave_one_out=rms(fit.leave_one_out_residuals[every, j]),
+                rms_zero_torque_included=rms(tau[use, j]),
+                rms_fit_included=rms(fit.residuals[use, j]),
+                rms_leave_one_out_included=rms(fit.leave_one_out_residuals[use, j]),
+                rms_cross_validation_included=rms(validated[use, j]),
+                num_excluded=int(np.sum(every & ~use)),
+                feedforward_scale=float(feedforward_scale[j]),
                 position_lower=float(lower),
                 position_upper=float(upper),
                 coverage=float((upper - lower) / (arm.position_upper[j] - arm.position_lower[j])),

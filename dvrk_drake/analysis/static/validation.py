@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.results import Validation
-from dvrk_drake.analysis.static.doubts import Doubt, check_effort_unit, find_doubts, usable_measurements
+from dvrk_drake.analysis.static.excluded_measurements import (
+    ExcludedMeasurement,
+    check_effort_unit,
+    find_excluded,
+    usable_measurements,
+)
 from dvrk_drake.analysis.static.linear_fit import rms
 from dvrk_drake.analysis.verdict import judge, rule_text
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
@@ -21,8 +26,8 @@ class JointError:
     """One joint's error over a recording: RMS in N m (N if prismatic) in the coordinates that the recording is in.
 
     `rms_torque` is what commanding zero torque would err by; `relative_error` = rms_error / rms_torque, None where
-    nothing was measured. `_undoubted`
-    leaves out `num_doubted` measurements of poses that rest on a stop or exceed the effort limit. `verdict` judges what
+    nothing was measured. `_included`
+    leaves out `num_excluded` measurements of poses that rest on a stop or exceed the effort limit. `verdict` judges what
     is left, see `judge`.
     """
 
@@ -30,10 +35,10 @@ class JointError:
     rms_torque: float
     rms_error: float
     relative_error: float | None
-    rms_torque_undoubted: float
-    rms_error_undoubted: float
-    relative_error_undoubted: float | None
-    num_doubted: int
+    rms_torque_included: float
+    rms_error_included: float
+    relative_error_included: float | None
+    num_excluded: int
     verdict: Verdict
 
 
@@ -45,14 +50,14 @@ class StaticValidation(Validation):
         joints: in the arm's order.
         poses: their number.
         residuals: (m, n) measured minus predicted efforts, in the recording's coordinates [N m; N].
-        doubts: measurements that the verdicts leave out, and why.
+        excluded: measurements that the verdicts leave out, and why.
         measured: (m, n) False where an effort is no holding torque.
     """
 
     joints: list[JointError]
     poses: int
     residuals: NDArray[np.float64]
-    doubts: list[Doubt]
+    excluded: list[ExcludedMeasurement]
     measured: NDArray[np.bool_]
 
     @property
@@ -63,7 +68,7 @@ class StaticValidation(Validation):
     @property
     def relative_errors(self) -> dict[str, float | None]:
         """RMS error / RMS effort of each joint, without outliers [1]; None where nothing was measured."""
-        return {joint.name: joint.relative_error_undoubted for joint in self.joints}
+        return {joint.name: joint.relative_error_included for joint in self.joints}
 
     def as_dict(self) -> dict:
         """Returns what `validate --json` writes."""
@@ -72,7 +77,7 @@ class StaticValidation(Validation):
             "rule": rule_text(in_motion=False),
             "joints": [asdict(joint) for joint in self.joints],
             "poses": self.poses,
-            "doubted": [{"where": doubt.where, "reason": doubt.reason} for doubt in self.doubts],
+            "excluded": [{"where": measurement.where, "reason": measurement.reason} for measurement in self.excluded],
         }
 
 
@@ -99,7 +104,7 @@ def validate_static(
     Args:
         model: the model.
         recording: in either coordinates.
-        measured_joints: (m, n) False where an effort is no holding torque, as `slow_parts` gives it; default: all are.
+        measured_joints: (m, n) False where an effort is no holding torque, as `low_speed_segments` gives it; default: all are.
 
     Raises:
         RecordingError: the recording does not fit the model's arm, or has no efforts.
@@ -112,8 +117,8 @@ def validate_static(
     if measured_joints is None:
         measured_joints = np.ones(measured.shape, dtype=bool)
     check_effort_unit(in_joints, arm)
-    doubts = find_doubts(in_joints, arm, measured_joints)
-    usable = usable_measurements(measured.shape, doubts) & measured_joints
+    excluded = find_excluded(in_joints, arm, measured_joints)
+    usable = usable_measurements(measured.shape, excluded) & measured_joints
     if recording.coordinates == "actuator":
         # A doubt about a joint touches every actuator that drives it.
         usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
@@ -125,7 +130,7 @@ def validate_static(
         joints=errors,
         poses=len(recording),
         residuals=residuals,
-        doubts=doubts,
+        excluded=excluded,
         measured=measured_joints,
     )
 

@@ -35,7 +35,7 @@ POSES, FRESH_POSES = 40, 15
 #: Effort noise of one sample, as a share of the effort limit.
 EFFORT_NOISE = 0.01
 #: Farthest that the true centres of mass are from the model's along each axis [m].
-LARGEST_SHIFT = 0.002
+MAX_SHIFT = 0.002
 #: Release: pose held, then let go, then driven home; phases end at these times [s].
 HELD_UNTIL, RELEASED_UNTIL, HOME_UNTIL = 0.5, 4.5, 7.5
 STEP_DURATION = 4.0
@@ -110,7 +110,7 @@ class DemoResult:
         fresh_paper: errors of the paper's least squares at the same poses.
         release_time: (m,) [s].
         released: (m, n) positions of the release with the identified model [rad, m].
-        released_as_drawn: (m, n) the same with the model that the SDF states.
+        released_nominal: (m, n) the same with the model that the SDF states.
         drift: (n,) largest distance from the pose of the release, by model.
         step_time: (k,) [s].
         step: (k, n) positions of the step home [rad, m].
@@ -123,7 +123,7 @@ class DemoResult:
     fresh_paper: StaticValidation
     release_time: NDArray[np.float64]
     released: NDArray[np.float64]
-    released_as_drawn: NDArray[np.float64]
+    released_nominal: NDArray[np.float64]
     drift: dict[str, NDArray[np.float64]]
     step_time: NDArray[np.float64]
     step: NDArray[np.float64]
@@ -150,18 +150,18 @@ def run_demo(
     if arm_name not in PLANS:
         raise ArmError(f'the demo has no plan for "{arm_name}"; it has for {", ".join(PLANS)}')
     with TemporaryDirectory() as folder:
-        return _run_demo(output, Path(folder) / "true_arm.sdf", arm_name, seed, progress)
+        return _run_demo(output, Path(folder) / "ground_truth_arm.sdf", arm_name, seed, progress)
 
 
 def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: Progress) -> DemoResult:
     generator = np.random.default_rng(seed)
     arm, plan = load_arm(arm_name), PLANS[arm_name]
     nominal = IdentifiedModel.from_arm(arm)
-    links = perturbed_links(arm, generator, shift=LARGEST_SHIFT)
-    true_arm = with_links(arm, links, true_sdf, "no arm: drawn at random")
+    links = perturbed_links(arm, generator, shift=MAX_SHIFT)
+    ground_truth_arm = with_links(arm, links, true_sdf, "no arm: drawn at random")
 
     def station(meshcat: Meshcat | None = None) -> ArmStation:
-        return damped_station(arm, true_arm, ArmEffects(cables=list(plan.effects)), plan.closure, meshcat)
+        return damped_station(arm, ground_truth_arm, ArmEffects(cables=list(plan.effects)), plan.closure, meshcat)
 
     def collect(count: int, what: str) -> Recording:
         poses = arm.sample_poses(count, generator, margin=0.1)

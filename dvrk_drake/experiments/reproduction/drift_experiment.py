@@ -40,7 +40,7 @@ class Release:
 
     Attributes:
         arm: name of the arm that the controller knows.
-        true_arm: what is simulated.
+        ground_truth_arm: what is simulated.
         parts: of the true arm's effects that it has, as `ArmEffects.only` takes them.
         model: file of the controller's model.
         start: (n,) pose at which it rests when it is let go [rad, m], its friction unloaded.
@@ -52,7 +52,7 @@ class Release:
     """
 
     arm: str
-    true_arm: Arm
+    ground_truth_arm: Arm
     parts: tuple[str, ...]
     model: str
     start: NDArray[np.float64]
@@ -67,8 +67,8 @@ def release(case: Release) -> NDArray[np.float64]:
     """True positions (samples, n) every `SAMPLE_PERIOD` from the release on."""
     arm = load_arm(case.arm)
     name = arm.name.lower()
-    effects = case.true_arm.effects.only(case.parts)
-    station = ArmStation(arm, plant_arm=case.true_arm, effects=effects, seed=case.seed)
+    effects = case.ground_truth_arm.effects.only(case.parts)
+    station = ArmStation(arm, plant_arm=case.ground_truth_arm, effects=effects, seed=case.seed)
     builder = DiagramBuilder()
     way = _way(case, arm)
     controller = GravityPidController(_model(case.model), mode="hold" if case.led else _mode(case))

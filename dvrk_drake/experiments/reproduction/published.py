@@ -130,7 +130,9 @@ def paper_model(arm: Arm) -> IdentifiedModel:
 
 def with_zeroed(model: IdentifiedModel, joints: Sequence[int]) -> IdentifiedModel:
     """The model with no torque on `joints` (from 0), as the paper's Fig. 6 has it."""
-    statistics = [dataclasses.replace(s, trust=0.0) if j in joints else s for j, s in enumerate(model.joints)]
+    statistics = [
+        dataclasses.replace(s, feedforward_scale=0.0) if j in joints else s for j, s in enumerate(model.joints)
+    ]
     return dataclasses.replace(model, joints=statistics)
 
 

@@ -87,10 +87,10 @@ def simulate_paper_controller(
     return q
 
 
-def simulate_ours(true_arm: Arm, model: IdentifiedModel, duration: float) -> NDArray[np.float64]:
+def simulate_ours(ground_truth_arm: Arm, model: IdentifiedModel, duration: float) -> NDArray[np.float64]:
     """q (samples, n) every `PERIOD` under gravity compensation and PID, with all effects but the stops."""
     arm = load_arm(PAPER_ARM)
-    station = ArmStation(arm, plant_arm=true_arm, effects=true_arm.effects.without("stops"))
+    station = ArmStation(arm, plant_arm=ground_truth_arm, effects=ground_truth_arm.effects.without("stops"))
     builder = DiagramBuilder()
     controller = GravityPidController(model)
     add_closed_loop(builder, station, controller, ConstantVectorSource(np.zeros(2 * arm.num_joints)))

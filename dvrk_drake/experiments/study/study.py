@@ -103,25 +103,25 @@ def run_case(scenario: Scenario, measures: Sequence[Measure]) -> Row:
 
 
 #: How often a pool is made again whose worker was killed (by the system where memory ends, say).
-MOST_POOLS = 3
+MAX_POOLS = 3
 #: Google's allocator, as Debian's and Ubuntu's package libtcmalloc-minimal4 and Fedora's gperftools-libs install it.
 TCMALLOC = "libtcmalloc_minimal.so.4"
 #: How long a scheduler may take to answer, and to have its first worker [s].
-PATIENCE = 10
+TIMEOUT = 10
 
 
 def run_study_locally(study: Study, output: str | Path, workers: int | None, progress: Progress) -> dict[int, Row]:
     """As `run_study` on this computer; where a worker is killed, what it and its pool left is run by another pool.
 
     Raises:
-        StudyError: as `run_study`, or `MOST_POOLS` pools lost a worker.
+        StudyError: as `run_study`, or `MAX_POOLS` pools lost a worker.
     """
-    for pool in range(MOST_POOLS):
+    for pool in range(MAX_POOLS):
         try:
             with local_executor(workers) as executor:
                 return run_study(study, executor, output, progress)
         except StudyError as error:
-            if not isinstance(error.__cause__, BrokenExecutor) or pool == MOST_POOLS - 1:
+            if not isinstance(error.__cause__, BrokenExecutor) or pool == MAX_POOLS - 1:
                 raise
     raise AssertionError("unreachable")
 
@@ -194,12 +194,12 @@ def dask_executor(address: str) -> Iterator[Executor]:
     for logger in ("distributed", "distributed.client"):
         logging.getLogger(logger).setLevel(logging.CRITICAL)
     try:
-        client = Client(address, timeout=PATIENCE, set_as_default=False)
+        client = Client(address, timeout=TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise StudyError(f"{address}: no Dask scheduler answers there: {error}") from error
     with client:
         try:
-            client.wait_for_workers(1, timeout=PATIENCE)
+            client.wait_for_workers(1, timeout=TIMEOUT)
         except TimeoutError as error:
             raise StudyError(f"{address}: the scheduler has no workers; start some: dask worker {address}") from error
         _check_workers(client)

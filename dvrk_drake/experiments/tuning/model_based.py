@@ -28,7 +28,7 @@ GRAVITY_ERROR, INTEGRAL_SHARE = 0.2, 0.15
 #: Frequencies that are tried, the fastest first [rad/s].
 FREQUENCIES = np.geomspace(300.0, 1.0, 400)
 #: Poses of the joint box where the mass matrix is looked at, and of these where all joints are looked at together.
-POSES, TOGETHER = 200, 20
+POSES, MIN_CORRELATION = 200, 20
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class JointFacts:
     """What one joint's gains depend on [kg m^2, N m, rad; kg, N, m].
 
     Attributes:
-        inertia: the least that its motor can feel, all other joints free; and the largest, all others held.
+        inertia: the least at its motor, all other joints free; and the largest, all others held.
         dry_friction: what holds it at rest, at most.
         viscous: friction.
         gravity: the largest gravity torque on it.
@@ -104,7 +104,7 @@ def design_arm(arm: Arm) -> ArmDesign:
     slowed = np.ones(arm.num_joints)
     harder = Sampling(sampling.period, sampling.ticks + 1, sampling.cut_off)
     viscous = [fact.viscous for fact in facts]
-    loops = [SampledLoop(0.8 * M, harder, viscous) for M in masses[:: POSES // TOGETHER]]
+    loops = [SampledLoop(0.8 * M, harder, viscous) for M in masses[:: POSES // MIN_CORRELATION]]
     while np.min(slowed) > 0.1:
         gains = rounded_gains((joint.kp, joint.kd, joint.ki) for joint in joints)
         growth, shares = max((loop.least_damped_mode(gains) for loop in loops), key=lambda mode: mode[0])

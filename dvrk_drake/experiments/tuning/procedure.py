@@ -36,7 +36,7 @@ class Oscillation:
 #: Swings that are judged after the first: enough for 1 % of growth to show, few enough not to reach the stops.
 JUDGED = 8
 #: With fewer nothing is said: a joint that sticks after three swings does not oscillate.
-FEWEST = 3
+MIN_TURNING_POINTS = 3
 
 
 def judge_oscillation(t: NDArray[np.float64], x: NDArray[np.float64], threshold: float) -> Oscillation:
@@ -44,7 +44,7 @@ def judge_oscillation(t: NDArray[np.float64], x: NDArray[np.float64], threshold:
     turns = turning_points(x, threshold)[: JUDGED + 2]
     swings = np.abs(np.diff(x[turns]))
     judged = swings[1:]
-    if len(judged) < FEWEST:
+    if len(judged) < MIN_TURNING_POINTS:
         return Oscillation(len(swings), 0.0, np.inf)
     growth = (judged[-1] / judged[0]) ** (1.0 / (len(judged) - 1))
     half = np.diff(t[turns[1:]]).mean()

@@ -52,13 +52,13 @@ class StepMeasures:
             the last `REST`.
         overshoot: (n,) farthest beyond the goal, as a share of the step; 0 if it does not get there.
         steady_error: (n,) mean distance from the goal over the last `REST` [rad, m].
-        unrest: (n,) peak to peak of the commanded effort over the last `REST`, as a share of the effort limit.
+        oscillation: (n,) peak to peak of the commanded effort over the last `REST`, as a share of the effort limit.
     """
 
     settling: NDArray[np.float64]
     overshoot: NDArray[np.float64]
     steady_error: NDArray[np.float64]
-    unrest: NDArray[np.float64]
+    oscillation: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ def measure_step(arm: Arm, response: Response) -> StepMeasures:
         settling=np.where(settling > t[-1] - REST, np.inf, settling),
         overshoot=np.maximum(np.max(-error / way, axis=0), 0.0),
         steady_error=np.abs(error[late]).mean(axis=0),
-        unrest=np.ptp(response.effort[late], axis=0) / arm.effort_limits,
+        oscillation=np.ptp(response.effort[late], axis=0) / arm.effort_limits,
     )
 
 

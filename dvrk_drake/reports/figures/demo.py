@@ -35,7 +35,7 @@ def plot_demo(output: Path, result: DemoResult) -> None:
         output / "release.png",
         arm,
         result.release_time,
-        {"identified model": result.released, "model as drawn (SDF)": result.released_as_drawn},
+        {"identified model": result.released, "model as drawn (SDF)": result.released_nominal},
         f"{arm.name} (simulated without dry friction): held until {HELD_UNTIL} s, released under gravity compensation "
         f"until {RELEASED_UNTIL} s, then driven home\n{NO_DRY_FRICTION}",
     )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification
 from dvrk_drake.analysis.dynamic.validation import DynamicValidation, validate_motion
 from dvrk_drake.analysis.results import Identification, Validation
-from dvrk_drake.analysis.static.doubts import Doubt, usable_measurements
+from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement, usable_measurements
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
 from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -46,14 +46,14 @@ def plot_static_identification(folder: Path, result: StaticIdentification) -> No
     plot_torque_error(
         folder / "torque_error.png",
         result.model.arm,
-        np.array([j.rms_zero_torque_undoubted for j in joints]),
+        np.array([j.rms_zero_torque_included for j in joints]),
         {
-            "leave-one-out": np.array([j.rms_leave_one_out_undoubted for j in joints]),
-            "ten-fold, effects chosen anew": np.array([j.rms_cross_validation_undoubted for j in joints]),
+            "leave-one-out": np.array([j.rms_leave_one_out_included for j in joints]),
+            "ten-fold, effects chosen anew": np.array([j.rms_cross_validation_included for j in joints]),
         },
         f"{result.model.arm.name}: poses not used for fitting ({Path(recording.source).name}, without excluded ones)",
     )
-    plot_measured_against_predicted(folder / "predicted.png", result.model, recording, result.measured, result.doubts)
+    plot_measured_against_predicted(folder / "predicted.png", result.model, recording, result.measured, result.excluded)
 
 
 def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
@@ -68,7 +68,9 @@ def plot_static_validation(folder: Path, validation: StaticValidation) -> None:
         {"model": np.array([j.rms_error for j in validation.joints])},
         f"{model.arm.name}: all {validation.poses} poses of {Path(recording.source).name}",
     )
-    plot_measured_against_predicted(folder / "predicted.png", model, recording, validation.measured, validation.doubts)
+    plot_measured_against_predicted(
+        folder / "predicted.png", model, recording, validation.measured, validation.excluded
+    )
 
 
 def plot_torque_error(
@@ -104,7 +106,7 @@ def plot_measured_against_predicted(
     model: IdentifiedModel,
     recording: Recording,
     measured_joints: NDArray[np.bool_],
-    doubts: list[Doubt],
+    excluded: list[ExcludedMeasurement],
 ) -> None:
     """One panel a joint: predicted over measured torque of every pose.
 
@@ -113,15 +115,15 @@ def plot_measured_against_predicted(
         model: what predicts.
         recording: in joint coordinates.
         measured_joints: (m, n); what is no holding torque is not drawn.
-        doubts: what is doubted is drawn as a cross, and does not stretch the axes.
+        excluded: what is excluded is drawn as a cross, and does not stretch the axes.
     """
-    usable = usable_measurements(recording.q.shape, doubts) & measured_joints
+    usable = usable_measurements(recording.q.shape, excluded) & measured_joints
     arm = model.arm
     names = arm.joint_names
     measured, predicted = recording.measured_effort(), model.holding_torque(recording.q)
     figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 6.5), layout="constrained")
     for j, (name, ax) in enumerate(zip(names, axes.flat, strict=False)):
-        use, doubted = usable[:, j], measured_joints[:, j] & ~usable[:, j]
+        use, left_out = usable[:, j], measured_joints[:, j] & ~usable[:, j]
         if not np.any(use):
             ax.set_title(f"J{j + 1} {name}: nothing measured", fontsize=10)
             ax.set(xticks=[], yticks=[])
@@ -132,8 +134,8 @@ def plot_measured_against_predicted(
         ax.plot(limits, limits, color="black", linewidth=0.8, label="measured = predicted")
         ax.plot(measured[use, j], predicted[use, j], ".", color=MODEL_COLOUR, label="one pose")
         ax.plot(
-            np.clip(measured[doubted, j], *limits),
-            np.clip(predicted[doubted, j], *limits),
+            np.clip(measured[left_out, j], *limits),
+            np.clip(predicted[left_out, j], *limits),
             "x",
             color=MEASURED_COLOUR,
             label="excluded (at the edge: outside)",

@@ -9,12 +9,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.dynamics.friction_compensation import LARGEST_HYSTERESIS_RATIO
+from dvrk_drake.dynamics.friction_compensation import MAX_HYSTERESIS_RATIO
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.reproduction import published
 from dvrk_drake.experiments.reproduction.drift_experiment import APPROACH, BAND, RESTING, SAMPLE_PERIOD, Drifts
-from dvrk_drake.experiments.reproduction.laboratory import Laboratory
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
+from dvrk_drake.experiments.reproduction.session import ReproductionSession
 from dvrk_drake.experiments.tuning.model_based import friction
 from dvrk_drake.models.effects_schema import EFFECT_NAMES
 from dvrk_drake.reports.figures.style import MEASURED_COLOUR, MODEL_COLOUR, save_figure
@@ -70,12 +70,12 @@ def _shares(drifts: Drifts) -> tuple[str, ...]:
     return numbers(drifts.held.mean(axis=0), "{:.3f}")
 
 
-def torque_table(laboratory: Laboratory) -> ResultTable:
+def torque_table(session: ReproductionSession) -> ResultTable:
     """How wrong the torques are over the joint box; the truth is known here."""
-    mtm = laboratory.mtm
-    q = laboratory.random_poses(PAPER_ARM, 500)
+    mtm = session.mtm
+    q = session.random_poses(PAPER_ARM, 500)
     true = mtm.truth.model.holding_torque(q)
-    paper = IdentifiedModel.load(laboratory.paper_file).holding_torque(q)
+    paper = IdentifiedModel.load(session.paper_file).holding_torque(q)
 
     def rms(values: NDArray[np.float64]) -> tuple[str, ...]:
         return numbers(np.sqrt(np.mean(values**2, axis=0)), "{:.4f}")
@@ -108,29 +108,34 @@ _JOINTS = tuple(f"J{j}" for j in range(1, 8))
 LOOSE_DURATION = 3.0
 
 
-def reproduce_figure_5(laboratory: Laboratory) -> Section:
+def reproduce_figure_5(session: ReproductionSession) -> Section:
     """All torques on: ours at all poses, the paper's at the first of them, and ours without friction."""
-    mtm, extent = laboratory.mtm, laboratory.extent
-    poses = laboratory.random_poses(PAPER_ARM, extent.releases)
-    few = poses[: extent.paper_releases]
-    ours = laboratory.release(PAPER_ARM, mtm.truth, mtm.file, poses, "Fig. 5: releasing ours")
-    paper = laboratory.release(PAPER_ARM, mtm.truth, laboratory.paper_file, few, "Fig. 5: releasing the paper's")
-    led = laboratory.release(
-        PAPER_ARM, mtm.truth, mtm.file, poses[: extent.led_releases], "Fig. 5: leading and releasing ours", led=True
-    )
-    kept = laboratory.release(
+    mtm, sample_sizes = session.mtm, session.sample_sizes
+    poses = session.random_poses(PAPER_ARM, sample_sizes.releases)
+    few = poses[: sample_sizes.paper_releases]
+    ours = session.release(PAPER_ARM, mtm.truth, mtm.file, poses, "Fig. 5: releasing ours")
+    paper = session.release(PAPER_ARM, mtm.truth, session.paper_file, few, "Fig. 5: releasing the paper's")
+    led = session.release(
         PAPER_ARM,
         mtm.truth,
         mtm.file,
-        poses[: extent.led_releases],
+        poses[: sample_sizes.hand_guided_releases],
+        "Fig. 5: leading and releasing ours",
+        led=True,
+    )
+    kept = session.release(
+        PAPER_ARM,
+        mtm.truth,
+        mtm.file,
+        poses[: sample_sizes.hand_guided_releases],
         "Fig. 5: leading and releasing, hysteresis compensated",
         led=True,
-        hysteresis_ratio=LARGEST_HYSTERESIS_RATIO,
+        hysteresis_ratio=MAX_HYSTERESIS_RATIO,
     )
     frictionless = [name for name in EFFECT_NAMES if name != "friction"]
 
     def loose(model: Path, where: NDArray[np.float64], what: str, damped: bool = False) -> Drifts:
-        return laboratory.release(
+        return session.release(
             PAPER_ARM,
             mtm.truth,
             model,
@@ -141,24 +146,24 @@ def reproduce_figure_5(laboratory: Laboratory) -> Section:
             longest=LOOSE_DURATION,
         )
 
-    loose_paper = loose(laboratory.paper_file, few, "the paper's")
+    loose_paper = loose(session.paper_file, few, "the paper's")
     loose_ours = loose(mtm.file, few, "ours")
     damped = loose(mtm.file, poses, "ours damped", damped=True)
     without_friction = {"the paper's": loose_paper, "ours": loose_ours, "ours with damping": damped}
     figures = _plots(
-        laboratory.folder, "fig5", "all torques on", ours, paper, published.FIGURE_5, published.FIGURE_5_MEANS
+        session.folder, "fig5", "all torques on", ours, paper, published.FIGURE_5, published.FIGURE_5_MEANS
     )
     tables = (
         drift_table("fig5", "all torques on", published.FIGURE_5, published.FIGURE_5_MEANS, paper, ours, led, kept),
-        torque_table(laboratory),
+        torque_table(session),
         rate_table(without_friction),
     )
     remarks = (
         mtm.truth.origin,
-        f"**Ours** knows {extent.collected} poses that were collected on that arm, with its friction, noise and "
+        f"**Ours** knows {sample_sizes.collected} poses that were collected on that arm, with its friction, noise and "
         "encoders, each approached from both sides; `identify` made a model of them, which alone carries the arm. "
-        f"**The paper's** is {_whose(laboratory)}. Each release starts at rest at a random pose anywhere inside the "
-        f"limits, its friction unloaded, and is watched for {extent.duration:g} s.",
+        f"**The paper's** is {_whose(session)}. Each release starts at rest at a random pose anywhere inside the "
+        f"limits, its friction unloaded, and is watched for {sample_sizes.duration:g} s.",
         f"**Ours holds every joint within {1e3 * BAND[0]:.0f} mrad at {share(ours.num_held, len(poses))}** of the "
         f"poses; joint by joint at {_per_joint(ours)}. The paper's parameters hold "
         f"{share(paper.num_held, len(few))}: {_lost(paper)} leave, and the second table says why: their torque errs "
@@ -171,7 +176,7 @@ def reproduce_figure_5(laboratory: Laboratory) -> Section:
         "hysteresis with a travel of 0.06-0.25 rad pushes joints 2 and 3 back and leaves less friction for what the "
         "model errs by, and joint 7's friction gives by 15 mrad before it slips. An exact model is let down alike. "
         "The published drifts of joints 2 and 3, up to 0.13 rad, are as large. **With that hysteresis compensated** "
-        f"(`run --hysteresis-ratio {LARGEST_HYSTERESIS_RATIO:g}`, the friction known) the joints that leave are "
+        f"(`run --hysteresis-ratio {MAX_HYSTERESIS_RATIO:g}`, the friction known) the joints that leave are "
         f"{_any_lost(kept)} of {len(kept.positions)}, by at most {_furthest(kept)} mrad.",
         "**Without friction** nothing but an exact model holds an arm: an error of torque over the inertia of a "
         f"wrist is tens of rad/s^2. So, in {LOOSE_DURATION:g} s, both models let it run into its limits, the "
@@ -183,15 +188,15 @@ def reproduce_figure_5(laboratory: Laboratory) -> Section:
     return Section("fig5", "Fig. 5: drift after release, all torques", remarks, tables, figures)
 
 
-def reproduce_figure_6(laboratory: Laboratory) -> Section:
+def reproduce_figure_6(session: ReproductionSession) -> Section:
     """Joints 5-7 without torque, as the paper tried against their drift."""
-    mtm, extent = laboratory.mtm, laboratory.extent
-    few = laboratory.random_poses(PAPER_ARM, extent.paper_releases)
-    zeroed = laboratory.zeroed(laboratory.paper_file)
-    paper = laboratory.release(PAPER_ARM, mtm.truth, zeroed, few, "Fig. 6: releasing the paper's")
-    ours = laboratory.release(PAPER_ARM, mtm.truth, laboratory.zeroed(mtm.file), few, "Fig. 6: releasing ours")
+    mtm, sample_sizes = session.mtm, session.sample_sizes
+    few = session.random_poses(PAPER_ARM, sample_sizes.paper_releases)
+    zeroed = session.zeroed(session.paper_file)
+    paper = session.release(PAPER_ARM, mtm.truth, zeroed, few, "Fig. 6: releasing the paper's")
+    ours = session.release(PAPER_ARM, mtm.truth, session.zeroed(mtm.file), few, "Fig. 6: releasing ours")
     figures = _plots(
-        laboratory.folder, "fig6", "joints 5-7 zeroed", ours, paper, published.FIGURE_6, published.FIGURE_6_MEANS
+        session.folder, "fig6", "joints 5-7 zeroed", ours, paper, published.FIGURE_6, published.FIGURE_6_MEANS
     )
     table = drift_table("fig6", "joints 5-7 zeroed", published.FIGURE_6, published.FIGURE_6_MEANS, paper, ours)
     remarks = (
@@ -207,8 +212,8 @@ def reproduce_figure_6(laboratory: Laboratory) -> Section:
     return Section("fig6", "Fig. 6: drift after release, joints 5-7 zeroed", remarks, (table,), figures)
 
 
-def _whose(laboratory: Laboratory) -> str:
-    if laboratory.mtm.truth.is_the_papers:
+def _whose(session: ReproductionSession) -> str:
+    if session.mtm.truth.is_paper_arm:
         return "its twelve published parameters, identified with g = 9.9 and used with 9.81 m/s^2, on the same arm"
     return (
         "its method, unweighted least squares, on the same poses: its published parameters are of an arm whose "

@@ -9,7 +9,6 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
 from dvrk_drake.experiments.reproduction.drift_experiment import BAND, Drifts
-from dvrk_drake.experiments.reproduction.laboratory import Laboratory
 from dvrk_drake.experiments.reproduction.mechanisms import (
     POSES,
     PSM_POSES,
@@ -18,6 +17,7 @@ from dvrk_drake.experiments.reproduction.mechanisms import (
     recomputed_table,
 )
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM, TABLE_1
+from dvrk_drake.experiments.reproduction.session import ReproductionSession
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.reports.figures.style import MODEL_COLOUR, save_figure
@@ -75,18 +75,18 @@ def reproduce_table_1() -> Section:
 _FILE = "psm_release.png"
 
 
-def reproduce_psm(laboratory: Laboratory) -> Section:
+def reproduce_psm(session: ReproductionSession) -> Section:
     """The mechanism's facts beside the paper's file's, then releases of a simulated PSM."""
-    psm, extent = laboratory.psm, laboratory.extent
-    poses = laboratory.random_poses("psm", extent.psm_releases)
-    ours = laboratory.release("psm", psm.truth, psm.file, poses, "PSM: releasing ours")
-    nominal = laboratory.folder / "psm_as_drawn.yaml"
-    psm_as_drawn = type(psm.model).from_arm(load_arm("psm"))
-    psm_as_drawn.save(nominal)
-    drawn = laboratory.release("psm", psm.truth, nominal, poses, "PSM: releasing the model as drawn")
-    _plot(laboratory.folder / _FILE, ours, drawn)
+    psm, sample_sizes = session.psm, session.sample_sizes
+    poses = session.random_poses("psm", sample_sizes.psm_releases)
+    ours = session.release("psm", psm.truth, psm.file, poses, "PSM: releasing ours")
+    nominal = session.folder / "psm_nominal.yaml"
+    psm_nominal = type(psm.model).from_arm(load_arm("psm"))
+    psm_nominal.save(nominal)
+    drawn = session.release("psm", psm.truth, nominal, poses, "PSM: releasing the model as drawn")
+    _plot(session.folder / _FILE, ours, drawn)
     names = ours.arm.joint_names
-    untrusted = [joint.name for joint in psm.model.joints if joint.trust == 0.0]
+    disabled = [joint.name for joint in psm.model.joints if joint.feedforward_scale == 0.0]
     rows = (
         ("model as drawn (mean)", *numbers(np.abs(drawn.final).mean(axis=0), "{:.4f}")),
         ("ours (mean)", *numbers(np.abs(ours.final).mean(axis=0), "{:.4f}")),
@@ -97,12 +97,12 @@ def reproduce_psm(laboratory: Laboratory) -> Section:
     remarks = (
         "The paper shows a model and no experiment: its masses are placeholders. The table sets its file's faults "
         "beside what our plant gives when it is asked.",
-        f"{psm.truth.origin} Ours is identified from {extent.collected} poses collected on it. Each release is at a "
-        f"random pose inside the limits, watched for {extent.duration:g} s under gravity compensation alone. **Every "
+        f"{psm.truth.origin} Ours is identified from {sample_sizes.collected} poses collected on it. Each release is at a "
+        f"random pose inside the limits, watched for {sample_sizes.duration:g} s under gravity compensation alone. **Every "
         f"joint stays within {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm) at "
         f"{share(ours.num_held, len(poses))}** of the poses with ours, at {share(drawn.num_held, len(poses))} with "
         "the model as drawn.",
-        f"`identify` gives no torque to {', '.join(untrusted) or 'no joint'}: what it measured there is below 2 % of "
+        f"`identify` gives no torque to {', '.join(disabled) or 'no joint'}: what it measured there is below 2 % of "
         "the effort limit or no better than zero. Friction alone must hold these, and where the spring of the roll "
         "exceeds it, far from its middle, it does not.",
     )

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.experiments.reproduction.laboratory import Extent, Laboratory
 from dvrk_drake.experiments.reproduction.published import PaperRecordings
+from dvrk_drake.experiments.reproduction.session import ReproductionSession, SampleSizes
 from dvrk_drake.experiments.study.study import local_executor
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, reproduce_figure_6
@@ -17,10 +17,10 @@ from dvrk_drake.reports.reproduction.step_response import reproduce_figure_7
 from dvrk_drake.reports.reproduction.torque_errors import reproduce_figure_4
 from dvrk_drake.reports.reproduction.transparency import reproduce_transparency
 
-_MAKERS: dict[str, Callable[[Laboratory], Section]] = {
-    "table1": lambda laboratory: reproduce_table_1(),
-    "fig4": lambda laboratory: reproduce_figure_4(
-        laboratory.recordings, laboratory.folder, step_progress(laboratory.progress, "identifying")
+_MAKERS: dict[str, Callable[[ReproductionSession], Section]] = {
+    "table1": lambda session: reproduce_table_1(),
+    "fig4": lambda session: reproduce_figure_4(
+        session.recordings, session.folder, step_progress(session.progress, "identifying")
     ),
     "fig5": reproduce_figure_5,
     "fig6": reproduce_figure_6,
@@ -37,7 +37,7 @@ def reproduce(
     folder: Path,
     recordings: PaperRecordings,
     progress: Progress = lambda step, share: None,
-    extent: Extent | None = None,
+    sample_sizes: SampleSizes | None = None,
     seed: int = 0,
 ) -> Path:
     """Writes figures, tables and index.md, which has what is finished at any time.
@@ -47,7 +47,7 @@ def reproduce(
         folder: an existing one.
         recordings: without them Fig. 4 is left out if other things are asked for, and Fig. 5 and 6 have another arm.
         progress: called with a step, "fig5: releasing" for example, and its finished share, 0..1.
-        extent: how much is done.
+        sample_sizes: how much is done.
         seed: of true arms, poses and noise.
 
     Returns:
@@ -65,12 +65,14 @@ def reproduce(
         wanted.remove("fig4")
         left_out.append("Fig. 4 needs the recording of the paper's poses; name its folder with --data.")
     with local_executor() as executor:
-        laboratory = Laboratory(folder, recordings, executor, extent=extent or Extent(), seed=seed)
+        session = ReproductionSession(
+            folder, recordings, executor, sample_sizes=sample_sizes or SampleSizes(), seed=seed
+        )
         sections: list[Section] = []
         for name in wanted:
             progress(name, 0.0)
-            laboratory.progress = _within(progress, name)
-            sections.append(_MAKERS[name](laboratory))
+            session.progress = _within(progress, name)
+            sections.append(_MAKERS[name](session))
             unfinished = [f"{later} was not finished." for later in wanted[len(sections) :]]
             page = write_page(folder, sections, [*left_out, *unfinished])
     return page

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.experiments.reproduction import published
-from dvrk_drake.experiments.reproduction.laboratory import Laboratory
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
+from dvrk_drake.experiments.reproduction.session import ReproductionSession
 from dvrk_drake.experiments.reproduction.step_response import (
     DURATION,
     LINK_INERTIA,
@@ -30,12 +30,12 @@ _FILE = "fig7.png"
 _JOINTS = tuple(f"J{j}" for j in range(1, 8))
 
 
-def reproduce_figure_7(laboratory: Laboratory, duration: float = DURATION) -> Section:
+def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION) -> Section:
     """The paper's step with its controller on its arm, and ours on the honest one; writes fig7.png."""
-    folder, mtm = laboratory.folder, laboratory.mtm
+    folder, mtm = session.folder, session.mtm
 
     def progress(share: float) -> None:
-        laboratory.progress("stepping to zero", share)
+        session.progress("stepping to zero", share)
 
     theirs_arm = paper_simulated_arm(load_arm(PAPER_ARM), folder / "paper_simulated_mtm.sdf")
     faulty = simulate_paper_controller(theirs_arm, duration, True, lambda share: progress(0.4 * share))

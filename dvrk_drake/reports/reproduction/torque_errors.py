@@ -33,8 +33,8 @@ def reproduce_figure_4(
     ours = identify_static(recording, arm, progress=progress)
     published = recordings.figure_4
     zero = recording.measured_effort()
-    undoubted = ~_doubted(ours)
-    _plot(folder / _FILE, ours, paper, zero, undoubted)
+    included = ~_excluded(ours)
+    _plot(folder / _FILE, ours, paper, zero, included)
     same = (
         "Its squared errors are the published ones to "
         f"{np.abs(paper.residuals[:, 1:] ** 2 - published).max():.0e} (N m)^2 at every pose. "
@@ -45,7 +45,7 @@ def reproduce_figure_4(
     def rms(values: NDArray[np.float64], use: NDArray[np.bool_]) -> tuple[str, ...]:
         return numbers([np.sqrt(np.mean(values[use[:, j], j] ** 2)) for j in range(1, 7)], "{:.4f}")
 
-    every = np.ones_like(undoubted)
+    every = np.ones_like(included)
     joints = tuple(f"J{j}" for j in range(2, 8))
     squared = ResultTable(
         "fig4_mean_squared",
@@ -60,19 +60,19 @@ def reproduce_figure_4(
     )
     left_out = ResultTable(
         "fig4_left_out",
-        "RMS error at poses that were not fitted [N m]; without the measurements that our check doubts, then with all",
+        "RMS error at poses that were not fitted [N m]; without the measurements that our check excluded, then with all",
         ("", *joints),
         (
-            ("zero torque", *rms(zero, undoubted)),
-            ("the paper's, each pose from all others", *rms(paper.left_out_residuals, undoubted)),
-            ("ours, each pose from all others", *rms(ours.left_out_residuals, undoubted)),
+            ("zero torque", *rms(zero, included)),
+            ("the paper's, each pose from all others", *rms(paper.leave_one_out_residuals, included)),
+            ("ours, each pose from all others", *rms(ours.leave_one_out_residuals, included)),
             (
                 "ours, each tenth from the others, every choice made anew",
-                *numbers([joint.rms_cross_validation_undoubted for joint in ours.model.joints[1:]], "{:.4f}"),
+                *numbers([joint.rms_cross_validation_included for joint in ours.model.joints[1:]], "{:.4f}"),
             ),
             ("all measurements: zero torque", *rms(zero, every)),
-            ("all measurements: the paper's", *rms(paper.left_out_residuals, every)),
-            ("all measurements: ours", *rms(ours.left_out_residuals, every)),
+            ("all measurements: the paper's", *rms(paper.leave_one_out_residuals, every)),
+            ("all measurements: ours", *rms(ours.leave_one_out_residuals, every)),
         ),
     )
     worse = [f"J{j + 1}" for j in range(1, 7) if np.mean(paper.residuals[:, j] ** 2) > np.mean(zero[:, j] ** 2)]
@@ -83,7 +83,7 @@ def reproduce_figure_4(
         "decide what the parameters are, and what they get wrong there the wrist must bear.",
         "Ours differs: each joint is weighted by its own spread; offsets, springs and cables are terms of their own "
         "where predictions of left-out poses gain by them; a joint that is better off with zero torque gets that; "
-        f"and {int(np.sum(~undoubted))} measurements that press on the linkage's stop, or that no other pose agrees "
+        f"and {int(np.sum(~included))} measurements that press on the linkage's stop, or that no other pose agrees "
         "with, are left out (crosses in the figure). With those left in, the paper's reads better on J2: it fits "
         "the stop along with gravity.",
     )
@@ -91,11 +91,11 @@ def reproduce_figure_4(
     return Section("fig4", "Fig. 4: torque errors", remarks, (squared, left_out), {_FILE: shows})
 
 
-def _doubted(ours: StaticIdentification) -> NDArray[np.bool_]:
-    doubted = np.zeros(ours.recording.q.shape, dtype=bool)
-    for doubt in ours.doubts:
-        doubted[doubt.row, list(doubt.joints)] = True
-    return doubted
+def _excluded(ours: StaticIdentification) -> NDArray[np.bool_]:
+    excluded = np.zeros(ours.recording.q.shape, dtype=bool)
+    for measurement in ours.excluded:
+        excluded[measurement.row, list(measurement.joints)] = True
+    return excluded
 
 
 def _plot(
@@ -103,18 +103,18 @@ def _plot(
     ours: StaticIdentification,
     paper: StaticIdentification,
     zero: NDArray[np.float64],
-    undoubted: NDArray[np.bool_],
+    included: NDArray[np.bool_],
 ) -> None:
     figure, axes = plt.subplots(3, 2, figsize=(13, 9), layout="constrained", sharex=True)
     pose = np.arange(1, len(zero) + 1)
     for j, ax in zip(range(1, 7), axes.flat, strict=True):
         for values, label, colour, marker in (
             (zero, "zero torque", "#8d8d8d", "_"),
-            (paper.left_out_residuals, "the paper's least squares", MEASURED_COLOUR, "."),
-            (ours.left_out_residuals, "ours", MODEL_COLOUR, "."),
+            (paper.leave_one_out_residuals, "the paper's least squares", MEASURED_COLOUR, "."),
+            (ours.leave_one_out_residuals, "ours", MODEL_COLOUR, "."),
         ):
             squared = np.maximum(values[:, j] ** 2, FLOOR)
-            use = undoubted[:, j]
+            use = included[:, j]
             ax.semilogy(pose[use], squared[use], marker, color=colour, markersize=6, label=label)
             ax.semilogy(pose[~use], squared[~use], "x", color=colour, markersize=4)
         ax.set_ylim(bottom=FLOOR / 2)
@@ -124,7 +124,7 @@ def _plot(
         ax.grid(alpha=0.3)
     for ax in axes[-1]:
         ax.set_xlabel("pose", fontsize=8)
-    axes.flat[0].plot([], [], "x", color=ZERO_COLOUR, label="doubted measurement")
+    axes.flat[0].plot([], [], "x", color=ZERO_COLOUR, label="excluded measurement")
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9)
     figure.suptitle("Fig. 4 redone: each pose predicted from the other 71 (paper's own recording)")

@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 
 #: The longest expiry, 1 s, has so many measurements at 2 kHz.
-_MOST_MEASUREMENTS = 2000
+_MAX_MEASUREMENTS = 2000
 
 
 class WallClock:
@@ -23,7 +23,7 @@ class WallClock:
     def note(self, measured_utime: int, age: int) -> None:
         """Notes a measurement of `measured_utime` on the arm's clock, which is `age` old by it [us]."""
         self._times.setdefault(measured_utime, self.now() - age)
-        if len(self._times) > _MOST_MEASUREMENTS:
+        if len(self._times) > _MAX_MEASUREMENTS:
             self._times.popitem(last=False)
 
     def time_of(self, measured_utime: int, age: int) -> int:

@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
 
 #: No longer time between two steps is made up for in rate limits [s].
-_LONGEST_STEP = 0.01
+_MAX_STEP = 0.01
 
 #: After a longer time without a measurement, the next one is not compared with it [s]: somebody may have moved the arm.
-_LONGEST_GAP = 0.1
+_MAX_GAP = 0.1
 
 #: States in which a position controller leads the arm to a target.
 _REGULATED = (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_POSITION)
@@ -291,13 +291,13 @@ class CommandGuard:
             self.report_fault(excess, lcmt_dvrk_status.FAULT_POSITION_LIMIT)
         if self.state in _REGULATED and (away := self._follower.astray(self._q())):
             self.report_fault(away, lcmt_dvrk_status.FAULT_FOLLOWING)
-        self.output = self._output(min(max(dt, 0.0), _LONGEST_STEP))
+        self.output = self._output(min(max(dt, 0.0), _MAX_STEP))
         if not self.output.is_finite():
             self.report_fault("the guard's output is not finite", lcmt_dvrk_status.FAULT_NOT_FINITE)
             self._follower.latch(self._q(), np.zeros(self.num_joints))
             self.output = self._follower.hold(0.0)
         elif self.state == lcmt_dvrk_status.STATE_EFFORT:
-            joint = self._oscillation.add(self.output.effort, min(max(dt, 0.0), _LONGEST_STEP))
+            joint = self._oscillation.add(self.output.effort, min(max(dt, 0.0), _MAX_STEP))
             if joint is not None:
                 text = f"{self.limits.names[joint]}: the commanded effort oscillates"
                 self.report_fault(text, lcmt_dvrk_status.FAULT_OSCILLATION)
@@ -325,7 +325,7 @@ class CommandGuard:
         """Takes a measurement and checks it; what is wrong with it ends in HOLD or FAULT."""
         measured, plausibility = self._measured, self._plausibility
         first = measured.q is None
-        begins = plausibility.begins or measured.time_since(measured_utime) >= _LONGEST_GAP
+        begins = plausibility.begins or measured.time_since(measured_utime) >= _MAX_GAP
         implausible_pose = self.limits.implausible_pose if begins else None
         self._problem = problem = measured.take(measured_utime, q, v, effort, implausible_pose)
         if problem:

@@ -13,7 +13,7 @@ from dvrk_drake.systems.guard.command_stream import is_finite
 from dvrk_drake.systems.guard.limits import Vector
 
 #: By a clock that stands still nothing expires; Drake takes two steps at the time at which it starts.
-_MOST_STEPS_AT_ONE_TIME = 10
+_MAX_STEPS_AT_ONE_TIME = 10
 
 
 @dataclass
@@ -53,7 +53,7 @@ class Measurement:
         if dt < 0:
             self._measured_utime = None
             return dt, f"the arm's clock went back by {-dt:.6f} s"
-        return dt, "the arm's clock stands still" if self._steps_at_one_time > _MOST_STEPS_AT_ONE_TIME else ""
+        return dt, "the arm's clock stands still" if self._steps_at_one_time > _MAX_STEPS_AT_ONE_TIME else ""
 
     def time_since(self, measured_utime: int) -> float:
         """Returns the time from the last good measurement to `measured_utime` [us] in s; inf if there was none."""

@@ -17,17 +17,17 @@ def real_motion(shared_data):
         path = shared_data / "trajectories" / f"{name}.csv"
         if not path.is_file():
             pytest.skip(f"needs {path}")
-        return wpi_in_joint_coordinates(read_wpi_csv(path), real_arm(name))
+        return wpi_in_joint_coordinates(read_wpi_csv(path), simulated_effects(name))
 
     return motion
 
 
 @pytest.fixture(scope="module")
 def real(real_motion):
-    return lambda name: check_recording(real_motion(name), real_arm(name))
+    return lambda name: check_recording(real_motion(name), simulated_effects(name))
 
 
-def real_arm(name):
+def simulated_effects(name):
     return load_arm(name.split("_")[0].replace("mtm", "mtmr"))
 
 
@@ -81,7 +81,7 @@ def test_real_insertion_has_noise_between_5_and_17_hz_and_a_late_effort(real, na
 @pytest.mark.parametrize("name", ["mtm_one", "psm_one"])
 @pytest.mark.parametrize("joint", [0, 2, 4, 6])
 def test_real_motor_with_the_wrong_sign_is_refused(real_motion, name, joint):
-    arm = real_arm(name)
+    arm = simulated_effects(name)
     motors = changed(real_motion(name).in_actuator_coordinates(arm), "tau", joint, lambda x: -x)
     refusals = check_recording(motors, arm).refusals
     assert [(f.kind, f.joints) for f in refusals] == [("effort sign", (joint,))]

@@ -8,7 +8,7 @@ import pytest
 
 from dvrk_drake.analysis.dynamic.columns import drive_effects, optional_effects
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
-from dvrk_drake.analysis.dynamic.stepwise_selection import EffectSelection
+from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import load_arm
 
@@ -95,7 +95,7 @@ def test_an_effect_that_is_there_is_chosen_and_noise_is_not():
     true[:2] = 1.0
     for seed in range(5):
         X, tau, fold, edge = equations(np.random.default_rng(seed), true)
-        selection = EffectSelection(
+        selection = StepwiseSelection(
             equations=NormalEquations.of([(np.arange(22), X)], 22, tau[:, None], fold, edge),
             efforts=np.array([[np.sum(tau[fold == f] ** 2)] for f in range(FOLDS)]),
             rows=np.bincount(fold),

@@ -78,11 +78,11 @@ def test_base_parameters_of_the_motion_lie_in_their_intervals(case):
     found = result.model.dynamics.base_parameters
     assert [p.name for p in found] == list(base.base.names)
     beta = base.combination @ truth.parameters[: base.combination.shape[1]]
-    z = [(p.value - b) / p.standard_error for p, b in zip(found, beta, strict=True) if p.told > 0.5]
+    z = [(p.value - b) / p.standard_error for p, b in zip(found, beta, strict=True) if p.identifiability > 0.5]
     assert len(z) > 20
     assert np.mean(np.abs(z) < 1.96) >= 0.9 and np.max(np.abs(z)) < 4
     # A prior that the motion does not change keeps its variance; one that it does becomes narrower.
-    assert all(0 <= p.told <= 1 for p in found) and min(p.told for p in found) < 0.2
+    assert all(0 <= p.identifiability <= 1 for p in found) and min(p.identifiability for p in found) < 0.2
 
 
 def test_every_parameter_is_printed_on_request(case):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.signals.noise import LEAST_CUT_OFF, cut_offs, narrow_band, spectra
+from dvrk_drake.analysis.signals.noise import MIN_CUT_OFF, cut_offs, narrow_band, spectra
 from dvrk_drake.analysis.signals.repetition import find_period, repeatability_floor
 
 RATE = 200.0
@@ -64,7 +64,7 @@ def test_the_cut_off_is_where_noise_begins():
     found = cut_offs(spectra(x, RATE, 5.0))
     # Five lines of 0.4 Hz are smoothed over, and the window of a periodogram leaks into the next ones.
     assert 12.0 <= found[0] < 15.0
-    assert LEAST_CUT_OFF <= found[1] < 4.0
+    assert MIN_CUT_OFF <= found[1] < 4.0
 
 
 def test_a_narrow_band_of_noise_is_found():

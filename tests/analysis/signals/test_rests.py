@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rests import motion_with_rests
+from static_poses import motion_with_pauses
 
 from dvrk_drake.analysis.signals.static_segments import (
     find_poses,
-    rest_poses,
     smooth_velocity,
+    static_poses,
     stationary_runs,
 )
 from dvrk_drake.errors import RecordingError
@@ -22,7 +22,7 @@ ARM = load_arm("psm")
 def moving(count=3, rest=0.5, travel=0.5):
     generator = np.random.default_rng(0)
     poses = ARM.sample_poses(count, generator, margin=0.1)
-    return poses, motion_with_rests(ARM, poses, generator, travel=travel, rest=rest)
+    return poses, motion_with_pauses(ARM, poses, generator, travel=travel, rest=rest)
 
 
 def test_runs_end_where_the_arm_moves_or_has_crept_away():
@@ -47,11 +47,11 @@ def test_velocities_are_smoothed_without_delay():
 
 def test_rests_are_where_the_arm_was_put():
     poses, recording = moving()
-    rests = rest_poses(recording, ARM)
+    rests = static_poses(recording, ARM)
     np.testing.assert_allclose(rests.q, poses, atol=1e-3)
     assert rests.t is None and rests.qd is None
     # A rest of 0.25 s is none.
-    assert len(rest_poses(moving(rest=0.15)[1], ARM)) == 0
+    assert len(static_poses(moving(rest=0.15)[1], ARM)) == 0
 
 
 def test_what_is_no_motion_has_no_rests():
@@ -61,7 +61,7 @@ def test_what_is_no_motion_has_no_rests():
     for other in (None, 20 * t, t[::-1], np.where(np.arange(len(t)) == 50, t[49], t)):
         poses = replace(recording, t=other)
         assert not (poses.is_motion and poses.has_increasing_times)
-        assert rest_poses(replace(recording, t=other), ARM) is None
+        assert static_poses(replace(recording, t=other), ARM) is None
     assert not Recording(q=recording.q[:99], t=t[:99]).is_motion
 
 
@@ -72,7 +72,7 @@ def test_poses_come_from_rests_or_are_left_as_they_are():
     assert "12 poses at which the arm rests" in found.note and not found.moves
     few = find_poses(moving(count=3)[1], ARM)
     assert few.moves and few.measured is None and len(few.recording) > 100
-    slow = find_poses(moving(count=3)[1], ARM, take_slow_parts=True)
+    slow = find_poses(moving(count=3)[1], ARM, with_low_speed_segments=True)
     assert np.all(slow.measured.sum(axis=1) == 1) and slow.note
     table = Recording(q=poses, tau=np.zeros_like(poses))
     assert find_poses(table, ARM).recording is table

@@ -26,19 +26,19 @@ def arm():
 
 
 @pytest.fixture(scope="module")
-def true_arm(arm, tmp_path_factory):
+def ground_truth_arm(arm, tmp_path_factory):
     links = perturbed_links(arm, np.random.default_rng(5), shift=0.002)
-    return with_links(arm, links, tmp_path_factory.mktemp("true_arm") / "psm.sdf", "a test")
+    return with_links(arm, links, tmp_path_factory.mktemp("ground_truth_arm") / "psm.sdf", "a test")
 
 
 @pytest.fixture(scope="module")
-def recording(arm, true_arm):
+def recording(arm, ground_truth_arm):
     """Collected with the nominal model, so that the integrator has to make up for what is wrong with it."""
     generator = np.random.default_rng(6)
     laws = [DriveEffect("joint.yaw", "offset", 0.0, 0.05), DriveEffect("joint.roll", "cable sine", 1.0, 0.03)]
     effects = ArmEffects(cables=laws)
     return collect_static_poses(
-        damped_station(arm, true_arm, effects, "ball"),
+        damped_station(arm, ground_truth_arm, effects, "ball"),
         IdentifiedModel.from_arm(arm),
         arm.sample_poses(COUNT, generator, margin=0.1),
         effort_noise=0.0,
@@ -46,8 +46,8 @@ def recording(arm, true_arm):
     )
 
 
-def true_torque(arm, true_arm, poses):
-    plant = make_arm_plant(true_arm)
+def true_torque(arm, ground_truth_arm, poses):
+    plant = make_arm_plant(ground_truth_arm)
     context = plant.CreateDefaultContext()
     tau = []
     for q in poses:
@@ -59,11 +59,11 @@ def true_torque(arm, true_arm, poses):
     return tau
 
 
-def test_the_true_torque_is_found_through_the_closed_linkage(arm, true_arm, recording):
-    np.testing.assert_allclose(recording.tau, true_torque(arm, true_arm, recording.q), atol=1e-3)
+def test_the_true_torque_is_found_through_the_closed_linkage(arm, ground_truth_arm, recording):
+    np.testing.assert_allclose(recording.tau, true_torque(arm, ground_truth_arm, recording.q), atol=1e-3)
     model = identify_static(recording, arm).model
     fresh = arm.sample_poses(100, np.random.default_rng(7), margin=0.1)
-    truth = true_torque(arm, true_arm, fresh)
+    truth = true_torque(arm, ground_truth_arm, fresh)
     error = np.sqrt(np.mean((model.holding_torque(fresh) - truth) ** 2, axis=0))
     assert np.all(error < np.maximum(0.03 * np.sqrt(np.mean(truth**2, axis=0)), 1e-3 * arm.effort_limits))
     found = {str(ActuatorEffect.of(e)) for e in model.effects}

@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.static.doubts import find_doubts
+from dvrk_drake.analysis.static.excluded_measurements import find_excluded
 from dvrk_drake.analysis.static.linear_fit import robust_fit, weighted_fit
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.analysis.static.validation import predict_static, validate_static
@@ -85,7 +85,7 @@ def test_left_out_residuals_are_those_of_a_fit_without_the_pose():
     for i in range(12):
         rest = np.arange(12) != i
         other = weighted_fit(X[rest], tau[rest], weights[rest], prior)
-        np.testing.assert_allclose(fit.left_out_residuals[i], tau[i] - X[i] @ other.theta, atol=1e-12)
+        np.testing.assert_allclose(fit.leave_one_out_residuals[i], tau[i] - X[i] @ other.theta, atol=1e-12)
 
 
 def test_gross_outliers_do_not_move_the_robust_fit():
@@ -109,7 +109,7 @@ def test_poses_on_a_stop_are_doubted_and_named(arm):
     tau[7, 5] += 0.05
     tau[11, 3] = 2.0  # eight times what the motor can give
     dirty = dataclasses.replace(recording, q=q, tau=tau)
-    reasons = {(d.row, d.joints): d.reason for d in find_doubts(dirty, arm)}
+    reasons = {(d.row, d.joints): d.reason for d in find_excluded(dirty, arm)}
     assert "parallelogram at -0.350 rests on its stop" in reasons[3, (1, 2)]
     assert "wrist_yaw at 0.785 rests on its stop" in reasons[7, (5,)]
     assert "wrist_platform effort 2 exceeds its limit 0.309" in reasons[11, (3,)]
@@ -125,7 +125,7 @@ def test_a_joint_that_measures_nothing_gets_no_torque(arm):
     tau = recording.tau.copy()
     tau[:, 6] = 1e-5
     model = identify_static(dataclasses.replace(recording, tau=tau), arm).model
-    assert model.joints[6].trust == 0.0
+    assert model.joints[6].feedforward_scale == 0.0
     assert np.all(model.holding_torque(recording.q)[:, 6] == 0.0)
 
 
@@ -201,7 +201,7 @@ def test_a_joint_that_did_not_move_gets_no_torque(arm):
     model = compile_static_model(arm)
     tau = model.torque(q, model.gravity.base_values) + 0.05 * arm.effort_limits * generator.uniform(-1, 1, q.shape)
     result = identify_static(Recording(q=q, tau=tau, source="fixed wrist"), arm).model
-    assert np.all(result.trust[3:] == 0.0)
+    assert np.all(result.feedforward_scale[3:] == 0.0)
     fresh, _ = simulated(arm, poses=100, seed=3)
     for error in validate_static(result, fresh).joints:
         assert error.rms_error <= error.rms_torque, error
@@ -245,7 +245,10 @@ def test_model_file_round_trip_and_refusals(arm, tmp_path):
             text.replace("model 3", "model 1").replace("\neffects:", "\njoint_effects:"),
             'model 1", this version reads "dvrk_drake identified model 3" and 2; identify anew',
         ),
-        (text.replace("trust: 1.0", "trust: 2.0"), r"joints\[1\]\.trust is 2; allowed: 0\.\.1"),
+        (
+            text.replace("feedforward_scale: 1.0", "feedforward_scale: 2.0"),
+            r"joints\[1\]\.feedforward_scale is 2; allowed: 0\.\.1",
+        ),
         (text.replace("arm: ", "arms: ", 1), 'key "arms" is unknown; did you mean "arm"'),
         ("]", "not YAML: line 1"),
     ):
@@ -308,19 +311,19 @@ def test_paper_method_reproduces_the_papers_figure_4(arm, shared_data):
 def test_default_method_is_never_worse_than_zero_torque_on_left_out_poses(arm, shared_data, name):
     model = identify_static(read_recording(shared_data / f"mtm_static/{name}.csv"), arm).model
     for joint in model.joints:
-        assert joint.rms_leave_one_out_undoubted <= joint.rms_zero_torque_undoubted, joint
-        assert joint.rms_cross_validation_undoubted <= 1.02 * joint.rms_zero_torque_undoubted, joint
+        assert joint.rms_leave_one_out_included <= joint.rms_zero_torque_included, joint
+        assert joint.rms_cross_validation_included <= 1.02 * joint.rms_zero_torque_included, joint
 
 
 def test_default_method_beats_the_paper_on_left_out_poses(arm, shared_data):
     recording = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
     ours, paper = identify_static(recording, arm), identify_static(recording, arm, "paper")
-    doubted = np.zeros(recording.q.shape, bool)
-    for doubt in ours.doubts:
-        doubted[doubt.row, list(doubt.joints)] = True
+    excluded = np.zeros(recording.q.shape, bool)
+    for measurement in ours.excluded:
+        excluded[measurement.row, list(measurement.joints)] = True
     for j in range(7):
-        use = ~doubted[:, j]
-        rms = [np.sqrt(np.mean(r.left_out_residuals[use, j] ** 2)) for r in (ours, paper)]
+        use = ~excluded[:, j]
+        rms = [np.sqrt(np.mean(r.leave_one_out_residuals[use, j] ** 2)) for r in (ours, paper)]
         assert rms[0] < rms[1], arm.joint_names[j]
 
 
@@ -328,12 +331,12 @@ def test_another_day_of_the_same_arm_is_predicted_better_than_by_zero_torque(arm
     model = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_good72.csv"), arm).model
     other = validate_static(model, read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"))
     for joint in other.joints:
-        assert joint.rms_error_undoubted <= joint.rms_torque_undoubted, joint
+        assert joint.rms_error_included <= joint.rms_torque_included, joint
 
 
 def test_dirty_recording_names_the_poses_that_press_on_a_stop(arm, shared_data):
     result = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"), arm)
     # Lines of the file; line 72 repeats the pose of line 62.
-    line = {d: int(d.where.rpartition(":")[2]) for d in result.doubts}
-    assert {62, 64, 68, 74, 78} <= {line[d] for d in result.doubts if "parallelogram" in d.reason}
+    line = {d: int(d.where.rpartition(":")[2]) for d in result.excluded}
+    assert {62, 64, 68, 74, 78} <= {line[d] for d in result.excluded if "parallelogram" in d.reason}
     assert 47 in line.values()

@@ -99,7 +99,7 @@ def test_numbers_of_workers_that_are_none_are_refused(study, capsys):
 
 
 def test_schedulers_that_are_none_are_refused(study, capsys, monkeypatch):
-    monkeypatch.setattr("dvrk_drake.experiments.study.study.PATIENCE", 0.3)
+    monkeypatch.setattr("dvrk_drake.experiments.study.study.TIMEOUT", 0.3)
     pytest.importorskip("distributed", reason="needs the extra dask")
     assert "is no address of a scheduler; allowed: tcp://HOST:PORT" in study_refusal(
         capsys, study, "--scheduler", "here"

@@ -12,7 +12,7 @@ from pathlib import Path
 import formula_study
 import pytest
 from command_output import messages
-from patience import PATIENCE, wait_until
+from waiting import TIMEOUT, wait_until
 
 import dvrk_drake.experiments.study.study as study_module
 from dvrk_drake.experiments.study.study import dask_executor, run_study
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 STUDY = """
 scenario: mtml
-set: [duration=1, controller.mode=gravity, "real_arm=[all]"]
+set: [duration=1, controller.mode=gravity, "simulated_effects=[all]"]
 random_poses: {count: 5, seed: 1, margin: 0.1}
 variations: [{name: nominal}, {name: wrong, set: [controller.parameter_error=0.2]}]
 measures: [{kind: held, time: 1}, {kind: drift, time: 0.5}, {kind: effort_share}]
@@ -109,7 +109,7 @@ def test_a_killed_study_goes_on_and_a_killed_worker_costs_nothing(study, started
     wait_until(lambda: rows_in(path) == 4, "a fourth row", second)
     os.kill(children_of(second)[0], signal.SIGKILL)
     sell(20)
-    output, error = second.communicate(timeout=PATIENCE)
+    output, error = second.communicate(timeout=TIMEOUT)
     assert (second.returncode, messages(error)) == (0, [])
     assert "nominal: 2 of 5 runs" in output
     monkeypatch.delenv(formula_study.TICKETS)
@@ -130,11 +130,11 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same(study, started, tmp_p
             workers[0].kill()
 
     url = json.loads(address.read_text())["address"]
-    with distributed.Client(url, timeout=PATIENCE, set_as_default=False) as client:
-        client.wait_for_workers(2, timeout=PATIENCE)
+    with distributed.Client(url, timeout=TIMEOUT, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=TIMEOUT)
     with dask_executor(url) as executor:
         run_study(load_study(study), executor, path, kill_one)
-    assert workers[0].wait(PATIENCE) == -signal.SIGKILL
+    assert workers[0].wait(TIMEOUT) == -signal.SIGKILL
     assert path.read_bytes() == undisturbed(study)
 
 
@@ -146,7 +146,7 @@ def test_ctrl_c_ends_in_one_line_and_leaves_no_worker(study, started, sell, tmp_
     wait_until(lambda: rows_in(path) == 1, "a row", run)
     workers = children_of(run)
     run.send_signal(signal.SIGINT)
-    _, error = run.communicate(timeout=PATIENCE)
+    _, error = run.communicate(timeout=TIMEOUT)
     assert (run.returncode, messages(error)) == (130, ["dvrk-drake: interrupted"])
     assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
     assert rows_in(path) == 1

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from real_arm import ARMS, Run, middle, weightless
+from simulated_effects import ARMS, Run, middle, weightless
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import load_arm

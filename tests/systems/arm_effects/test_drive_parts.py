@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from real_arm import Run, middle, weightless
+from simulated_effects import Run, middle, weightless
 
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, EffortEffect

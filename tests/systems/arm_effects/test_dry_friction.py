@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from real_arm import ARMS, STEP, Run, breakaway, middle, weightless
+from simulated_effects import ARMS, STEP, Run, breakaway, middle, weightless
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, joint_row
 from dvrk_drake.models.arm import load_arm

@@ -4,7 +4,7 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
-from real_arm import ARMS
+from simulated_effects import ARMS
 
 from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ArmError, ScenarioError, StationError
@@ -17,7 +17,7 @@ from dvrk_drake.systems.arm_station import ArmStation
 
 
 def scenario(arm, *settings):
-    parts = ["duration=0.3", "real_arm=[all]", "sample_period=0.001"]
+    parts = ["duration=0.3", "simulated_effects=[all]", "sample_period=0.001"]
     return load_scenario(arm, [*parts, *settings])
 
 
@@ -33,11 +33,11 @@ def test_a_seed_gives_the_same_bits(name):
 @pytest.mark.parametrize("name", ARMS)
 def test_a_controller_that_knows_only_gravity_holds_the_real_arm(name):
     arm = load_arm(name)
-    path = simulate(load_scenario(name, ["duration=2", "real_arm=[all]"])).recording.q
+    path = simulate(load_scenario(name, ["duration=2", "simulated_effects=[all]"])).recording.q
     # Cables and springs, which it does not know, pull it by their torque over its gain until its integral has grown.
     assert np.abs(path - path[0]).max() < 0.1
     rest = [part for part in EFFECT_NAMES if part not in ("cables", "springs")]
-    recording = simulate(load_scenario(name, ["duration=2", f"real_arm={rest}"])).recording
+    recording = simulate(load_scenario(name, ["duration=2", f"simulated_effects={rest}"])).recording
     resolution = np.array([arm.effects.encoder.resolution[joint] for joint in arm.joint_names])
     counts = arm.transmission.position(recording.q - recording.q[0]) / resolution
     # Presliding alone is some counts of the fine encoders: 3 mrad under its load.
@@ -60,7 +60,7 @@ def test_every_part_can_be_switched():
 
 def test_a_typo_is_an_error(tmp_path):
     with pytest.raises(ScenarioError, match="simulated arm: unknown effect frction"):
-        load_scenario("mtml", ["real_arm=[frction]"])
+        load_scenario("mtml", ["simulated_effects=[frction]"])
     text = (MODELS_FOLDER / "mechanisms" / "mtm.yaml").read_text()
     arm_text = (MODELS_FOLDER / "arms" / "mtml.yaml").read_text().replace("mechanism: mtm", "mechanism: m.yaml")
     (tmp_path / "a.yaml").write_text(arm_text)
@@ -108,7 +108,7 @@ HAND = [
 
 @pytest.mark.slow
 def test_a_hand_moves_the_arm_and_lets_go():
-    settings = ["duration=2.2", "controller.mode=gravity", "real_arm=[all]", *HAND]
+    settings = ["duration=2.2", "controller.mode=gravity", "simulated_effects=[all]", *HAND]
     simulation = simulate(load_scenario("mtml", settings))
     frame = ArmFrame(load_arm("mtml"), "dh_7")
     force = np.linalg.norm(simulation.hand[:, 3:], axis=1)
@@ -126,10 +126,10 @@ def test_a_hand_moves_the_arm_and_lets_go():
 @pytest.mark.slow
 def test_a_controller_that_knows_cables_and_springs_holds_them_exactly():
     """Gravity compensation alone, without friction: nothing is left that moves the arm."""
-    parts = ["real_arm=[cables, springs]", "duration=1", "controller.mode=gravity", f"start={TWO_POSES[1]}"]
+    parts = ["simulated_effects=[cables, springs]", "duration=1", "controller.mode=gravity", f"start={TWO_POSES[1]}"]
     moved = {}
     for knows in ("[]", "[cables, springs]"):
-        path = simulate(load_scenario("mtml", [*parts, f"controller.knows={knows}"])).state_true
+        path = simulate(load_scenario("mtml", [*parts, f"controller.compensated_effects={knows}"])).state_true
         moved[knows] = np.abs(path[:, :7] - path[0, :7]).max()
     assert moved["[cables, springs]"] < 1e-3
     assert moved["[]"] > 0.05
@@ -142,7 +142,7 @@ def test_saturation_shows_what_motors_cannot_follow():
     settings = [f"start={low}", f"targets=[{{time: 0.2, pose: {high}}}]", "duration=0.4"]
     error, effort = {}, {}
     for parts in ("[]", "[saturation]"):
-        simulation = simulate(load_scenario("mtml", [*settings, f"real_arm={parts}"]))
+        simulation = simulate(load_scenario("mtml", [*settings, f"simulated_effects={parts}"]))
         error[parts] = np.abs(simulation.recording.q - simulation.desired).max()
         effort[parts] = np.abs(arm.transmission.inverse.pull_back_effort(simulation.recording.tau)).max(axis=0)
     limit = np.array([arm.effects.saturation[joint] for joint in arm.joint_names])
@@ -158,7 +158,7 @@ def test_a_cable_of_a_scenario_stretches():
     stretch, load = {}, {}
     for stiffness in (50.0, 200.0):
         cable = f"stretch.shoulder_pitch={{stiffness: {stiffness}, damping: 1.0}}"
-        settings = ["duration=1", "controller.mode=gravity", "real_arm=[friction]", start, cable]
+        settings = ["duration=1", "controller.mode=gravity", "simulated_effects=[friction]", start, cable]
         simulation = simulate(load_scenario("mtml", settings))
         assert np.abs(simulation.state_true[-1, 7:]).max() < 0.02
         stretch[stiffness] = (simulation.recording.q - simulation.state_true[:, :7])[-1, 1]
@@ -176,7 +176,10 @@ def test_a_cable_of_a_scenario_stretches():
         ("hand.path=[{time: 0.1, pose: [0, 0, 0, 0, 0, 0, 0]}]", "hand.path needs two poses or more"),
         ("hand.path=[{time: 0.1, pose: [0, 0, 0]}]", r"hand.path\[0\].pose has 3 numbers"),
         ("hand.grip=1", "allowed"),
-        ("controller.knows=[friction]", 'controller.knows is "friction"; allowed: cables, springs'),
+        (
+            "controller.compensated_effects=[friction]",
+            'controller.compensated_effects is "friction"; allowed: cables, springs',
+        ),
         ("controller.friction_ratio=0.5", 'controller.friction_ratio needs mode "gravity"'),
     ],
 )

@@ -20,8 +20,8 @@ from dvrk_drake.systems.ideal_drive import DrivePorts, PlantJoints, add_true_sta
 
 
 @dataclass(frozen=True)
-class RealDrive:
-    """What `add_real_drive` needs.
+class DriveWithEffects:
+    """What `add_drive_with_effects` needs.
 
     Attributes:
         arm: that is simulated.
@@ -41,7 +41,7 @@ class RealDrive:
     home: NDArray[np.float64]
 
 
-def add_real_drive(builder: DiagramBuilder, drive: RealDrive) -> tuple[DrivePorts, DriveStep]:
+def add_drive_with_effects(builder: DiagramBuilder, drive: DriveWithEffects) -> tuple[DrivePorts, DriveStep]:
     """Connects a finalized plant's inputs; returns the ports and the system that knows what was measured."""
     drive.parts.finish(drive.joints)
     plant, delay = drive.plant, drive.effects.delay or DelayEffect()
@@ -71,7 +71,7 @@ def add_real_drive(builder: DiagramBuilder, drive: RealDrive) -> tuple[DrivePort
     return ports, step
 
 
-def _late(builder: DiagramBuilder, name: str, steps: int, port: OutputPort, drive: RealDrive) -> OutputPort:
+def _late(builder: DiagramBuilder, name: str, steps: int, port: OutputPort, drive: DriveWithEffects) -> OutputPort:
     if steps == 0:
         return port
     # What goes in comes out a step later by itself: the plant steps while it is stored.

@@ -6,7 +6,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from real_arm import STEP, middle, weightless
+from simulated_effects import STEP, middle, weightless
 
 from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.dynamics.kinematics import ArmFrame
@@ -147,7 +147,7 @@ def test_a_hand_gives_the_arm_no_more_than_moving_it_took(grip):
         given += held.in_hand() - before
         taken += held.advance()
         worst = min(worst, given - held.in_hand() - taken)
-    # At first it does not feel what else pushes the arm: by some micrometres, until it pushes back.
+    # At first it does not measure what else pushes the arm: by some micrometres, until it pushes back.
     assert worst > -0.5 * held.grip.stiffness * 5e-6**2
     assert taken > 0.3
 

@@ -16,7 +16,7 @@ STOP_MARGIN = 0.01, 0.002
 
 
 @dataclass(frozen=True)
-class Doubt:
+class ExcludedMeasurement:
     """Why the torque of some joints in one pose is not used: `where` names the pose, `reason` is readable."""
 
     row: int
@@ -25,15 +25,17 @@ class Doubt:
     reason: str
 
 
-def find_doubts(recording: Recording, arm: Arm, measured: NDArray[np.bool_] | None = None) -> list[Doubt]:
-    """What can be doubted before any fit. A stop carries load, so it makes the torque of its own joints meaningless.
+def find_excluded(
+    recording: Recording, arm: Arm, measured: NDArray[np.bool_] | None = None
+) -> list[ExcludedMeasurement]:
+    """What can be excluded before any fit. A stop carries load, so it makes the torque of its own joints meaningless.
 
     Args:
         recording: in joint coordinates, with efforts.
         arm: whose limits count.
-        measured: (m, n) False where an effort is no holding torque and need not be doubted; by default all are.
+        measured: (m, n) False where an effort is no holding torque and need not be excluded; by default all are.
     """
-    doubts = []
+    excluded = []
     A, lower, upper = arm.limit_matrix()
     names = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
     values = recording.q @ A.T
@@ -44,18 +46,20 @@ def find_doubts(recording: Recording, arm: Arm, measured: NDArray[np.bool_] | No
         joints = tuple(int(j) for j in np.flatnonzero(A[limit]))
         stop = lower[limit] if values[row, limit] < (lower[limit] + upper[limit]) / 2 else upper[limit]
         reason = f"{names[limit]} at {values[row, limit]:.3f} rests on its stop ({stop:.3f})"
-        doubts.append(Doubt(int(row), joints, recording.where(int(row)), reason))
+        excluded.append(ExcludedMeasurement(int(row), joints, recording.where(int(row)), reason))
     tau = recording.measured_effort()
-    doubted = ~usable_measurements(tau.shape, doubts)
-    for row, joint in np.argwhere((np.abs(tau) > arm.effort_limits) & ~doubted):
+    usable = usable_measurements(tau.shape, excluded)
+    for row, joint in np.argwhere((np.abs(tau) > arm.effort_limits) & usable):
         reason = (
             f"{arm.joint_names[joint]} effort {tau[row, joint]:.3g} exceeds its limit {arm.effort_limits[joint]:.3g}"
         )
-        doubts.append(Doubt(int(row), (int(joint),), recording.where(int(row)), reason))
+        excluded.append(ExcludedMeasurement(int(row), (int(joint),), recording.where(int(row)), reason))
     if measured is not None:
-        doubts = [doubt for doubt in doubts if np.any(measured[doubt.row, list(doubt.joints)])]
+        excluded = [
+            measurement for measurement in excluded if np.any(measured[measurement.row, list(measurement.joints)])
+        ]
     order = np.arange(len(recording)) if recording.lines is None else recording.lines
-    return sorted(doubts, key=lambda doubt: order[doubt.row])
+    return sorted(excluded, key=lambda measurement: order[measurement.row])
 
 
 def check_effort_unit(recording: Recording, arm: Arm) -> None:
@@ -74,12 +78,12 @@ def check_effort_unit(recording: Recording, arm: Arm) -> None:
         )
 
 
-def outlier_doubts(
+def exclude_outliers(
     recording: Recording, arm: Arm, outliers: NDArray[np.bool_], residuals: NDArray[np.float64]
-) -> list[Doubt]:
+) -> list[ExcludedMeasurement]:
     """The measurements that a robust fit rejected, (m, n) each."""
     return [
-        Doubt(
+        ExcludedMeasurement(
             int(row),
             (int(joint),),
             recording.where(int(row)),
@@ -89,9 +93,9 @@ def outlier_doubts(
     ]
 
 
-def usable_measurements(shape: tuple[int, int], doubts: list[Doubt]) -> NDArray[np.bool_]:
-    """(m, n) mask: False where a doubt names the pose and the joint."""
+def usable_measurements(shape: tuple[int, int], excluded: list[ExcludedMeasurement]) -> NDArray[np.bool_]:
+    """(m, n) mask: False where an excluded measurement names the pose and the joint."""
     usable = np.ones(shape, dtype=bool)
-    for doubt in doubts:
-        usable[doubt.row, list(doubt.joints)] = False
+    for measurement in excluded:
+        usable[measurement.row, list(measurement.joints)] = False
     return usable

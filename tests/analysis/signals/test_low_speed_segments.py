@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rests import RATE, motion_with_rests
+from static_poses import RATE, motion_with_pauses
 
-from dvrk_drake.analysis.signals.static_segments import SAME_REST, find_poses, rest_poses, slow_parts
-from dvrk_drake.analysis.static.static_identification import LEAST_POSES, identify_static
+from dvrk_drake.analysis.signals.static_segments import SAME_REST, find_poses, low_speed_segments, static_poses
+from dvrk_drake.analysis.static.static_identification import MIN_POSES, identify_static
 from dvrk_drake.analysis.static.validation import validate_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -27,8 +27,8 @@ def arm():
 def test_rests_of_a_motion_are_found_and_identify_the_arm(arm):
     generator = np.random.default_rng(0)
     poses = arm.sample_poses(16, generator, margin=0.1)
-    recording = motion_with_rests(arm, poses, generator)
-    parts, measured = slow_parts(recording, arm)
+    recording = motion_with_pauses(arm, poses, generator)
+    parts, measured = low_speed_segments(recording, arm)
     assert np.all(measured.sum(axis=1) == 1)
     # A joint that hardly moves from one pose to the next is slow all the way: then the two rests are one pass.
     assert np.all(measured.sum(axis=0) >= 0.7 * len(poses))
@@ -47,15 +47,17 @@ def test_rests_of_a_motion_are_found_and_identify_the_arm(arm):
 def test_repetitions_are_one_part(arm):
     generator = np.random.default_rng(1)
     a, b = arm.sample_poses(2, generator, margin=0.1)
-    once, thrice = (slow_parts(motion_with_rests(arm, [a, b] * count + [a], generator), arm) for count in (1, 3))
+    once, thrice = (
+        low_speed_segments(motion_with_pauses(arm, [a, b] * count + [a], generator), arm) for count in (1, 3)
+    )
     np.testing.assert_array_equal(once.measured, thrice.measured)
     np.testing.assert_allclose(once.recording.q, thrice.recording.q, atol=1e-3)
 
 
 def test_slow_parts_at_1_khz_are_those_at_200_hz(arm):
     poses = arm.sample_poses(6, np.random.default_rng(1), margin=0.1)
-    motions = (motion_with_rests(arm, poses, np.random.default_rng(2), rate=rate) for rate in (200.0, 1000.0))
-    slow, fast = (slow_parts(motion, arm) for motion in motions)
+    motions = (motion_with_pauses(arm, poses, np.random.default_rng(2), rate=rate) for rate in (200.0, 1000.0))
+    slow, fast = (low_speed_segments(motion, arm) for motion in motions)
     assert abs(len(slow.measured) - len(fast.measured)) <= 0.1 * len(slow.measured)
     assert fast.measured.sum(axis=0).min() >= 0.6 * len(poses)
 
@@ -63,11 +65,11 @@ def test_slow_parts_at_1_khz_are_those_at_200_hz(arm):
 def test_a_rest_does_not_reach_over_a_gap(arm):
     """Where samples are missing the arm may have been anywhere."""
     a, b = arm.sample_poses(2, np.random.default_rng(1), margin=0.1)
-    recording = motion_with_rests(arm, [a, b], np.random.default_rng(2), rest=2.0)
+    recording = motion_with_pauses(arm, [a, b], np.random.default_rng(2), rest=2.0)
     late = recording.t >= 5.0  # in the middle of the rest at b
     sag = 0.9 * arm.per_joint(*SAME_REST)
     split = replace(recording, t=recording.t + 5.0 * late, q=recording.q + sag * late[:, None])
-    rests = rest_poses(split, arm)
+    rests = static_poses(split, arm)
     assert len(rests) == 2
     # Both halves are averaged as samples of one pose, each by its own later half.
     np.testing.assert_allclose(rests.q[1], b + 0.5 * sag, atol=1e-4)
@@ -78,9 +80,9 @@ def test_a_rest_does_not_reach_over_a_gap(arm):
 def test_rests_are_poses_of_all_joints(arm, rate, with_speeds):
     generator = np.random.default_rng(3)
     poses = arm.sample_poses(12, generator, margin=0.1)
-    recording = motion_with_rests(arm, [*poses, poses[0]], generator, rest=1.0, rate=rate)
+    recording = motion_with_pauses(arm, [*poses, poses[0]], generator, rest=1.0, rate=rate)
     noisy = recording.qd + arm.per_joint(0.01, 0.001) * generator.normal(size=recording.q.shape)
-    rests = rest_poses(replace(recording, qd=noisy if with_speeds else None), arm)
+    rests = static_poses(replace(recording, qd=noisy if with_speeds else None), arm)
     assert len(rests) == len(poses), "the last pose is the first again"
     # A rest begins when the arm is slow, not when it stands.
     np.testing.assert_allclose(rests.q, poses, atol=1e-4)
@@ -94,12 +96,12 @@ def test_rests_are_poses_of_all_joints(arm, rate, with_speeds):
 def test_what_does_not_rest_is_left_as_it_is(arm):
     generator = np.random.default_rng(4)
     poses = arm.sample_poses(12, generator, margin=0.1)
-    moving = motion_with_rests(arm, poses, generator, rest=0.0)
-    assert len(rest_poses(moving, arm)) == 0
+    moving = motion_with_pauses(arm, poses, generator, rest=0.0)
+    assert len(static_poses(moving, arm)) == 0
     assert find_poses(moving, arm).recording is moving
-    assert find_poses(moving, arm, take_slow_parts=True).measured.sum(axis=1).max() == 1
-    assert rest_poses(replace(moving, t=None, qd=None), arm) is None
-    assert rest_poses(replace(moving, t=0.1 * np.arange(len(moving))), arm) is None
+    assert find_poses(moving, arm, with_low_speed_segments=True).measured.sum(axis=1).max() == 1
+    assert static_poses(replace(moving, t=None, qd=None), arm) is None
+    assert static_poses(replace(moving, t=0.1 * np.arange(len(moving))), arm) is None
 
 
 def test_what_has_no_slow_parts_is_refused(arm):
@@ -108,25 +110,25 @@ def test_what_has_no_slow_parts_is_refused(arm):
         IdentificationError,
         match=r"need a motion: qd1\.\.qd7, and t that increases by less than 0\.05 s, over 100 rows",
     ):
-        slow_parts(Recording(q=q, tau=q), arm)
+        low_speed_segments(Recording(q=q, tau=q), arm)
     t = np.arange(400) * 0.1
     q = np.zeros((400, 7))
     with pytest.raises(IdentificationError, match=r"t that increases by less than 0\.05 s"):
-        slow_parts(Recording(q=q, qd=q, tau=q, t=t), arm)
+        low_speed_segments(Recording(q=q, qd=q, tau=q, t=t), arm)
     with pytest.raises(RecordingError, match="has no efforts"):
-        slow_parts(Recording(q=q, qd=q, t=t), arm)
+        low_speed_segments(Recording(q=q, qd=q, t=t), arm)
     t = np.arange(2000) / RATE
     qd = np.tile(np.cos(2 * np.pi * t)[:, None], (1, 7))
     with pytest.raises(IdentificationError, match="no joint is slow"):
-        slow_parts(Recording(q=np.sin(2 * np.pi * t)[:, None] + 0 * qd, qd=qd, tau=qd, t=t), arm)
+        low_speed_segments(Recording(q=np.sin(2 * np.pi * t)[:, None] + 0 * qd, qd=qd, tau=qd, t=t), arm)
 
 
 def test_few_segments_give_no_feedforward(arm):
-    poses = arm.sample_poses(LEAST_POSES - 1, np.random.default_rng(0), margin=0.1)
-    parts, measured = slow_parts(motion_with_rests(arm, poses, np.random.default_rng(1)), arm)
-    assert 0 < measured.sum(axis=0).max() < LEAST_POSES
+    poses = arm.sample_poses(MIN_POSES - 1, np.random.default_rng(0), margin=0.1)
+    parts, measured = low_speed_segments(motion_with_pauses(arm, poses, np.random.default_rng(1)), arm)
+    assert 0 < measured.sum(axis=0).max() < MIN_POSES
     model = identify_static(parts, arm, measured=measured).model
-    assert [joint.trust for joint in model.joints] == [0.0] * arm.num_joints
+    assert [joint.feedforward_scale for joint in model.joints] == [0.0] * arm.num_joints
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +138,7 @@ def real_parts(arm, shared_data, tmp_path_factory):
     def parts_of(name):
         path = tmp_path_factory.mktemp("converted") / f"{name}.csv"
         convert(shared_data / f"trajectories/{name}.csv", path, format="wpi-csv", arm=arm)
-        return path, slow_parts(read_recording(path, arm), arm)
+        return path, low_speed_segments(read_recording(path, arm), arm)
 
     return {name: parts_of(name) for name in ("psm_one", "psm_one_205g_insertion")}
 
@@ -147,16 +149,16 @@ def test_a_real_excitation_motion_is_no_recording_of_poses(arm, real_parts):
         parts, measured = real_parts[name][1]
         model = identify_static(parts, arm, measured=measured).model
         assert measured[:, 0].sum() == 0
-        assert model.joints[0].trust == model.joints[2].trust == 0.0
+        assert model.joints[0].feedforward_scale == model.joints[2].feedforward_scale == 0.0
         assert np.all(model.holding_torque(np.array([0.5, 0.4, 0.1, 0, 0, 0, 0]))[[0, 2]] == 0.0)
         for joint in validate_static(model, real_parts[other][1].recording, real_parts[other][1].measured).joints:
-            assert joint.rms_error_undoubted <= joint.rms_torque_undoubted + 1e-12, (name, joint.name)
+            assert joint.rms_error_included <= joint.rms_torque_included + 1e-12, (name, joint.name)
 
 
 def test_identify_warns_of_torques_from_segments(real_parts, tmp_path, capsys):
     path = real_parts["psm_one"][0]
     output = str(tmp_path / "model.yaml")
-    assert main(["identify", str(path), "--arm", "psm", "--slow-parts", "--output", output]) == 0
+    assert main(["identify", str(path), "--arm", "psm", "--low-speed-segments", "--output", output]) == 0
     warnings = [line for line in capsys.readouterr().err.splitlines() if "low-speed segments" in line]
-    commanded = [joint.name for joint in IdentifiedModel.load(output).joints if joint.trust > 0]
+    commanded = [joint.name for joint in IdentifiedModel.load(output).joints if joint.feedforward_scale > 0]
     assert len(warnings) == 1 and ", ".join(commanded) in warnings[0]

@@ -1,6 +1,6 @@
 """What each effect of a real arm costs: time of a simulated step, as a ratio to the arm without effects.
 
-    python benchmarks/honest_arm.py [--arm NAME] [--closure mimic|ball] [--repetitions N] [--json FILE]
+    python benchmarks/simulated_effects.py [--arm NAME] [--closure mimic|ball] [--repetitions N] [--json FILE]
 
 All rows simulate the same ArmStation at 1 kHz under GravityPidController ("hold"), which follows one slow cubic in all
 joints, so that friction slips and sticks. Rows: the ideal arm, the machinery of effects without any, each part alone,
@@ -9,7 +9,7 @@ that can have one has one that gives STRETCH under the motor's largest effort. R
 busy machine slows all rows alike; times are CPU time of this process, the least over the repetitions. `real time` is
 simulated time over CPU time.
 
-A third of a step is Drake's allocations: set LD_PRELOAD or GLIBC_TUNABLES for a faster allocator, see docs/real_arm.md.
+A third of a step is Drake's allocations: set LD_PRELOAD or GLIBC_TUNABLES for a faster allocator, see docs/simulated_effects.md.
 """
 
 from __future__ import annotations

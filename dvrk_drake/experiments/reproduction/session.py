@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.experiments.ground_truth import GroundTruth, collect, paper_arm, unlike_its_drawing
+from dvrk_drake.experiments.ground_truth import GroundTruth, collect, paper_arm, perturbed_ground_truth
 from dvrk_drake.experiments.reproduction.drift_experiment import DURATION, Drifts, Release, release_all
 from dvrk_drake.experiments.reproduction.published import (
     FIGURE_7_FAULTY,
@@ -24,21 +24,21 @@ from dvrk_drake.experiments.reproduction.published import (
     paper_model,
     with_zeroed,
 )
-from dvrk_drake.experiments.transparency import Compensation, Felt, feel, rambling_path
+from dvrk_drake.experiments.transparency import Compensation, OperatorForces, random_path, simulate_operator
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.progress import Progress
 from dvrk_drake.recordings.recording import Recording, write_recording
 
 
 @dataclass(frozen=True)
-class Extent:
+class SampleSizes:
     """How much is done; smaller numbers are for tests.
 
     Attributes:
         collected: poses that an arm is identified from.
         releases: random poses that ours is released at.
         paper_releases: the first of these, for the paper's parameters.
-        led_releases: the first of these, for ours led there first.
+        hand_guided_releases: the first of these, for ours led there first.
         psm_releases: for the PSM.
         path_poses: that a hand leads the arm through.
         duration: of a release [s].
@@ -47,7 +47,7 @@ class Extent:
     collected: int = 40
     releases: int = 200
     paper_releases: int = 20
-    led_releases: int = 20
+    hand_guided_releases: int = 20
     psm_releases: int = 20
     path_poses: int = 5
     duration: float = DURATION
@@ -64,7 +64,7 @@ class Identified:
 
 
 @dataclass(eq=False)
-class Laboratory:
+class ReproductionSession:
     """Everything is made when it is first asked for.
 
     Attributes:
@@ -72,7 +72,7 @@ class Laboratory:
         recordings: of the paper's arm.
         executor: what is simulated runs there.
         progress: called with the step and its finished share, 0..1.
-        extent: how much is done.
+        sample_sizes: how much is done.
         seed: of true arms, poses and noise.
     """
 
@@ -80,7 +80,7 @@ class Laboratory:
     recordings: PaperRecordings
     executor: Executor
     progress: Progress = lambda step, share: None
-    extent: Extent = Extent()
+    sample_sizes: SampleSizes = SampleSizes()
     seed: int = 0
 
     @cached_property
@@ -88,7 +88,7 @@ class Laboratory:
         """The paper's arm if its recording is there, else one unlike its drawing; identified."""
         self.progress("finding the true MTM", 0.0)
         if self.recordings.folder is None:
-            truth = unlike_its_drawing(PAPER_ARM, self.folder, self.seed)
+            truth = perturbed_ground_truth(PAPER_ARM, self.folder, self.seed)
         else:
             truth = paper_arm(self.recordings.poses, self.folder)
         return self._identified(truth, PAPER_ARM)
@@ -96,13 +96,13 @@ class Laboratory:
     @cached_property
     def psm(self) -> Identified:
         """A PSM unlike its drawing; identified."""
-        return self._identified(unlike_its_drawing("psm", self.folder, self.seed), "psm")
+        return self._identified(perturbed_ground_truth("psm", self.folder, self.seed), "psm")
 
     @cached_property
     def paper_file(self) -> Path:
         """The file of the paper's own parameters; on another arm than the paper's, of its method on the same poses."""
         mtm, path = self.mtm, self.folder / "paper_model.yaml"
-        if mtm.truth.is_the_papers:
+        if mtm.truth.is_paper_arm:
             paper_model(load_arm(PAPER_ARM)).save(path)
         else:
             identify_static(mtm.poses, load_arm(PAPER_ARM), "paper").model.save(path)
@@ -123,7 +123,7 @@ class Laboratory:
     ) -> Drifts:
         """Of the arm `name`, at `poses` (m, n), under the model in a file, for at most `longest` [s]; `parts`,
         `damped`, `led` and `hysteresis_ratio`: see `Release`."""
-        duration = min(self.extent.duration, longest)
+        duration = min(self.sample_sizes.duration, longest)
         every = Release(
             name, truth.arm, tuple(parts), str(model), poses[0], damped, led, hysteresis_ratio, duration, self.seed
         )
@@ -147,7 +147,7 @@ class Laboratory:
         poses = collect(
             truth,
             name,
-            self.extent.collected,
+            self.sample_sizes.collected,
             self.seed,
             self.executor,
             lambda share: self.progress(f"collecting poses of the {label}", share),
@@ -174,11 +174,11 @@ class Lead:
     seed: int
 
 
-def led(lead: Lead) -> Felt:
+def led(lead: Lead) -> OperatorForces:
     """What the hand feels along a path through random poses."""
     model = IdentifiedModel.load(lead.model) if lead.model else None
     # Which friction there is, a controller knows from the same files as the arm; its weight it has to identify.
     friction = Friction.of_arm(load_arm(PAPER_ARM))
     compensation = Compensation(lead.name, model, lead.friction_ratio, friction)
-    path = rambling_path(lead.arm, lead.poses, seed=lead.seed)
-    return feel(lead.arm, path, compensation, effects=lead.arm.effects, seed=lead.seed)
+    path = random_path(lead.arm, lead.poses, seed=lead.seed)
+    return simulate_operator(lead.arm, path, compensation, effects=lead.arm.effects, seed=lead.seed)

@@ -10,7 +10,7 @@ from dvrk_drake.recordings.recording import Recording
 RATE = 200.0
 
 
-def motion_with_rests(arm, poses, generator, travel=2.0, rest=0.4, rate=RATE):
+def motion_with_pauses(arm, poses, generator, travel=2.0, rest=0.4, rate=RATE):
     """From pose to pose with a rest at each; torques are gravity's plus a viscous friction that spoils the travel."""
     t_travel, t_rest = np.arange(0, travel, 1 / rate), np.arange(0, rest, 1 / rate)
     s = t_travel / travel
