@@ -57,6 +57,11 @@ class BaseParameterEstimate:
     distinguishable: bool = False
 
 
+def _earlier(name: str) -> dict[str, object]:
+    """Returns the metadata of an RMS effort without excluded measurements, whose key ended in `_undoubted`."""
+    return RMS_EFFORTS | formerly(f"{name}_undoubted")
+
+
 @dataclass
 class JointStatistics:
     """How one joint was fitted. Torques are RMS in N m (N if prismatic), angles in rad (m).
@@ -72,8 +77,8 @@ class JointStatistics:
     rms_zero_torque: float = field(default=0.0, metadata=RMS_EFFORTS)
     rms_fit: float = field(default=0.0, metadata=RMS_EFFORTS)
     rms_leave_one_out: float = field(default=0.0, metadata=RMS_EFFORTS)
-    rms_zero_torque_included: float = field(default=0.0, metadata=RMS_EFFORTS | formerly("rms_zero_torque_undoubted"))
-    rms_fit_included: float = field(default=0.0, metadata=RMS_EFFORTS | formerly("rms_fit_undoubted"))
+    rms_zero_torque_included: float = field(default=0.0, metadata=_earlier("rms_zero_torque"))
+    rms_fit_included: float = field(default=0.0, metadata=_earlier("rms_fit"))
     rms_leave_one_out_included: float = field(
         default=0.0, metadata=RMS_EFFORTS | formerly("rms_leave_one_out_undoubted")
     )

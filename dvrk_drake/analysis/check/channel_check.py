@@ -318,7 +318,8 @@ def _offsets(fit: ChannelFit) -> Iterator[Finding]:
 
 def _undetectable(arm: Arm, joints: list[int]) -> Iterator[Finding]:
     if joints:
-        what = f"an offset of {MAX_UNDETECTED_OFFSET[0]} rad ({MAX_UNDETECTED_OFFSET[1]} m) in their positions would not show"
+        angle, length = MAX_UNDETECTED_OFFSET
+        what = f"an offset of {angle} rad ({length} m) in their positions would not show"
         advice = "this recording cannot tell it from the links' centres of mass; check the zeros of these encoders"
         names = ", ".join(arm.joint_names[i] for i in joints)
         yield Finding("note", "undetectable offset", names, what, advice, tuple(joints))
