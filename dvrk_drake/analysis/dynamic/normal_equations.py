@@ -202,10 +202,10 @@ class NonNegativeFit:
         return (x * self._scale)[:-1]
 
     def _minimum(self, S: NDArray[np.float64], bound: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Returns y >= 0 that minimises y' S y / 2 - b' y, starting from the positive set without the added unknown.
+        """Returns y >= 0 that minimises y' S y / 2 - b' y, starting from the current positive set.
 
-        All unknowns with a wrong sign, or with a wrong slope at 0, change sets at once (Portugal, Judice and Vicente, 1994).
-        This takes a few solutions. If it cycles, the method of Lawson and Hanson is used.
+        All unknowns with a wrong sign, or with a wrong slope at 0, change sets at once (Portugal, Judice and Vicente,
+        1994). This takes a few solutions. If it cycles, the method of Lawson and Hanson is used.
         """
         H, b = S[bound[:, None], bound], S[bound, -1]
         positive = np.append(self._positive, np.ones(len(b) - len(self._positive), dtype=bool))

@@ -134,8 +134,8 @@ class DynamicProblem:
         """Returns the stepwise selection of effects, with the rigid body reduced to its identifiable directions.
 
         Args:
-            phi: (p,) parameters about which the tilt is linearised. If given and the arm's base may tilt, the tilt adds two
-                unknowns after the effects. By default the tilt is constant.
+            phi: (p,) parameters about which the tilt is linearised. If given and the arm's base may tilt, the tilt adds
+                two unknowns after the effects. By default the tilt is constant.
             folds: False uses a single fold, for fits to the whole motion only.
         """
         base, tilts = self.columns.base, len(self.columns.tilts) if phi is not None else 0
@@ -268,8 +268,9 @@ class ConsistentProgram:
     def solve(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns x (p + e,) for weighted sums of squares (p + e + 1, p + e + 1), the measured effort last.
 
-        The sums of squares are reduced to a triangular matrix by a Cholesky decomposition in units of the prior deviation.
-        No eigenvalue is below 1 there, so the result is as accurate as a QR decomposition of the rows, at lower cost.
+        The sums of squares are reduced to a triangular matrix by a Cholesky decomposition in units of the prior
+        deviation. No eigenvalue is below 1 there, so the result is as accurate as a QR decomposition of the rows, at
+        lower cost.
 
         Raises:
             IdentificationError: The solver did not converge.

@@ -59,7 +59,7 @@ class StepwiseSelection:
         )
 
     def fit(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Returns all unknowns (k,), 0 for effects that are not included, and updates the weights from the residuals."""
+        """Returns all unknowns (k,), 0 for excluded effects, and updates the weights from the residuals."""
         for _ in range(3):
             x = self._fit_to(self._total.weighted(self.weights), effects).solve()
             self.weights = self._weights(self._total.squared_errors(x) / self._efforts)
