@@ -1,1 +1,1 @@
-"""What runs inside a Drake Diagram; one LeafSystem a file."""
+"""Systems for Drake Diagrams, one LeafSystem per file."""

@@ -1,4 +1,4 @@
-"""One simulated arm behind the ports that its driver has: the same names as those of the hardware."""
+"""Simulation of one arm with the ports of its driver. The port names are the same as those of the hardware."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from dvrk_drake.systems.ideal_drive import DrivePorts, PlantJoints, add_ideal_dr
 
 @dataclass(frozen=True)
 class StationPorts:
-    """Name -> size of the ports that a station of one arm has, in simulation and on hardware alike."""
+    """Names and sizes of the ports of a station with one arm, in simulation and on hardware alike."""
 
     inputs: dict[str, int]
     outputs: dict[str, int]
 
 
 def station_ports(arm: Arm) -> StationPorts:
-    """The ports of `arm`'s station, named like the fields of the iiwa's driver in Drake.
+    """Returns the ports of `arm`'s station, named like the fields of the iiwa's driver in Drake.
 
-    Prefixed with the arm's lower-case name; n numbers in the arm's order of joints [rad, rad/s, N m; m, m/s,
-    N].
+    The names are prefixed with the arm's lower-case name. Each port has n numbers in the arm's order of joints
+    [rad, rad/s, N m; m, m/s, N].
     """
     n, name = arm.num_joints, arm.name.lower()
     return StationPorts(
@@ -51,14 +51,14 @@ def station_ports(arm: Arm) -> StationPorts:
 
 
 def arm_plant_config(time_step: float = 1e-3) -> MultibodyPlantConfig:
-    """Returns the configuration of a station's plant: the SAP solver, and a state that is read before the step [s]."""
+    """Returns the configuration of a station's plant: SAP solver, and state output before the step. time_step in s."""
     return MultibodyPlantConfig(
         time_step=time_step, discrete_contact_approximation="sap", use_sampled_output_ports=False
     )
 
 
 class ArmStation(Diagram):
-    """A simulated arm with the ports of its driver. `HardwareArmStation` is the arm itself, over LCM.
+    """Simulated arm with the ports of its driver. `HardwareArmStation` has the same ports for the real arm, over LCM.
 
     .. pydrake_system::
 
@@ -76,26 +76,27 @@ class ArmStation(Diagram):
         - body_poses
         - query_object
 
-    `mtml` stands for the arm's lower-case name. The arm's ports have n numbers (`state_estimated` 2n: q, then
-    v) for the independent joints, in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]; the
-    linkage follows them.
+    `mtml` stands for the arm's lower-case name. The arm's ports have n numbers (`state_estimated` 2n: q, then v) for
+    the independent joints, in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]. The linkage follows
+    them.
 
-    - `effort_commanded`: clamped to the plant's effort limits. Unconnected: zero, a limp arm.
-    - `effort_disturbance`: added behind the motors and not clamped: friction, cables, a hand. Unconnected:
-      zero.
-    - `effort_measured`: what the motors apply, the command after the clamp.
-    - `state_true` (2n): q, then v as they are, whatever `effects` make of what is measured.
-    - `plant_state`, `body_poses`, `query_object`: the plant's own, of the whole tree. The hardware does not have them,
-      nor `state_true` and `effort_disturbance`; all others are those of `station_ports`.
+    - `effort_commanded`: commanded effort, clamped to the plant's effort limits. Unconnected: zero effort.
+    - `effort_disturbance`: effort that is added after the motors without a limit, e.g. friction, cables or a hand.
+      Unconnected: zero.
+    - `effort_measured`: applied motor effort, the command after the limits.
+    - `state_true` (2n): true q, then v, independent of the `effects` on the measurement.
+    - `plant_state`, `body_poses`, `query_object`: ports of the plant, for the whole tree. The hardware has neither
+      these nor `state_true` and `effort_disturbance`. All other ports are those of `station_ports`.
 
-    Without `effects` all of it is C++ and has no state but the plant's, and measured values are exact and undelayed.
-    `effects` are those of a real arm, see `ArmEffects`: friction, cables, stops, encoders, motors and delays as
-    `arm.effects` states them. A discrete controller beside the station sees the arm as it is when the period starts,
-    and its command acts from the next one on: it is a period late, as on hardware.
+    Without `effects`, the station consists of C++ systems and has no state besides the plant's. Measured values are
+    then exact and without delay. `effects` adds those of a real arm, see `ArmEffects`: friction, cables, stops,
+    encoders, motors and delays as stated in `arm.effects`. A discrete controller connected to the station receives the
+    state at the start of a period, and its command acts from the next period on. The delay of one period is the same as
+    on hardware.
 
-    Drake's solver holds the linkage to about 1e-8 m at 1 ms with either `closure`, and each joint in its position
-    limits; the coupled limits of the linkage are there with the effect `stops`. An arm's shapes never touch each other:
-    they are collision shapes only where `modify_plant` adds one that they can touch.
+    With either `closure`, Drake's solver holds the linkage to about 1e-8 m at 1 ms, and each joint in its position
+    limits. The coupled limits of the linkage are included with the effect `stops`. The shapes of an arm never collide
+    with each other. They are collision shapes only if `modify_plant` adds a shape that they can touch.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -119,26 +120,24 @@ class ArmStation(Diagram):
         effects: ArmEffects | None = None,
         seed: int = 0,
     ) -> None:
-        """Builds the station; the arm starts at zero, or at the nearest pose inside its limits.
+        """Builds the station. The arm starts at zero, or at the nearest pose inside its limits.
 
         Args:
-            arm: names the ports, and is the arm that controllers of this station know.
-            plant_config: time step, contact model and so on of the plant; `arm_plant_config()` by default.
-            meshcat: draws the arm there, below the path of its lower-case name: `SetTransform("mtml", X_WB)` places
-            it.
-            closure: how the linkage's loops are held, see `add_arm`.
-            plant_arm: the arm that is simulated, `arm` by default: another mounting or SDF with the same
-            joints.
-            modify_plant: called with the plant before it is finalized, e.g. to add a payload, damping or
-            other effort limits.
-                Drake can change the inertia of links that are already there only in a Context:
-                `SetLinkInertias`.
-            effects: of the real arm that the simulation shall have, e.g. `arm.effects` or
-            `arm.effects.only(["friction"])`; none by default.
-            seed: of the effects' noise.
+            arm: Arm after which the ports are named, and which the controllers of this station use.
+            plant_config: Configuration of the plant: time step, contact model etc. `arm_plant_config()` by default.
+            meshcat: Meshcat in which the arm is drawn, below the path of its lower-case name.
+                `SetTransform("mtml", X_WB)` places it.
+            closure: Method that closes the linkage's loops, see `add_arm`.
+            plant_arm: Arm that is simulated, `arm` by default. It may have another mounting or SDF with the same
+                joints.
+            modify_plant: Function called with the plant before it is finalized, e.g. to add a payload, damping or other
+                effort limits. Drake can change the inertia of existing links only in a Context, see `SetLinkInertias`.
+            effects: Simulated effects of the real arm, e.g. `arm.effects` or `arm.effects.only(["friction"])`. None by
+                default.
+            seed: Seed of the effects' noise.
 
         Raises:
-            StationError: the plant's configuration is not one of an arm, or `plant_arm` has other joints.
+            StationError: The plant's configuration is not valid for an arm, or `plant_arm` has other joints.
         """
         super().__init__()
         self._arm = arm
@@ -155,7 +154,7 @@ class ArmStation(Diagram):
             )
         builder = DiagramBuilder()
         self._plant, self._scene_graph = AddMultibodyPlant(plant_config, builder)
-        # Nothing else is in the plant, so nothing touches the arm unless somebody adds it.
+        # The plant contains nothing else, so the arm has contacts only with bodies that `modify_plant` adds.
         self._instance = add_arm(
             self._plant, self._ground_truth_arm, closure, collision_shapes=modify_plant is not None
         )
@@ -168,7 +167,7 @@ class ArmStation(Diagram):
         self._joints = PlantJoints(self._plant, self._ground_truth_arm, self._instance)
         self._set_default_pose()
         if meshcat is not None:
-            # The visualizer deletes its prefix when it starts: one level down, so that a SetTransform stays.
+            # The visualizer deletes its prefix when it starts. One level below, an earlier SetTransform persists.
             parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
             MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
         if effects is None or self._parts is None:
@@ -191,7 +190,7 @@ class ArmStation(Diagram):
 
     @property
     def arm(self) -> Arm:
-        """The arm that the ports are named and ordered after."""
+        """Arm that defines the names and order of the ports."""
         return self._arm
 
     @property
@@ -200,11 +199,11 @@ class ArmStation(Diagram):
         return self._plant
 
     def SetPositions(self, context: Context, q: ArrayLike) -> None:
-        """Puts the arm at the pose q (n,) of its independent joints, linkage included, at rest.
+        """Sets the pose q (n,) of the independent joints, with the linkage consistent and all velocities zero.
 
         Args:
-            context: of this station, not of a Diagram around it.
-            q: pose; it need not be inside the limits.
+            context: Context of this station, not of a Diagram that contains it.
+            q: Pose. It need not be inside the limits.
 
         Raises:
             StationError: q is not n finite numbers.
@@ -223,21 +222,21 @@ class ArmStation(Diagram):
         self.plant.SetVelocities(plant_context, np.zeros(self.plant.num_velocities()))
 
     def GetPositions(self, context: Context) -> NDArray[np.float64]:
-        """Pose (n,) of the independent joints in this station's context."""
+        """Returns the pose (n,) of the independent joints in this station's context."""
         plant_context = self.GetSubsystemContext(self.plant, context)
         q: NDArray[np.float64] = self.plant.GetPositions(plant_context)[self._joints.index]
         return q
 
     def SetLinkInertias(self, context: Context, inertias: Mapping[str, SpatialInertia]) -> None:
-        """Gives links another inertia in this station's context: an arm that differs from its model.
+        """Changes the inertia of links in this station's context, for an arm that differs from its model.
 
         Args:
-            context: of this station.
-            inertias: link name -> spatial inertia M_LLo_L about the link's origin, in its frame [kg, m, kg
-            m^2].
+            context: Context of this station.
+            inertias: Mapping of link name to spatial inertia M_LLo_L about the link's origin, in its frame
+                [kg, m, kg m^2].
 
         Raises:
-            StationError: a link that the arm does not have.
+            StationError: A link that the arm does not have.
         """
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
         bodies = {self.plant.get_body(i).name(): i for i in self.plant.GetBodyIndices(self._instance)}
@@ -247,7 +246,7 @@ class ArmStation(Diagram):
             self.plant.get_body(bodies[name]).SetSpatialInertiaInBodyFrame(plant_context, M_LLo_L)
 
     def _drop_idle_shapes(self) -> None:
-        """Takes the collision shapes out if no two of them may touch: they would cost a sixth of a step for nothing."""
+        """Removes the collision shapes if no two of them can collide. They would take a sixth of the time of a step."""
         if self._scene_graph.model_inspector().GetCollisionCandidates():
             return
         plant = self.plant
@@ -285,12 +284,12 @@ class ArmStation(Diagram):
 
 
 def plant_config_fault(config: MultibodyPlantConfig) -> str:
-    """Why a station's plant cannot have this configuration, or ""."""
+    """Returns the reason why a station's plant cannot have this configuration. Empty: it can."""
     if not 0 < config.time_step <= 0.01:
         return f"time_step must be above 0 and at most 0.01 s: the wrist is lost above; got {config.time_step}"
     if config.discrete_contact_approximation == "tamsi":
         return 'discrete_contact_approximation is "tamsi"; a linkage needs sap, similar or lagged'
     if config.use_sampled_output_ports:
-        # Drake then steps the plant before all discrete updates, and what they measure is from after the step.
+        # Drake then steps the plant before all discrete updates, which would use measurements from after the step.
         return "use_sampled_output_ports must be false, so that a command acts after its measurement"
     return ""

@@ -1,4 +1,4 @@
-"""An arm in Meshcat, posed by its independent joints alone, and where a camera stands to see it."""
+"""Display of an arm in Meshcat, posed by its independent joints alone, with a suitable camera position."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, set_arm_positions
 
-#: From what the camera looks at toward the camera (base frame), and the magnification of Meshcat's 75 degree view.
+#: Direction from the target to the camera (base frame), and the magnification of Meshcat's 75 degree view.
 DIRECTION, ZOOM = (1.1, 1.0, 0.3), 2.8
-#: Half the height of that view at distance 1, and its width over its height in a common browser window.
+#: Half the height of that view at distance 1, and its aspect ratio (width / height) in a common browser window.
 HALF_HEIGHT, ASPECT = np.tan(np.radians(75 / 2)) / ZOOM, 1.2
-#: How far each joint goes toward its limits in the poses that the view holds (all of it would show the arm small), and
-#: how much wider than these poses the view is.
+#: Fraction of the way to the limits that each joint moves in the poses inside the view (the whole range would show the
+#: arm small), and the factor by which the view is wider than these poses.
 SHARE, MARGIN = 0.75, 1.05
 
 
 def framing(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places (3,) [m, base frame] of a camera and of what it looks at, such that the arm fills the view.
+    """Returns the positions (3,) [m, base frame] of a camera and of its target, so that the arm fills the view.
 
-    The arm at home and with each joint in turn at SHARE of its way to either limit, so that moving it does not
-    leave the view at once.
+    The view contains the arm at home and with each joint in turn at SHARE of the way to either limit. So a motion of
+    the arm does not leave the view at once.
 
     Raises:
-        ArmError: the arm has no visual geometry.
+        ArmError: The arm has no visual geometry.
     """
     p_WC = geometry_corners(arm)
     target = (p_WC.min(axis=0) + p_WC.max(axis=0)) / 2
@@ -43,10 +43,10 @@ def framing(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def geometry_corners(arm: Arm) -> NDArray[np.float64]:
-    """Corners (n, 3) [m, base frame] of the boxes around the visual geometry at the poses that the view holds.
+    """Returns corners (n, 3) [m, base frame] of the boxes around the visual geometry at the poses inside the view.
 
     Raises:
-        ArmError: the arm has no visual geometry.
+        ArmError: The arm has no visual geometry.
     """
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
@@ -81,14 +81,14 @@ def start_meshcat(
     """Starts Meshcat, Drake's 3D view in a browser, on localhost with a light background.
 
     Args:
-        arm: which the view shall frame; the caller draws it, e.g. with `ArmStation(arm, meshcat=meshcat)`.
-        camera, target: without an arm: where the camera stands and what it looks at (3,) [m].
-        zoom: magnification of Meshcat's 75 degree view [1].
-        port: 1024..65535; by default a free one.
+        arm: Arm that the view frames. The caller draws it, e.g. with `ArmStation(arm, meshcat=meshcat)`.
+        camera, target: Positions (3,) of the camera and of its target [m], for a view without an arm.
+        zoom: Magnification of Meshcat's 75 degree view [1].
+        port: Port in 1024..65535; by default a free one.
 
     Raises:
-        DvrkDrakeError: the port cannot be opened.
-        ArmError: the arm has no visual geometry.
+        DvrkDrakeError: The port cannot be opened.
+        ArmError: The arm has no visual geometry.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -116,17 +116,17 @@ def start_meshcat(
 
 
 class ArmView:
-    """Draws an arm at poses of its independent joints; sliders for them on request.
+    """Draws an arm at poses of its independent joints, optionally with sliders for them.
 
-    Drake's own JointSliders move every joint of the tree by itself and pull the parallelogram apart; here the dependent
-    joints follow through the arm's linkage.
+    Drake's own JointSliders move every joint of the tree independently and open the parallelogram. Here, the dependent
+    joints follow from the arm's linkage.
     """
 
     def __init__(self, arm: Arm, meshcat: Meshcat, role: Role = Role.kIllustration) -> None:
-        """Of `arm` in `meshcat`, at home: all joints at zero, or as near as their limits allow.
+        """Draws `arm` in `meshcat` at its home pose: all joints at zero, or as near as their limits allow.
 
         Raises:
-            ArmError: the arm has nothing to draw in that role.
+            ArmError: The arm has no geometry in that role.
         """
         self.arm, self.meshcat = arm, meshcat
         builder = DiagramBuilder()
@@ -144,7 +144,7 @@ class ArmView:
         self.show(self._q)
 
     def show(self, q: ArrayLike) -> None:
-        """Draws the pose q (n,) [rad, m]; it need not be inside the limits."""
+        """Draws the pose q (n,) [rad, m]. It need not be inside the limits."""
         self._q = np.array(q, dtype=float)
         set_arm_positions(self._plant, self._plant.GetMyMutableContextFromRoot(self._context), self.arm, self._q)
         self._diagram.ForcedPublish(self._context)
@@ -157,9 +157,9 @@ class ArmView:
             self.meshcat.AddSlider(name, lower, upper, (upper - lower) / 1000, self._q[i])
 
     def follow_sliders(self) -> NDArray[np.float64]:
-        """Draws the sliders' pose if it changed, and returns it.
+        """Draws the pose of the sliders if it changed, and returns it.
 
-        A coupled limit stops the sliders of its joints, and a button without function names it.
+        A coupled limit stops the sliders of its joints. A button without function shows the name of the limit.
         """
         wanted = np.array([self.meshcat.GetSliderValue(name) for name in self._slider_names])
         if np.array_equal(wanted, self._q):
@@ -178,9 +178,9 @@ class ArmView:
         return self._q
 
     def _inside_coupled_limits(self, wanted: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
-        """The wanted pose with the joints of each coupled limit stopped there, and the limits that stopped them.
+        """Returns the pose with the joints of each coupled limit stopped there, and the names of these limits.
 
-        A slider moves in steps, so the shown pose may be slightly beyond a limit: then it goes no further.
+        A slider moves in steps, so the shown pose may be slightly beyond a limit. It then moves no further.
         """
         A, lower, upper = self.arm.limit_matrix()
         n, q, stops = self.arm.num_joints, wanted.copy(), []

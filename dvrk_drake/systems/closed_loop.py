@@ -1,4 +1,4 @@
-"""The wires between an arm's station, its controller and what is desired of it."""
+"""Connections between an arm's station, its controller and the source of its desired state."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def add_closed_loop(
     """Adds a station and its controller to a Diagram and connects them.
 
     Args:
-        builder: of the diagram that they become part of.
-        station: the arm.
-        controller: of an arm with the same joints: a `GravityPidController`, or a System with an input port
+        builder: Builder of the diagram to which they are added.
+        station: Station of the arm.
+        controller: Controller of an arm with the same joints: a `GravityPidController`, or a System with an input port
             `state_estimated` (2n) and an output port `effort` (n).
-        desired: a source with one output port: q_d, then v_d (2n,). Without it the controller holds where it starts.
-        friction: takes a share of the arm's friction off a hand.
+        desired: Source with one output port: q_d, then v_d (2n,). Without it the controller holds the initial pose.
+        friction: Compensator for a share of the arm's friction.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -51,9 +51,9 @@ def connect_controller(
     desired: System | None = None,
     friction: FrictionCompensator | None = None,
 ) -> None:
-    """Adds a controller and what belongs to it to a `builder` that has the station, and connects them.
+    """Adds a controller with the systems that it needs to a `builder` that has the station, and connects them.
 
-    Arguments as of `add_closed_loop`.
+    The arguments are those of `add_closed_loop`.
     """
     name = station.arm.name.lower()
     builder.AddSystem(controller)

@@ -1,4 +1,4 @@
-"""Leads from the effort that the arm has to the effort that a controller wants."""
+"""Ramp from the measured effort of an arm to the effort of a controller."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dvrk_drake.errors import ControllerError
 
 
 class EffortRamp(LeafSystem):
-    """Passes the measured effort on until it is enabled, and from then on moves to the wanted one in `duration`.
+    """Outputs the measured effort until it is enabled. It then changes to the desired one over `duration`.
 
-    So a command guard that accepts only efforts near the present ones sees nothing else before its arm obeys, and the
-    arm feels no step when it does.
+    A command guard that accepts only efforts near the present ones receives such efforts until its arm follows. The
+    effort on the arm has no step.
 
     .. pydrake_system::
 
@@ -23,16 +23,16 @@ class EffortRamp(LeafSystem):
         output_ports:
         - effort
 
-    `effort_wanted`, `effort_measured` and `effort` have n numbers [N m; N on a prismatic joint]; `enabled` one, 0 or
-    not. `effort` is start + share * (wanted - start): start the last measured effort before it was enabled, share from
-    0 to 1. Both are discrete state, updated every `period` or by a forced discrete update.
+    `effort_wanted`, `effort_measured` and `effort` have n numbers [N m; N on a prismatic joint]. `enabled` has one, zero
+    or not. `effort` is start + share * (wanted - start), where start is the last measured effort before it was enabled
+    and share increases from 0 to 1. Both are discrete state, updated every `period` or by a forced discrete update.
     """
 
     def __init__(self, num_joints: int, *, period: float = 1e-3, duration: float = 1.0) -> None:
-        """Of `num_joints`; `period` of the update and `duration` of the ramp [s].
+        """Creates a ramp for `num_joints` joints with an update `period` and a `duration` of the ramp [s].
 
         Raises:
-            ControllerError: they are not positive.
+            ControllerError: They are not positive.
         """
         super().__init__()
         if not (period > 0 and duration > 0):
@@ -49,7 +49,7 @@ class EffortRamp(LeafSystem):
         self.DeclareForcedDiscreteUpdateEvent(self._update)
 
     def GetShare(self, context: Context) -> float:
-        """How much of the way is done, 0..1."""
+        """Returns the completed share of the ramp, 0..1."""
         return float(context.get_discrete_state(int(self._share)).get_value()[0])
 
     def _update(self, context: Context, state: DiscreteValues) -> None:

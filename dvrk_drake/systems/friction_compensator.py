@@ -1,4 +1,4 @@
-"""Takes a part of an arm's friction off the hand that moves it."""
+"""Compensation of a share of an arm's friction, to reduce the interaction force of an operator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 
 
 class FrictionCompensator(LeafSystem):
-    """Adds to a controller's effort what a share of the identified friction would need, and never enough to move alone.
+    """Adds a share of the identified friction to a controller's effort. The sum never moves the arm by itself.
 
     .. pydrake_system::
 
@@ -29,22 +29,22 @@ class FrictionCompensator(LeafSystem):
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
     - `state_estimated` (2n): q, then v.
-    - `effort_wanted` (n): of a controller, e.g. GravityPidController.
+    - `effort_wanted` (n): effort of a controller, e.g. GravityPidController.
     - `effort` (n): effort_wanted + friction_effort, inside the effort limits.
-    - `friction_effort` (n): sum of ratio_k coefficient_k shape_k row_k'. The same elements as the identified friction,
-      see `dvrk_drake.dynamics.actuator_effects`: dry friction is compensated by the hysteresis that it is, from the
-      travel of the joint and not from a sign of its velocity, which is noise near zero.
+    - `friction_effort` (n): sum of ratio_k coefficient_k shape_k row_k'. The elements are those of the identified
+      friction, see `dvrk_drake.dynamics.actuator_effects`. Dry friction is compensated as a hysteresis that depends on
+      the travel of the joint, not on the sign of its velocity, which is noise near zero.
 
-    **Why it is passive.** An elasto-plastic element takes c |slip|. One that starts later (`widening` >= 1 times the
-    travel until it slips) slips no more than the arm's own, so ratio times it gives back at most `ratio` of what the
-    arm's friction takes, beside what it can store, ratio c d widening / 2. Viscous and smoothed Coulomb terms are at
-    most `ratio` of the arm's at every speed. A delay turns such a term's phase, but not beyond that of the arm's own,
-    which stays larger. What remains is friction of its own: no cycle can feed on it. And it holds the arm against
-    errors of the gravity compensation, as `safe_ratios` sees to.
+    **Passivity.** An elasto-plastic element dissipates c |slip|. The compensating element starts later, at `widening`
+    >= 1 times the travel at which the arm's element slips, so it slips no more than the arm's own. It therefore returns
+    at most `ratio` of the energy that the arm's friction dissipates, besides the energy that it can store,
+    ratio c d widening / 2. Viscous and smoothed Coulomb terms are at most `ratio` of the arm's at every speed. A delay
+    shifts the phase of such a term, but the arm's own term remains larger. The remainder is friction, so no cycle gains
+    energy. It also holds the arm against errors of the gravity compensation, see `safe_ratios`.
 
-    **Time.** State (the elements' stretch, the last position) changes every `period`, at initialization, when the
-    elements are relaxed, and by a forced update. While `state_estimated` is not finite `friction_effort` is zero; then
-    the elements start relaxed.
+    **Time.** The state consists of the deflections of the elements and the last position. It changes every `period`, at
+    initialization, when the elements are relaxed, and by a forced update. While `state_estimated` is not finite,
+    `friction_effort` is zero. Afterwards the elements start relaxed.
     """
 
     def __init__(
@@ -57,19 +57,19 @@ class FrictionCompensator(LeafSystem):
         widening: float = 1.5,
         period: float = 1e-3,
     ) -> None:
-        """Of an arm's friction.
+        """Creates the compensator for an arm's friction.
 
         Args:
-            friction: as identified.
-            ratio: share of it that is compensated, 0..`MAX_RATIO`.
-            hysteresis_ratio: at least this share, 0..`MAX_HYSTERESIS_RATIO`, of the wide hysteresis that moves an
-                arm back where it was led from when it is let go, see `safe_ratios`.
-            holding_error: (n,) by which the gravity compensation may be wrong [N m, N]; lowers the ratio where needed.
-            widening: the compensation's scales over the identified ones, from 1.
-            period: of the update [s].
+            friction: Identified friction.
+            ratio: Share of it that is compensated, 0..`MAX_RATIO`.
+            hysteresis_ratio: Least share, 0..`MAX_HYSTERESIS_RATIO`, of the wide hysteresis that moves a released arm
+                back towards its earlier position, see `safe_ratios`.
+            holding_error: Error (n,) of the gravity compensation [N m, N]. It lowers the ratio where needed.
+            widening: Ratio of the compensation's scales to the identified ones, at least 1.
+            period: Period of the update [s].
 
         Raises:
-            ControllerError: a number that is none of these.
+            ControllerError: A number is out of range.
         """
         super().__init__()
         check_ratios(ratio, hysteresis_ratio)
@@ -88,7 +88,7 @@ class FrictionCompensator(LeafSystem):
         )
         self._state_port = self.DeclareVectorInputPort("state_estimated", 2 * n)
         self._wanted_port = self.DeclareVectorInputPort("effort_wanted", n)
-        # Stretch of the elements, last positions of their coordinates, friction effort, whether positions are known.
+        # Deflections of the elements, last positions of their coordinates, friction effort, flag of valid positions.
         self._memory = self.DeclareDiscreteState(2 * len(kinds) + n + 1)
         self._at = slice(2 * len(kinds), 2 * len(kinds) + n)
         ticket = self.discrete_state_ticket(self._memory)
@@ -100,7 +100,7 @@ class FrictionCompensator(LeafSystem):
 
     @property
     def ratios(self) -> NDArray[np.float64]:
-        """(k,) share of each effect of the friction that is compensated."""
+        """Compensated share (k,) of each friction effect."""
         return self._ratios.copy()
 
     def _restart(self, context: Context, state: DiscreteValues) -> None:
@@ -130,14 +130,14 @@ def _advance(
     weights: NDArray[np.float64],
     memory: NDArray[np.float64],
 ) -> None:
-    """One step of all elements, in place in `memory`, see FrictionCompensator."""
+    """Computes one step of all elements, in place in `memory`, see FrictionCompensator."""
     k, n = rows.shape
     stretch, last, effort = memory[:k], memory[k : 2 * k], memory[2 * k : 2 * k + n]
     effort[:] = 0.0
     known = memory[-1] == 1.0
     memory[-1] = 0.0
     for i in range(2 * n):
-        if not abs(state[i]) < IMPLAUSIBLE:  # also true of NaN
+        if not abs(state[i]) < IMPLAUSIBLE:  # also true for NaN
             return
     memory[-1] = 1.0
     for j in range(k):

@@ -1,4 +1,4 @@
-"""Gravity compensation and PID control of one arm, compiled: equation 11 of the paper."""
+"""Compiled gravity compensation and PID control of one arm: equation 11 of the paper."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.systems.gravity_pid_step import compile_step
 
-#: "hold" regulates a pose, "gravity" only carries the arm's weight and leaves it free to move, "damped" also brakes it.
+#: "hold" regulates a pose, "gravity" compensates gravity and leaves the arm free to move, "damped" adds damping.
 Mode = Literal["hold", "gravity", "damped"]
 
 _MODES: tuple[Mode, ...] = get_args(Mode)
 
 
 class GravityPidController(LeafSystem):
-    """Carries an arm's weight and, in "hold" mode, regulates its pose.
+    """Compensates gravity and, in "hold" mode, regulates the arm's pose.
 
-    The law is tau = G(q) + Kp e + Kd de + integral(Ki e dt), the paper's equation 11, with e = q_d - q and
-    de = v_d - v for every joint: no position ever enters the damping term. G(q) is the model's static torque
-    (gravity and joint effects, scaled by each joint's feedforward scale). Gains are diagonal. In "gravity" mode tau = G(q), in
-    "damped" mode tau = G(q) - Kd v: whatever G is wrong by, the arm creeps and does not run away.
+    The control law is tau = G(q) + Kp e + Kd de + integral(Ki e dt), the paper's equation 11, with e = q_d - q and
+    de = v_d - v for every joint. The damping term uses no positions. G(q) is the model's static torque: gravity and
+    joint effects, scaled by each joint's feedforward scale. Gains are diagonal. In "gravity" mode tau = G(q). In
+    "damped" mode tau = G(q) - Kd v, so an error of G causes a slow motion that does not accelerate.
 
     .. pydrake_system::
 
@@ -44,28 +44,29 @@ class GravityPidController(LeafSystem):
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
     - `state_estimated` (2n): q, then v. Not connected: ControllerError at initialization.
-    - `desired_state` (2n): q_d, then v_d. Read in "hold" mode only. Unconnected, that mode holds the latched
-      pose: the one at initialization, or at the last change to "hold", or when a fault ended; so it never jumps.
-    - `effort` (n): the command, inside the effort limits.
+    - `desired_state` (2n): q_d, then v_d. Read in "hold" mode only. Unconnected: that mode holds the latched pose. It
+      is latched at initialization, at a change to "hold" and at the end of a fault, so it never jumps.
+    - `effort` (n): command inside the effort limits.
     - `gravity_effort` (n): G(q) alone, before the limits.
     - `fault` (1): 1 while `state_estimated` (or a `desired_state` that is read) is not finite or beyond 1e6, else 0.
 
-    **Time.** Inputs are sampled and the outputs change every `period` seconds, and at initialization, which
-    also empties the integrator and latches the pose. Beside a discrete plant of the same period without sampled
-    output ports, as that of ArmStation, the command is therefore one period late, as it is on hardware; beside one that
-    has them, Drake's default, it is not: such a plant steps first. A forced discrete update is the same step, for loops
-    that are driven by messages. Gains and mode are numeric parameters of the Context and can be changed while running.
+    **Time.** Inputs are sampled and outputs change every `period` seconds and at initialization, which also resets the
+    integrator and latches the pose. With a discrete plant of the same period and without sampled output ports, such as
+    that of ArmStation, the command is one period late, as on hardware. With sampled output ports, Drake's default, the
+    plant steps first and there is no delay. A forced discrete update executes the same step, for loops that are driven
+    by messages. Gains and mode are numeric parameters of the Context and can be changed while running.
 
-    **Saturation.** `effort` is clamped to the effort limits. Anti-windup is by conditional integration
-    (Astrom and Hagglund, Advanced PID Control, 2006, chapter 3): a joint's integrator stands still while its
-    command is beyond the limit and the error would push it further, and while Kp e alone exceeds the limit,
-    so that a long way to go does not fill it. The integral is kept as an effort, so changing Ki causes no
-    step; Ki = 0 empties it.
+    **Saturation.** `effort` is clamped to the effort limits. Anti-windup is by conditional integration (Astrom and
+    Hagglund, Advanced PID Control, 2006, chapter 3). The integrator of a joint stops while its command is beyond the
+    limit and the error would increase it further. It also stops while Kp e alone exceeds the limit, so that a large
+    error does not fill it. The integral is stored as an effort, so a change of Ki causes no step. Ki = 0 resets it.
 
-    **Fault.** A running Diagram is not stopped by an exception. While an input is not finite, the command is
-    the gravity effort of the last finite pose, without PID: the arm is neither dropped nor driven anywhere.
-    Before any finite pose was seen it is zero. Regulation resumes by itself, with an empty integrator, when
-    the inputs are finite again.
+    **Fault.** A running Diagram is not stopped by an exception. While an input is not finite, the command is the
+    gravity effort of the last finite pose, without PID, so the arm neither falls nor moves to another pose. Before the
+    first finite pose it is zero. Regulation resumes automatically, with the integrator at zero, when the inputs are
+    finite again.
+
+    To compensate gravity of a plant without an identification, use the model from the arm's SDF, as in the example.
 
     To compensate with a plant's own gravity, nothing identified, use the model that the arm's SDF states, as here.
 
@@ -88,18 +89,18 @@ class GravityPidController(LeafSystem):
         mode: Mode = "hold",
         effort_limits: ArrayLike | None = None,
     ) -> None:
-        """Compiles the controller for the model's arm; the first time takes seconds, later ones are quick.
+        """Compiles the controller for the model's arm. The first time takes seconds, later ones are fast.
 
         Args:
-            model: what G(q) is; its parameters are copied.
-            period: of the update [s].
-            gains: n numbers each; the arm's own by default.
-            mode: "hold", "gravity" or "damped", at first; see `SetMode`.
-            effort_limits: (n,) largest magnitude of each joint's effort; the arm's own by default.
+            model: Model that defines G(q). Its parameters are copied.
+            period: Period of the update [s].
+            gains: Gains with n numbers each; the arm's own by default.
+            mode: Initial mode, "hold", "gravity" or "damped"; see `SetMode`.
+            effort_limits: Largest magnitude (n,) of each joint's effort; the arm's own by default.
 
         Raises:
-            ModelError: the model does not fit its arm.
-            ControllerError: a period, gain, mode or limit that is none.
+            ModelError: The model does not fit its arm.
+            ControllerError: A period, gain, mode or limit is invalid.
         """
         super().__init__()
         model.check()
@@ -119,7 +120,7 @@ class GravityPidController(LeafSystem):
         self._check_gains(gains)
         self._gains = [self.DeclareNumericParameter(BasicVector(k)) for k in (gains.kp, gains.kd, gains.ki)]
         self._mode = self.DeclareNumericParameter(BasicVector([self._mode_number(mode)]))
-        # In the order of the compiled step's arguments. NaN: no pose yet.
+        # In the order of the compiled step's arguments. NaN stands for no pose yet.
         effort, gravity_effort, fault, *_ = (
             self.DeclareDiscreteState(BasicVector(np.full(size, value)))
             for size, value in [(n, 0.0), (n, 0.0), (1, 0.0), (n, 0.0), (n, np.nan), (n, np.nan)]
@@ -151,26 +152,26 @@ class GravityPidController(LeafSystem):
         """Changes the gains from the next update on.
 
         Raises:
-            ControllerError: a gain that is not for this arm, see `Arm.gains_fault`.
+            ControllerError: A gain is not valid for this arm, see `Arm.gains_fault`.
         """
         self._check_gains(gains)
         for index, values in zip(self._gains, (gains.kp, gains.kd, gains.ki), strict=True):
             context.get_mutable_numeric_parameter(index).SetFromVector(values)
 
     def GetGains(self, context: Context) -> Gains:
-        """The gains in use."""
+        """Returns the gains in use."""
         return Gains(*(context.get_numeric_parameter(index).get_value().tolist() for index in self._gains))
 
     def SetMode(self, context: Context, mode: Mode) -> None:
         """Changes the mode from the next update on.
 
         Raises:
-            ControllerError: none of `Mode`.
+            ControllerError: The mode is not one of `Mode`.
         """
         context.get_mutable_numeric_parameter(self._mode).SetAtIndex(0, self._mode_number(mode))
 
     def GetMode(self, context: Context) -> Mode:
-        """The mode in use."""
+        """Returns the mode in use."""
         return _MODES[int(context.get_numeric_parameter(self._mode).GetAtIndex(0))]
 
     def _check_gains(self, gains: Gains) -> None:
@@ -191,10 +192,10 @@ class GravityPidController(LeafSystem):
     def _make_update(
         self, step: Callable[..., None], theta: NDArray[np.float64], restart: bool
     ) -> Callable[[Context, DiscreteValues], None]:
-        """The handler of an update event.
+        """Returns the handler of an update event.
 
-        It runs between two steps of the plant, which leave nothing of Python in the processor's caches: what
-        costs is each different thing that it touches. So its names are local and it touches few things.
+        The handler runs between two steps of the plant, which evict Python's data from the processor caches. Its time
+        depends on the number of different objects that it accesses, so it uses few objects and local names.
         """
         eval_vector_input, settings, period = self.EvalVectorInput, self._settings, self._period
 

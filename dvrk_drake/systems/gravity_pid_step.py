@@ -1,4 +1,4 @@
-"""One update of GravityPidController as one compiled function: the control law and nothing of Drake."""
+"""Update of GravityPidController as one compiled function, without any Drake types."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ HOLD, GRAVITY, DAMPED = 0, 1, 2
 
 @cache
 def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
-    """One update of the controller as one compiled function without allocation.
+    """Returns one update of the controller as a compiled function without allocation.
 
-    Arguments, vectors of n joints unless another size is stated:
-
-    - `state`, `desired` (2n) and `has_desired`: the inputs;
-    - `restart`: whether this is the update at initialization;
-    - `period` [s]; `mode`: index into `Mode`; `per_joint` (5, n): kp, kd, ki, feedforward_scale, effort limits; `theta`;
-    - changed in place: `effort`, `gravity`, `fault` (1), `integral`, `latched_q` and `last_q`, the pose that is
-      regulated without `desired` and the last finite one. NaN: no such pose yet.
+    Arguments of the function, vectors of n joints unless another size is stated:
+    - `state`, `desired` (2n) and `has_desired`: inputs;
+    - `restart`: true for the update at initialization;
+    - `period` [s]; `mode`: index into `Mode`;
+    - `per_joint` (5, n): kp, kd, ki, feedforward_scale, effort limits; `theta`;
+    - changed in place: `effort`, `gravity`, `fault` (1), `integral`, `latched_q` and `last_q`. The latter two are the
+      pose that is regulated without `desired` and the last finite pose. NaN stands for no such pose yet.
     """
 
     def step(
@@ -53,7 +53,7 @@ def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
             integral[:] = 0.0
         faulty = False
         for i in range(2 * n):
-            faulty |= not abs(state[i]) < IMPLAUSIBLE  # also true of NaN
+            faulty |= not abs(state[i]) < IMPLAUSIBLE  # also true for NaN
         if not faulty:
             last_q[:] = state[:n]
         if hold and has_desired:
@@ -93,7 +93,7 @@ def compile_step(torque_into: Callable[..., None]) -> Callable[..., None]:
 
     array = numba.float64[::1]
     matrix = numba.float64[:, ::1]
-    view = numba.types.Array(numba.float64, 1, "C", readonly=True)  # what Drake gives of inputs
+    view = numba.types.Array(numba.float64, 1, "C", readonly=True)  # type of Drake's input vectors
     flag = numba.boolean
     memory = (array,) * 6
     signature = numba.void(view, view, flag, flag, numba.float64, numba.int64, matrix, array, *memory)

@@ -1,4 +1,4 @@
-"""A person's hand on an arm: a spring and damper between a frame of the arm and the path that the hand follows."""
+"""Model of an operator's hand: a spring and damper between a frame of the arm and the path that the hand follows."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from dvrk_drake.models.schema_fault import number_fault, within
 
 @dataclass(frozen=True)
 class Grip:
-    """How firmly a hand holds.
+    """Stiffness, damping and limits of a hand's grip.
 
-    The defaults are of the order that is measured of people: some hundred N/m at the hand (Mussa-Ivaldi, Hogan and
-    Bizzi, J. Neurosci. 5, 1985). Limits are what a person exerts without effort.
+    The order of magnitude of the defaults is that of measurements of people: a few hundred N/m at the hand
+    (Mussa-Ivaldi, Hogan and Bizzi, J. Neurosci. 5, 1985). The limits are forces that people exert without effort.
 
     Attributes:
-        stiffness: of the position [N/m].
-        damping: of the position [N s/m].
-        rotational_stiffness: [N m/rad].
-        rotational_damping: [N m s/rad].
-        max_force: [N].
-        max_torque: [N m].
+        stiffness: Translational stiffness [N/m].
+        damping: Translational damping [N s/m].
+        rotational_stiffness: Rotational stiffness [N m/rad].
+        rotational_damping: Rotational damping [N m s/rad].
+        max_force: Largest force [N].
+        max_torque: Largest torque [N m].
     """
 
     stiffness: float = field(default=600.0, metadata=within(1e-6, 1e6, "N/m"))
@@ -43,7 +43,7 @@ class Grip:
 
 
 class Hand(LeafSystem):
-    """Pulls a frame G of an arm with base B towards a pose, as a person who holds it there.
+    """Pulls a frame G of an arm with base B towards a pose, as the hand of an operator does.
 
     .. pydrake_system::
 
@@ -56,32 +56,34 @@ class Hand(LeafSystem):
         - spatial_force
 
     - `state_estimated` (2n): q, then v of the arm's joints [rad, rad/s; m, m/s on a prismatic joint].
-    - `X_BG_desired` (RigidTransform): where the hand wants the frame. Unconnected: the hand has let go.
+    - `X_BG_desired` (RigidTransform): desired pose of the frame. Unconnected: the hand exerts no force.
     - `effort_disturbance` (n): J' F [N m, N], for `ArmStation`'s port of that name.
     - `spatial_force` (6): F_G_B, torque [N m], then force [N] of the hand on the arm at G's origin, in B.
 
-    Spring and damper are taken at the end of the coming step, to first order (linearly implicit Euler):
-    (1 + h (D + h K) J M^-1 J') F = K (e - h V) - D V, with h the station's time step, e the way to the desired pose
-    (rotation vector, then translation), V the frame's velocity and M the arm's mass matrix. So a stiff hand does not
-    shake a light wrist, whatever its gains: as h goes to zero it is F = K e - D V. Where torque or force is beyond its
-    limit, both are limited, and then each is solved again with the other as it is: a wrist that slips in the hand turns
-    further in the step, which the force must know. So the hand gives no more energy than was put into it.
+    Spring and damper are evaluated at the end of the coming step, to first order (linearly implicit Euler):
+    (1 + h (D + h K) J M^-1 J') F = K (e - h V) - D V. h is the station's time step, e the difference to the desired
+    pose (rotation vector, then translation), V the frame's velocity and M the arm's mass matrix. A stiff hand therefore
+    does not cause oscillations of a light wrist, for any gains. As h goes to zero, F = K e - D V.
 
-    With a state or pose that is not finite the hand lets go.
+    Where torque or force exceeds its limit, both are limited, and each is then computed again with the other one fixed.
+    This accounts for the larger rotation of a wrist that slips in the hand during the step. So the hand adds no energy
+    beyond its own work.
+
+    While a state or pose is not finite, the hand exerts no force.
     """
 
     def __init__(self, arm: Arm, frame_name: str = "dh_7", grip: Grip | None = None, time_step: float = 1e-3) -> None:
-        """On the frame of `arm`'s SDF of that name.
+        """Creates a hand on the frame of that name in `arm`'s SDF.
 
         Args:
-            arm: whose station it pulls.
-            frame_name: the frame G; by default an MTM's handle.
-            grip: how firmly; the default of `Grip` if none is given.
-            time_step: h, of the station's plant [s].
+            arm: Arm whose station the hand moves.
+            frame_name: Name of the frame G; by default an MTM's handle.
+            grip: Properties of the grip; `Grip()` by default.
+            time_step: Time step h of the station's plant [s].
 
         Raises:
-            ArmError: no such frame.
-            StationError: a number of the grip, or the time step, that is not positive.
+            ArmError: The frame does not exist.
+            StationError: A number of the grip or the time step is not positive.
         """
         super().__init__()
         grip = grip or Grip()
@@ -110,7 +112,7 @@ class Hand(LeafSystem):
         output.SetFromVector(self._force_and_jacobian(context)[0])
 
     def _force_and_jacobian(self, context: Context) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """F_G_B (6,) and J (6, n)."""
+        """Returns F_G_B (6,) and J (6, n)."""
         nothing = np.zeros(6), np.zeros((6, self._num_joints))
         if not self.get_input_port(1).HasValue(context):
             return nothing
@@ -127,7 +129,7 @@ class Hand(LeafSystem):
         return self._solve(A, self._K * (e - h * V) - self._D * V), J
 
     def _solve(self, A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-        """F (6,) of A F = b, within the limits."""
+        """Returns the solution F (6,) of A F = b, within the limits."""
         F = np.asarray(np.linalg.solve(A, b), float)
         torque, force = slice(0, 3), slice(3, 6)
         parts = (torque, force, self._grip.max_torque), (force, torque, self._grip.max_force)
@@ -140,13 +142,13 @@ class Hand(LeafSystem):
 
 
 def _limited(vector: NDArray[np.floating], limit: float) -> NDArray[np.floating]:
-    """`vector`, shortened to a length of `limit` if it is longer."""
+    """Returns `vector`, scaled to the length `limit` if it is longer."""
     length = float(np.linalg.norm(vector))
     return vector if length <= limit else vector * (limit / length)
 
 
 class PoseTrajectorySource(LeafSystem):
-    """Gives the pose of a trajectory at the context's time; before it and after it, that of its end.
+    """Outputs the pose of a trajectory at the context's time. Outside of its time span it outputs the nearest end pose.
 
     .. pydrake_system::
 
@@ -173,7 +175,7 @@ class PoseTrajectorySource(LeafSystem):
 
 
 class HandPath(LeafSystem):
-    """The pose X_BG that a frame G of an arm with base B has where its joints follow a trajectory.
+    """Outputs the pose X_BG of a frame G of an arm with base B whose joints follow a trajectory.
 
     .. pydrake_system::
 
@@ -181,15 +183,15 @@ class HandPath(LeafSystem):
         output_ports:
         - X_BG_desired
 
-    - `X_BG_desired` (RigidTransform): for `Hand`'s port of that name. Before the trajectory starts and after its end it
-      is not a number: the hand has let go.
+    - `X_BG_desired` (RigidTransform): for `Hand`'s port of that name. Before the start and after the end of the
+      trajectory it is NaN, so the hand exerts no force.
     """
 
     def __init__(self, arm: Arm, frame_name: str, trajectory: PiecewisePolynomial) -> None:
-        """Of the frame that `arm`'s SDF names so, along `trajectory` (n) of its joints [rad, m].
+        """Creates the path of the frame of that name in `arm`'s SDF along a joint `trajectory` (n) [rad, m].
 
         Raises:
-            ArmError: no such frame.
+            ArmError: The frame does not exist.
         """
         super().__init__()
         self._frame, self._trajectory = ArmFrame(arm, frame_name), trajectory

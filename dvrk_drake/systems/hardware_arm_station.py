@@ -1,4 +1,4 @@
-"""One arm over LCM behind the ports of its simulation."""
+"""Station of one real arm over LCM with the ports of its simulation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 
 class HardwareArmStation(Diagram):
-    """The arm itself, over LCM, with those ports of `ArmStation` that a driver has.
+    """Real arm, connected over LCM, with those ports of `ArmStation` that a driver has.
 
     .. pydrake_system::
 
@@ -25,26 +25,26 @@ class HardwareArmStation(Diagram):
         - mtml.state_estimated
         - mtml.effort_measured
 
-    `mtml` stands for the arm's lower-case name; sizes and units are those of `ArmStation`. Measured values are those of
-    the last DVRK_STATUS message, NaN before the first. Efforts go out in DVRK_COMMAND messages every
-    `driver.status_period` and on forced publishing, and the arm's command guard decides what becomes of them;
-    unconnected, the arm is told to hold.
+    `mtml` stands for the arm's lower-case name. Sizes and units are those of `ArmStation`. Measured values are those of
+    the last DVRK_STATUS message, and NaN before the first one. Efforts are sent in DVRK_COMMAND messages every
+    `driver.status_period` and on forced publishing. The arm's command guard checks them. Unconnected: the messages
+    command HOLD.
 
     After the guard's watchdog took over, e.g. because this process was stopped for 50 ms, efforts act again only when
-    an operator resumes: end this process, look at the arm, run `dvrk-drake run --reset`, end that, start this again.
+    an operator resumes: stop this process, inspect the arm, run `dvrk-drake run --reset`, stop it, restart this process.
     """
 
     def __init__(self, arm: Arm, *, driver: DvrkDriver | None = None, lcm: DrakeLcmInterface | None = None) -> None:
         """Builds the station.
 
         Args:
-            arm: names the ports and the channels.
-            driver: how the arm is driven; `DvrkDriver()` by default.
-            lcm: whose `HandleSubscriptions` somebody else calls, for loops that are driven by messages; by default one
-                at `driver.lcm_url` that a Simulator of this station handles.
+            arm: Arm after which the ports and the channels are named.
+            driver: Configuration of the driver; `DvrkDriver()` by default.
+            lcm: LCM interface whose `HandleSubscriptions` the caller calls, for loops that are driven by messages. By
+                default a new one at `driver.lcm_url`, which a Simulator of this station handles.
 
         Raises:
-            KeyFileError: the driver's key cannot be used.
+            KeyFileError: The driver's key cannot be used.
         """
         super().__init__()
         self._arm = arm
@@ -59,5 +59,5 @@ class HardwareArmStation(Diagram):
 
     @property
     def arm(self) -> Arm:
-        """The arm that the ports are named and ordered after."""
+        """Arm that defines the names and order of the ports."""
         return self._arm

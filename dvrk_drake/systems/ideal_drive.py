@@ -1,4 +1,4 @@
-"""The drive of an arm that is nothing but its links: what is commanded acts, and what is measured is so."""
+"""Ideal drive of an arm without joint effects: the commanded effort is applied, and measurements are exact."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from dvrk_drake.models.plant import tree_selector
 
 
 class PlantJoints:
-    """The independent joints of an arm in a finalized plant, in the arm's order.
+    """Independent joints of an arm in a finalized plant, in the arm's order.
 
     Attributes:
-        index: (n,) into the plant's q and v.
-        selection: (nv, n) efforts on the joints to efforts on the plant; its transpose picks their positions.
-        actuators: of the arm's instance, in Drake's order.
-        actuation: (len(actuators), n) efforts of the joints' motors to those of all actuators. Others, massless rotors
-            that ride on a linkage, get zero: their inertia is all they are for.
-        effort_limits: (n,) of the joints' motors [N m, N].
+        index: Indices (n,) into the plant's q and v.
+        selection: Matrix (nv, n) from joint efforts to generalized forces; its transpose selects the joint positions.
+        actuators: Actuators of the arm's instance, in Drake's order.
+        actuation: Matrix (len(actuators), n) from efforts of the joints' motors to efforts of all actuators. The other
+            actuators are massless rotors on the linkage that only represent inertia. Their effort is zero.
+        effort_limits: Effort limits (n,) of the joints' motors [N m, N].
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex) -> None:
-        """Of the `arm` that `add_arm` added to `plant` as `instance`.
+        """Finds the joints of the `arm` that `add_arm` added to `plant` as `instance`.
 
         Raises:
-            StationError: a floating body, or a joint without a motor.
+            StationError: A floating body, or a joint without a motor.
         """
         if plant.num_positions() != plant.num_velocities():
             raise StationError("modify_plant must not add floating bodies: weld them to the arm")
@@ -55,7 +55,7 @@ class PlantJoints:
 
 @dataclass(frozen=True)
 class DrivePorts:
-    """What a drive offers to the station around it, see `ArmStation`; vectors of the joints, in the arm's order."""
+    """Ports that a drive provides to its station, see `ArmStation`. Vectors of the joints are in the arm's order."""
 
     effort_commanded: InputPort
     effort_disturbance: InputPort
@@ -67,10 +67,10 @@ class DrivePorts:
 def add_ideal_drive(
     builder: DiagramBuilder, plant: MultibodyPlant, joints: PlantJoints, instance: ModelInstanceIndex
 ) -> DrivePorts:
-    """Connects a finalized plant's inputs; all that is added is C++ and has no state."""
+    """Connects a finalized plant's inputs and returns the ports. All added systems are C++ and have no state."""
     n = len(joints.index)
     commanded = builder.AddNamedSystem("effort_commanded", PassThrough(n))
-    # The plant clamps as well, but silently: clamp here, at the plant's limits, to know what is applied.
+    # The plant clamps as well but does not output the result. Clamp here, at its limits, to measure what is applied.
     limits = joints.effort_limits
     clamp = builder.AddNamedSystem("effort_clamp", Saturation(min_value=-limits, max_value=limits))
     to_actuators = builder.AddNamedSystem("to_actuators", MatrixGain(D=joints.actuation))
@@ -86,7 +86,7 @@ def add_ideal_drive(
 
 
 def add_true_state(builder: DiagramBuilder, plant: MultibodyPlant, joints: PlantJoints) -> OutputPort:
-    """Of q, then v of the independent joints (2n)."""
+    """Adds an output of q, then v of the independent joints (2n), and returns its port."""
     S = joints.selection.T
     true = builder.AddNamedSystem("state_true", MatrixGain(D=np.kron(np.eye(2), S)))
     builder.Connect(plant.get_state_output_port(), true.get_input_port())

@@ -1,4 +1,4 @@
-"""A master arm in gravity compensation that a simulated hand moves, and the patient side manipulator that it leads."""
+"""Simulated teleoperation: a hand moves a master arm in gravity compensation, and a patient side manipulator follows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hand import Hand
 from dvrk_drake.systems.teleoperation import FOLLOWER_FRAME, MASTER_FRAME, Teleoperation
 
-#: Viscous friction of the simulated master's joints, as a share of their effort limits [s].
+#: Viscous friction of the simulated master's joints, divided by their effort limits [s].
 MASTER_DAMPING = 0.03
 
 
@@ -40,8 +40,8 @@ class TeleoperatedArms(Diagram):
 
     `mtml` and `psm` stand for the arms' lower-case names.
 
-    - `X_MG_desired` (RigidTransform): where the hand wants the master's handle, in the master's base. Unconnected:
-      nobody touches the master.
+    - `X_MG_desired` (RigidTransform): desired pose of the master's handle in the master's base, set by the hand.
+      Unconnected: no force acts on the master.
     - `engaged`, `jaw_angle`, `desired_state`, `following`, `fault`: those of `Teleoperation`.
     - `state_estimated`: those of the two stations.
 
@@ -61,13 +61,14 @@ class TeleoperatedArms(Diagram):
         R_FM: RotationMatrix | None = None,
         meshcat: Meshcat | None = None,
     ) -> None:
-        """Builds it; both arms have exact models of themselves, the master some joint friction.
+        """Builds the diagram. Both arms have exact models, and the master has a small joint friction.
 
         Args:
-            master: an MTM.
-            follower: a PSM.
-            scale, R_FM: see `Teleoperation`.
-            meshcat: draws both arms there, below paths of their lower-case names; place them with `SetTransform`.
+            master: MTM.
+            follower: PSM.
+            scale, R_FM: See `Teleoperation`.
+            meshcat: Meshcat in which both arms are drawn, below paths of their lower-case names. `SetTransform` places
+                them.
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -113,20 +114,20 @@ class TeleoperatedArms(Diagram):
         builder.BuildInto(self)
 
     def SetPositions(self, context: Context, q_master: ArrayLike, q_follower: ArrayLike) -> None:
-        """Puts both arms at poses, at rest. `context` is this system's own.
+        """Sets the poses of both arms, at rest. `context` is the context of this system.
 
         Raises:
-            StationError: poses that are none.
+            StationError: A pose is not valid.
         """
         for station, q in ((self.master, q_master), (self.follower, q_follower)):
             station.SetPositions(self.GetMutableSubsystemContext(station, context), q)
 
     def CalcX_MG(self, context: Context) -> RigidTransform:
-        """Pose of the master's handle in its base."""
+        """Returns the pose of the master's handle in its base."""
         return self._pose(self.master, MASTER_FRAME, context)
 
     def CalcX_FT(self, context: Context) -> RigidTransform:
-        """Pose of the follower's tip in its base."""
+        """Returns the pose of the follower's tip in its base."""
         return self._pose(self.follower, FOLLOWER_FRAME, context)
 
     def _pose(self, station: ArmStation, frame_name: str, context: Context) -> RigidTransform:

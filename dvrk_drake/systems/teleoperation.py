@@ -1,4 +1,4 @@
-"""A master arm's handle leads a patient side manipulator's tip: scaled position, rotation one to one, clutch."""
+"""Teleoperation of a patient side manipulator by a master arm: scaled translation, unscaled rotation, clutch."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.plant import make_arm_plant
 
-#: Frames that lead and follow: the dVRK's measured_cp of the two arms, at the wrist centre and at the wrist yaw axis.
+#: Leading and following frames: the dVRK's measured_cp of both arms, at the wrist centre and at the wrist yaw axis.
 MASTER_FRAME, FOLLOWER_FRAME = "dh_7", "dh_6"
-#: The follower's wrist centre stays this far beyond its remote centre of motion [m]: nearer, yaw and pitch would whirl.
+#: Least depth of the follower's wrist centre beyond its remote centre of motion [m]. Yaw and pitch are singular there.
 MIN_DEPTH = 0.02
-#: A follower that is behind its command by more than its fastest joint motion in this time [s] is not following.
+#: Largest lag [s]. A follower behind its command by more than its fastest joint motion in this time does not follow.
 MAX_LAG = 0.1
 
 
 class Teleoperation(LeafSystem):
-    """Commands a follower (PSM) from the handle of a master (MTM) that somebody moves.
+    """Commands a follower (PSM) from the handle of a master (MTM) that an operator moves.
 
     .. pydrake_system::
 
@@ -40,34 +40,39 @@ class Teleoperation(LeafSystem):
     Ports [rad, rad/s; m, m/s on a prismatic joint], joints in the arms' order:
 
     - `master_position` (n of the master), `follower_position` (n of the follower): measured joint positions.
-    - `engaged` (1): the clutch; above 0.5 the follower follows. Pressing the dVRK's clutch pedal disengages.
-    - `jaw_angle` (1): wanted opening of the jaw, e.g. the master's gripper angle. Unconnected: the jaw is held.
-    - `desired_state` (2n of the follower): commanded joint positions, then their rates; for `GravityPidController`.
-    - `following` (1): 1 while the master leads, else 0.
-    - `fault` (1): 1 while an input is unusable or the follower is not where it was commanded, else 0.
+    - `engaged` (1): clutch state. Above 0.5 the follower follows. Pressing the dVRK's clutch pedal disengages.
+    - `jaw_angle` (1): desired opening of the jaw, e.g. the master's gripper angle. Unconnected: the jaw is held.
+    - `desired_state` (2n of the follower): commanded joint positions, then their rates, for `GravityPidController`.
+    - `following` (1): 1 while the follower follows the master, else 0.
+    - `fault` (1): 1 while an input is unusable or the follower is not at its commanded position, else 0.
 
-    **Law.** With X_MG the master's handle in its base and X_FT the follower's tip in its base, both noted when the
-    clutch engages (index 0), and R_FM the rotation between the bases as the operator sees them:
+    **Control law.** X_MG is the pose of the master's handle in its base, X_FT that of the follower's tip in its base.
+    Both are stored when the clutch engages (index 0). R_FM is the rotation between the bases as seen by the operator:
 
         p_FT = p_FT0 + scale R_FM (p_MG - p_MG0),    R_FT = R_FM R_MG R_MG0' R_FM' R_FT0
 
-    Engaging therefore never moves the follower, whatever the two orientations are: their difference is kept. (The
-    dVRK turns the master's wrist to match instead; a master in gravity compensation has nobody to turn it.)
+    Engaging therefore never moves the follower, and the difference of the two orientations is kept. (The dVRK aligns
+    the master's wrist instead. A master in gravity compensation has no controller for this.)
 
-    **Limits.** Joint positions from `PsmInverseKinematics` are clamped to the arm's limits; then each joint moves
-    towards them no faster than its velocity limit. A pose without a solution, as at and above the remote centre of
-    motion, moves nothing but the jaw. The relation of the poses is kept beyond a limit, so the tip takes it up again
-    where the master comes back.
+    **Limits.** Joint positions from `PsmInverseKinematics` are clamped to the arm's limits. Each joint then moves
+    towards them within its velocity limit. A pose without a solution, such as at and above the remote centre of motion,
+    moves only the jaw. The relation of the poses is kept beyond a limit. The tip continues where the master returns
+    inside the limit.
 
-    **Hold.** `desired_state` stands still, with zero rates, while the clutch is open, while `master_position` or
-    `jaw_angle` is not finite or beyond 1e6, while the follower is farther from the command than its velocity limits
-    cover in `MAX_LAG` (the jaw excepted: it may press on something), and while the instrument is in its cannula, less
-    than `MIN_DEPTH` beyond the remote centre. When that ends the clutch engages anew. With an open clutch a follower
-    that was moved by something else is taken where it is. Before a finite follower_position was seen, `desired_state`
-    is NaN, which the controller refuses.
+    **Hold.** `desired_state` is constant with zero rates in any of these cases:
 
-    A receiver of messages that are late has to open the clutch: ports have no age. Inputs are sampled, and outputs
-    change, every `period` seconds and at initialization, which forgets all.
+    - The clutch is open.
+    - `master_position` or `jaw_angle` is not finite or beyond 1e6.
+    - The follower is farther from the command than its velocity limits allow in `MAX_LAG`. The jaw is excepted, because
+      it may press on an object.
+    - The instrument is inside its cannula, less than `MIN_DEPTH` beyond the remote centre.
+
+    Afterwards the clutch engages again. With an open clutch, the command is set to the measured position of a follower
+    that was moved externally. Before the first finite follower_position, `desired_state` is NaN, which the controller
+    rejects.
+
+    Ports carry no age, so a receiver of delayed messages must open the clutch. Inputs are sampled and outputs change
+    every `period` seconds and at initialization, which resets the state.
     """
 
     def __init__(
@@ -79,18 +84,18 @@ class Teleoperation(LeafSystem):
         R_FM: RotationMatrix | None = None,
         period: float = 1e-3,
     ) -> None:
-        """Of a `master` with the frame "dh_7" and a `follower` with the kinematics of a PSM.
+        """Creates the system for a `master` with the frame "dh_7" and a `follower` with the kinematics of a PSM.
 
         Args:
-            master: the arm that leads.
-            follower: the arm that follows.
-            scale: tip's displacement over handle's, above 0 and at most 1; see `SetScale`.
-            R_FM: rotation from the master's base to the follower's; by default none: bases that stand alike.
-            period: of the update [s].
+            master: Arm that leads.
+            follower: Arm that follows.
+            scale: Ratio of the displacements of tip and handle, above 0 and at most 1; see `SetScale`.
+            R_FM: Rotation from the master's base to the follower's. By default the identity, for parallel bases.
+            period: Period of the update [s].
 
         Raises:
-            ArmError: an arm of another kind.
-            ControllerError: scale or period out of range, or a follower without velocity limits.
+            ArmError: An arm of another kind.
+            ControllerError: Scale or period out of range, or a follower without velocity limits.
         """
         super().__init__()
         if not (np.isfinite(period) and period > 0):
@@ -120,10 +125,10 @@ class Teleoperation(LeafSystem):
         self.DeclareForcedDiscreteUpdateEvent(update=self._update)
 
     def SetScale(self, context: Context, scale: float) -> None:
-        """Changes the scale from here on; the tip does not jump.
+        """Changes the scale. The tip does not jump.
 
         Raises:
-            ControllerError: not above 0 and at most 1.
+            ControllerError: The scale is not above 0 and at most 1.
         """
         context.get_mutable_discrete_state(_SCALE).SetAtIndex(0, self._checked(scale))
         context.get_mutable_discrete_state(_FOLLOWING).SetAtIndex(0, 0.0)
@@ -162,7 +167,7 @@ class Teleoperation(LeafSystem):
         state.get_mutable_value(_FAULT)[0] = float(fault)
 
     def _target(self, q_master: NDArray[np.float64], q_d: NDArray[np.float64], state: DiscreteValues) -> RigidTransform:
-        """Wanted X_FT; where the follower did not follow until now, the poses are noted and it is the present one."""
+        """Returns the desired X_FT. If the follower did not follow before, stores the poses and returns its own one."""
         X_MG = self._master.pose(q_master)
         memory = state.get_mutable_value(_POSES).reshape(2, 3, 4)  # a view
         if state.get_value(_FOLLOWING)[0] == 0.0:
@@ -175,7 +180,7 @@ class Teleoperation(LeafSystem):
         )
 
     def _rates(self, X_FT: RigidTransform, jaw: NDArray[np.float64], q_d: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Rates (n,) for one period that lead to the pose and jaw angle, inside all limits."""
+        """Returns joint rates (n,) for one period, towards the pose and jaw angle and inside all limits."""
         solution = self._inverse.solve(X_FT, q_d)
         wanted = np.concatenate([q_d[:6] if solution is None else solution, jaw])
         way = np.clip(wanted, self._lower, self._upper) - q_d
@@ -193,11 +198,11 @@ _DESIRED, _FOLLOWING, _FAULT, _SCALE, _POSES = range(5)  # indices of the discre
 
 
 def _usable(values: NDArray[np.float64]) -> bool:
-    return bool(np.all(np.abs(values) < IMPLAUSIBLE))  # not so of NaN
+    return bool(np.all(np.abs(values) < IMPLAUSIBLE))  # false for NaN
 
 
 def _velocity_limits(arm: Arm) -> NDArray[np.float64]:
-    """(n,) from the SDF's `<velocity>`."""
+    """Returns the velocity limits (n,) from `<velocity>` in the SDF."""
     plant = make_arm_plant(arm)
     limits = np.array([plant.GetJointByName(name).velocity_upper_limits()[0] for name in arm.joint_names])
     if not np.all(np.isfinite(limits)):

@@ -1,1 +1,1 @@
-"""What a simulated arm has beside links, joints and a linkage: parts of `ArmStation`, see `models.effects_schema`."""
+"""Effects of a simulated arm besides links, joints and linkage. Parts of `ArmStation`; see `models.effects_schema`."""

@@ -1,5 +1,5 @@
-"""All efforts on the plant of a real arm that no solver needs to know: motors, cables, springs, a hand;
-and the sensor of the motors' efforts.
+"""Efforts on the plant of a real arm that are computed outside of the solver (motors, cables, springs, external
+efforts), and the sensor of motor efforts.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 
 
 class Motors:
-    """Conversion of commanded joint efforts to the efforts of the motors.
+    """Conversion of commanded joint efforts to motor efforts.
 
-    On the actuators [N m, N]: the command, clamped to the joints' limits, as efforts of the actuators J^-T tau, in
-    whole steps of `effort.command_resolution`, and no more than `saturation`.
+    The command is clamped to the joints' limits and converted to actuator efforts J^-T tau [N m, N]. These are rounded
+    to multiples of `effort.command_resolution` and limited to `saturation`.
 
     Attributes:
-        constants: (3, n) limits of the joints, steps of the command, most of each motor: for `motor_effort_into`.
-        to_motors: (n, n) J^-T.
+        constants: Joint limits, command resolution and saturation (3, n), for `motor_effort_into`.
+        to_motors: Matrix J^-T (n, n).
     """
 
     def __init__(self, arm: Arm, effects: ArmEffects, effort_limits: NDArray[np.float64]) -> None:
-        """Motors of `arm`, whose joints have `effort_limits` (n,) [N m, N]."""
+        """Creates the motors of `arm`, whose joints have `effort_limits` (n,) [N m, N]."""
         names = arm.joint_names
         steps = per_actuator(effects.effort.command_resolution if effects.effort else {}, names, 0.0)
         self.constants = np.array([effort_limits, steps, per_actuator(effects.saturation, names, np.inf)])
         self.to_motors = np.ascontiguousarray(np.linalg.inv(arm.transmission.matrix).T)
 
     def effort(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n,) of the actuators, for a command (n,) on the joints."""
+        """Returns the actuator efforts (n,) for a command (n,) on the joints."""
         effort = np.empty(len(self.to_motors))
         motor_effort_into(np.ascontiguousarray(command), self.constants, self.to_motors, effort)
         return effort
@@ -47,13 +47,13 @@ class Motors:
 
 @numba.njit("float64(float64, float64)", cache=True)
 def in_steps(value, step):
-    """`value` to the next whole number of steps; exact where the step is 0."""
+    """Rounds `value` to the nearest multiple of `step`. A step of 0 leaves it unchanged."""
     return step * np.rint(value / step) if step > 0.0 else value
 
 
 @numba.njit("void(float64[::1], float64[:, ::1], float64[:, ::1], float64[::1])", cache=True)
 def motor_effort_into(command, constants, to_motors, effort):
-    """`Motors.effort`, for compiled code."""
+    """Computes `Motors.effort` in compiled code."""
     limits, steps, most = constants
     effort[:] = 0.0
     for k in range(len(command)):
@@ -65,7 +65,7 @@ def motor_effort_into(command, constants, to_motors, effort):
 
 
 class EffortSensor(LeafSystem):
-    """Efforts of the motors as a computer reads them from the currents.
+    """Sensor of the motor efforts, as computed from the motor currents.
 
     .. pydrake_system::
 
@@ -75,17 +75,17 @@ class EffortSensor(LeafSystem):
         output_ports:
         - effort_measured
 
-    - `effort_commanded` (n): on the joints, when it was measured [N m, N]. Unconnected: zero.
-    - `effort_measured` (n): on the joints: what the motors make of it, with Gaussian noise that is new in every time
-      step, and then in whole steps of `measured_resolution`, both of the actuators.
+    - `effort_commanded` (n): commanded joint efforts at the time of the measurement [N m, N]. Unconnected: zero.
+    - `effort_measured` (n): measured joint efforts: the motor efforts for the command, with Gaussian noise, rounded to
+      multiples of `measured_resolution`. Noise and rounding act on the actuators. The noise changes every time step.
 
-    The generator counts (Philox, Salmon et al., SC 2011): the numbers of a time step follow from seed and index alone,
-    whoever asks, in whatever order. So a seed gives the same noise bit for bit, and what nobody reads costs nothing.
-    Drake's RandomSource has no seed that Python can set (1.51 to 1.58).
+    The noise comes from a counter-based generator (Philox, Salmon et al., SC 2011). Its numbers for a time step depend
+    only on seed and index, not on the order of evaluations. So a seed gives the same noise bit for bit, and an output
+    that is not evaluated costs no time. Drake's RandomSource has no seed that Python can set (1.51 to 1.58).
     """
 
     def __init__(self, arm: Arm, motors: Motors, effort: EffortEffect | None, time_step: float, seed: int) -> None:
-        """Sensor of `arm` with new noise every `time_step` [s]; `seed` >= 0. Without an `effort` it is exact."""
+        """Creates the sensor of `arm` with noise from `seed` >= 0 every `time_step` [s]. It is exact without `effort`."""
         super().__init__()
         effort = effort or EffortEffect()
         names, n = arm.joint_names, arm.num_joints
@@ -101,7 +101,7 @@ class EffortSensor(LeafSystem):
         port = self.get_input_port()
         effort = self._motors.effort(port.Eval(context) if port.HasValue(context) else np.zeros(len(self._steps)))
         if np.any(self._deviations):
-            # Half a step of grace: sums of time steps are not exact.
+            # Adds half a time step, because sums of time steps are not exact.
             tick = int(context.get_time() / self._time_step + 0.5)
             bits = np.random.Philox(key=self._seed, counter=[0, 0, tick, 0])
             effort = effort + self._deviations * np.random.Generator(bits).standard_normal(len(effort))
@@ -110,7 +110,7 @@ class EffortSensor(LeafSystem):
 
 
 class DriveForce(LeafSystem):
-    """One system for all of them, as each system that computes in every step costs some microseconds.
+    """Sum of the efforts of motors, cables, springs and disturbance, in one system to save time in every step.
 
     .. pydrake_system::
 
@@ -122,18 +122,19 @@ class DriveForce(LeafSystem):
         output_ports:
         - generalized_force
 
-    - `effort_commanded` (n): on the joints [N m, N]; see `Motors`. Unconnected: zero.
-    - `effort_disturbance` (n): on the joints too, behind the motors. Unconnected: zero.
-    - `plant_state`: of the whole plant.
-    - `generalized_force`: for the plant's port `applied_generalized_force`: what the motors give, the disturbance, and
-      cables and springs. These are the effort that motors need to hold against them, so minus their sum acts.
+    - `effort_commanded` (n): commanded joint efforts [N m, N]; see `Motors`. Unconnected: zero.
+    - `effort_disturbance` (n): joint efforts that are added after the motors. Unconnected: zero.
+    - `plant_state`: state of the whole plant.
+    - `generalized_force`: input for the plant's port `applied_generalized_force`: motor efforts, disturbance, cables
+      and springs. The models of cables and springs state the effort that motors need to compensate them, so it is
+      subtracted.
     """
 
     def __init__(self, arm: Arm, motors: Motors, parts: PlantEffects, effects: ArmEffects) -> None:
-        """Of `arm`, whose plant is finalized and has the `parts`; of the `effects` cables and springs count.
+        """Creates the system for `arm`, whose plant is finalized and has the `parts`. It uses cables and springs only.
 
         Raises:
-            StationError: an effect that the arm cannot have.
+            StationError: An effect that the arm cannot have.
         """
         super().__init__()
         laws = [*effects.cables, *effects.springs]
@@ -156,7 +157,7 @@ class DriveForce(LeafSystem):
         )
 
     def _make_calc(self, n: int) -> Callable[[Context, BasicVector], None]:
-        """The handler of the port, with all that it needs at hand: see GravityPidController."""
+        """Returns the handler of the port. Its data are local names for speed, see GravityPidController."""
         eval_vector_input, motors_into, subtract_at = self.EvalVectorInput, entry_point(_force_into), entry_point(_take)
         torque_into = None if self._torque is None else entry_point(self._torque)
         constants, to_motors, from_motors = self._motors.constants, self._motors.to_motors, self._from_motors
@@ -191,7 +192,7 @@ class DriveForce(LeafSystem):
     cache=True,
 )
 def _force_into(command, outside, state, joints, constants, to_motors, from_motors, q, motors, force):
-    """Motors and what comes from outside; `q` becomes the joints' positions, `motors` the actuators' efforts."""
+    """Computes `force` from motors and disturbance, joint positions `q` and actuator efforts `motors`, in place."""
     motor_effort_into(command, constants, to_motors, motors)
     for i in range(len(force)):
         force[i] = 0.0

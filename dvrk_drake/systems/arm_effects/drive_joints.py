@@ -1,4 +1,4 @@
-"""Coordinates of an arm's drive as joints of its plant, so that Drake's solver can have friction and stops there."""
+"""Joints for the coordinates of an arm's drive in its plant, where Drake's solver computes friction and stops."""
 
 from __future__ import annotations
 
@@ -25,42 +25,43 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import Cable
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 
-#: Of each body that is added: its inertia, as a share of what the arm shows at the coordinate, and its mass [kg]. Drake
-#: makes a tie as stiff as the lighter of its bodies allows at the time step: so an MTM's parallelogram gives 1 mrad for
-#: 3 N m.
+#: Inertia of each added body as a fraction of the arm's inertia at the coordinate, and its mass [kg]. Drake limits the
+#: stiffness of a constraint by the lighter of its bodies and the time step. For an MTM's parallelogram, 3 N m cause a
+#: deflection of 1 mrad.
 SHARE, MASS = 2e-3, 1e-6
-#: Where bodies that turn together are tied, from their axis [m].
+#: Distance from the axis at which coupled bodies are constrained [m].
 RADIUS = 0.1
-#: A cable that does not stretch, but for what Drake's solver gives.
+#: Inextensible cable. Its only compliance is that of Drake's solver.
 STIFF = Cable(stiffness=float("inf"))
 
 
 class DriveJoints:
-    """Finds or makes, before a plant is finalized, the joint of a coordinate x = row q of an arm's joints.
+    """Finds or creates the joint of a coordinate x = row q of an arm's joints, before the plant is finalized.
 
-    If x is one joint's position times a number, that joint is it. A sum has none: a body is added that turns by x, on a
-    joint of its own. It is tied to a link that turns by x about the same axis where the arm has one (the crank of an
-    MTM's parallelogram, against the yaw link); else to the last of a chain of bodies on the world, each of which turns
-    against the one before by one joint's share.
+    If x is proportional to the position of one joint, that joint is used. For a sum of joints, a body with its own
+    joint is added, which rotates by x. It is coupled to a link that rotates by x about the same axis if the arm has
+    one, e.g. the crank of an MTM's parallelogram relative to the yaw link. Otherwise it is coupled to the last of a
+    chain of bodies on the world. Each body of the chain rotates relative to the previous one by the contribution of one
+    joint.
 
     Attributes:
-        motors: actuator -> the motor that `add_motor` made.
+        motors: Mapping of actuator to the motor that `add_motor` created.
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex) -> None:
-        """Of the `arm` that `add_arm` added to `plant` as `instance`."""
+        """Creates it for the `arm` that `add_arm` added to `plant` as `instance`."""
         self._plant, self._arm, self._instance = plant, arm, instance
         self._added: list[tuple[Joint, NDArray[np.float64]]] = []
         self.motors: dict[str, JointActuator] = {}
 
     def add_motor(self, name: str, cable: Cable) -> None:
-        """Puts the motor of an actuator on a joint of its own, tied to the arm by a cable that stretches.
+        """Adds a separate joint for the motor of an actuator and couples it to the arm by an elastic cable.
 
-        What `along` says of that actuator is then the motor's, and the rotor that the SDF states at its joint goes to
-        it.
+        Afterwards `along` returns the motor's joint for that actuator. The rotor inertia that the SDF states at the
+        actuator's joint is moved to the motor.
 
         Raises:
-            StationError: the actuator slides or moves more than its joint: then no rotor of its own is stated.
+            StationError: The actuator is prismatic or drives several joints, so no separate rotor is defined.
         """
         plant, i = self._plant, self._arm.joint_names.index(name)
         row = joint_row(self._arm, f"actuator.{name}")
@@ -75,14 +76,14 @@ class DriveJoints:
         self.motors[name] = motor
 
     def along(self, coordinate: str) -> tuple[Joint, float]:
-        """As `joint`, of a coordinate of the drive by its name."""
+        """Returns the same as `joint`, for a coordinate of the drive by its name."""
         owner, _, name = coordinate.partition(".")
         if owner == "actuator" and name in self.motors:
             return self.motors[name].joint(), 1.0
         return self.joint(joint_row(self._arm, coordinate))
 
     def joint(self, row: NDArray[np.float64]) -> tuple[Joint, float]:
-        """The joint of x = row q, row (n,), and the number by which its position must be multiplied to be x."""
+        """Returns the joint of x = row q, row (n,), and the factor that converts its position to x."""
         terms = np.flatnonzero(np.abs(row) > 1e-12)
         if len(terms) == 1:
             (i,) = terms
@@ -98,7 +99,7 @@ class DriveJoints:
         return joint
 
     def set_positions(self, q_plant: NDArray[np.float64], q: ArrayLike) -> None:
-        """Writes the positions that joints which were added have at the pose q (n,) into q_plant."""
+        """Writes the positions of added joints at the pose q (n,) into q_plant."""
         q = np.asarray(q, float)
         for i, (joint, row) in enumerate(self._added):
             q_plant[joint.position_start()] = row @ q
@@ -108,7 +109,7 @@ class DriveJoints:
                     q_plant[self._plant.GetJointByName(name, self._instance).position_start()] = row[k] * q[k]
 
     def _coaxial(self, row: NDArray[np.float64], cable: Cable) -> Joint | None:
-        """A new joint beside a path of coaxial joints whose angles add up to `row` q, if the arm has one."""
+        """Returns a new joint parallel to a path of coaxial joints whose angles add up to `row` q, if there is one."""
         plant, names = self._plant, self._arm.tree_joint_names
         above = {plant.GetJointByName(name, self._instance).child_body().index(): name for name in names}
         for name in names:
@@ -140,7 +141,7 @@ class DriveJoints:
         p_PR: NDArray[np.float64],
         last: RevoluteJoint,
     ) -> Joint:
-        """A joint from `parent` about the axis of `last` at p_PR, whose body turns with the child of `last`."""
+        """Returns a joint from `parent` about the axis of `last` at p_PR. Its body rotates with the child of `last`."""
         plant, name = self._plant, f"drive_{len(self._added)}"
         body = self._body(name, row)
         frame = plant.AddFrame(FixedOffsetFrame(f"{name}_base", parent, RigidTransform(p_PR)))
@@ -166,10 +167,10 @@ class DriveJoints:
     def _tie(
         self, A: RigidBody, p_AAxis: NDArray[np.float64], B: RigidBody, axis: NDArray[np.float64], cable: Cable
     ) -> None:
-        """Lets B turn with A about an axis that they share: a rod between points a quarter of a turn apart."""
+        """Couples the rotation of B to A about a common axis by a rod between points a quarter of a turn apart."""
         e = np.eye(3)[np.argmin(np.abs(axis))]
         f = np.cross(axis, e)
-        # The rod is `RADIUS` over the square root of 2 from the axis.
+        # The distance of the rod from the axis is `RADIUS` divided by the square root of 2.
         lever, length = 0.5 * RADIUS**2, float(np.sqrt(2.0)) * RADIUS
         p_AP, p_BQ = p_AAxis + RADIUS * e, RADIUS * f
         self._plant.AddDistanceConstraint(A, p_AP, B, p_BQ, length, cable.stiffness / lever, cable.damping / lever)
@@ -182,7 +183,7 @@ class DriveJoints:
 
 @cache
 def _mass_matrix(arm: Arm) -> NDArray[np.float64]:
-    """(n, n) of the joints, in the middle of their ranges."""
+    """Returns the mass matrix (n, n) of the joints in the middle of their ranges."""
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     set_arm_positions(plant, context, arm, 0.5 * (arm.position_lower + arm.position_upper))

@@ -1,4 +1,4 @@
-"""What happens in a real arm's drive once a time step: springs of dry friction give way, encoders are read."""
+"""Discrete update of a real arm's drive in each time step: springs of dry friction and encoders."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 
 
 class DriveStep(LeafSystem):
-    """Two things in one system, as each Python system costs 4 us a step: springs of friction, and encoders.
+    """Updates friction springs and encoders. One system for both, as each Python system costs 4 us per step.
 
     .. pydrake_system::
 
@@ -30,26 +30,26 @@ class DriveStep(LeafSystem):
         - desired_state
         - state_estimated
 
-    - `plant_state`: of the plant that the sliders of `add_friction` are part of.
-    - `desired_state`: for the plant's port of that name and the arm's instance: positions, then velocities (zero) of
-      all its actuators. The position of a slider's actuator is where its spring is hooked on.
-    - `state_estimated` (2n): q, then v of the arm's joints as measured, `delay` time steps ago [rad, rad/s; m, m/s on
-      a prismatic joint].
+    - `plant_state`: state of the plant that contains the sliders of `add_friction`.
+    - `desired_state`: input for the plant's port of that name and the arm's instance: positions, then velocities (zero)
+      of all its actuators. The position for a slider's actuator is the anchor of its spring.
+    - `state_estimated` (2n): measured q, then v of the arm's joints, `delay` time steps ago [rad, rad/s; m, m/s on a
+      prismatic joint].
 
-    **Friction.** A hook stands still while its spring is stretched by less than it holds, and follows at that distance
-    when it is stretched further: `effect_step` of the slider's kind. The plant takes the spring at the end of a step
-    and the hook moves after it, always to less stretch: what a slider has taken is never less than what its spring
-    holds, so friction never gives energy. At initialization all springs are slack.
+    **Friction.** An anchor is fixed while the deflection of its spring is below the slip limit. Beyond it, the anchor
+    follows at that distance, see `effect_step` of the slider's kind. The plant evaluates the spring at the end of a
+    step. The anchor moves afterwards, always towards less deflection. So the energy that a slider takes is never less
+    than the energy that its spring stores, and friction never adds energy. At initialization all springs are relaxed.
 
-    **Encoders.** A position of an actuator is a whole number of counts; joints follow by the transmission. The velocity
-    is the difference of two readings over the time step h, low-passed to first order: with a = exp(-2 pi f h),
-    y[k] = a y[k-1] + (1 - a) (x[k] - x[k-1]) / h. Without an encoder, position and velocity are exact. The arm is taken
-    to have rested before it starts: where `SetAtRest` says, or where it is at initialization. With a delay, what is
-    out during initialization itself is the former.
+    **Encoders.** A measured actuator position is a whole number of counts. Joint positions follow from the
+    transmission. The velocity is the difference of two readings over the time step h with a first-order low-pass: with
+    a = exp(-2 pi f h), y[k] = a y[k-1] + (1 - a) (x[k] - x[k-1]) / h. Without an encoder, position and velocity are
+    exact. The arm is assumed to be at rest before the start, at the pose of `SetAtRest` or the pose at initialization.
+    With a delay, the output during initialization itself uses the pose of `SetAtRest`.
     """
 
     def __init__(self, arm: Arm, parts: PlantEffects, effects: ArmEffects, q_default: NDArray[np.float64]) -> None:
-        """Of `arm`, whose plant is finalized and has the `parts`; it rested at `q_default` (n,) before it starts."""
+        """Creates it for `arm` with a finalized plant and its `parts`. The arm is at rest at `q_default` (n,) first."""
         super().__init__()
         n, time_step = arm.num_joints, parts.time_step
         encoder, delay = effects.encoder, effects.delay.measurement if effects.delay else 0
@@ -59,7 +59,7 @@ class DriveStep(LeafSystem):
         self._J = arm.transmission.matrix
         to_joints = np.ascontiguousarray(np.linalg.inv(arm.transmission.matrix))
         exact = to_joints @ parts.to_actuators
-        whole = np.rint(exact)  # no rounding errors in what is only picked out
+        whole = np.rint(exact)  # removes rounding errors from entries that only select a joint
         self._maps = parts.to_actuators, to_joints, np.where(np.abs(exact - whole) < 1e-12, whole, exact)
         self._places = np.array([[s.code, s.actuator, s.position] for s in parts.sliders], dtype=int).reshape(-1, 3)
         self._laws = np.array([[s.travel, s.fall_speed, s.side] for s in parts.sliders]).reshape(-1, 3)
@@ -82,7 +82,7 @@ class DriveStep(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period_sec=time_step, offset_sec=0.0, update=self._make_update())
 
     def _make_update(self) -> Callable[[Context, DiscreteValues], None]:
-        """The handler of the update, with all that it needs at hand: see GravityPidController."""
+        """Returns the handler of the update. Its data are local names for speed, see GravityPidController."""
         eval_vector_input, follow, measure_into = self.EvalVectorInput, entry_point(_follow), self._measure_into
         places, laws, maps, constants = self._places, self._laws, self._maps, self._constants
         rubs, time_step = len(places) > 0, self._constants[-1]
@@ -97,13 +97,13 @@ class DriveStep(LeafSystem):
         return update
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        """Without delay: what the update is about to compute."""
+        """Computes the output without delay, i.e. the result of the coming update."""
         memory = context.get_discrete_state(_MEMORY).get_value().copy()
         state = self.EvalVectorInput(context, 0).get_value()
         self._measure_into(state, *self._maps, self._constants, memory, output.get_mutable_value())
 
     def SetAtRest(self, context: Context, q: NDArray[np.float64]) -> None:
-        """What has been measured of an arm that rested at q (n,) until now; in this system's context."""
+        """Sets the measurements in this system's context to those of an arm at rest at q (n,)."""
         for group, value in zip((_OUT, _MEMORY), self._at_rest(q), strict=True):
             context.SetDiscreteState(group, value)
 
@@ -116,7 +116,7 @@ class DriveStep(LeafSystem):
             discrete_state.set_value(group, value)
 
     def _at_rest(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What is out, and what is remembered."""
+        """Returns the output and the memory of an arm at rest at q (n,)."""
         n = len(q)
         a = self._J @ q
         if self._constants[n] >= 0.0:
@@ -132,7 +132,7 @@ _HOOKS, _OUT, _MEMORY = 0, 1, 2  # indices of the discrete state groups
 
 @numba.njit("void(float64[::1], int64[:, ::1], float64[:, ::1], float64, float64[::1])", cache=True)
 def _follow(state, places, laws, time_step, hooks):
-    """Moves the hooks; see `Slider` for `places` and `laws`."""
+    """Moves the anchors of the springs; see `Slider` for `places` and `laws`."""
     num_positions = len(state) // 2
     for i in range(len(places)):
         code, hook, column = places[i]
@@ -142,14 +142,14 @@ def _follow(state, places, laws, time_step, hooks):
         if fall_speed > 0.0:
             holds *= max(math.exp(-((velocity / fall_speed) ** 2)), 1e-6)
         stretch = side * (position - hooks[hook])
-        # A spring that starts slack and is stretched that far has the element's state.
+        # The deflection of a spring that starts relaxed equals the element's state.
         z, _ = effect_step(code, 0.0, stretch, 0.0, holds)
         if abs(stretch - z * holds) < 1e-12 * travel:
             continue
         stretch = z * holds
         if holds < travel:
-            # The arm stretches it further in the step that goes on and in the one that it is for. Up to `travel`, the
-            # effort limit takes care of that.
+            # The deflection increases in the present step and in the step that the anchor is for. Up to `travel`, the
+            # effort limit covers this.
             stretch = math.copysign(max(abs(stretch) - 2.0 * time_step * abs(velocity), 0.0), stretch)
         hooks[hook] = position - side * stretch
 
@@ -159,10 +159,10 @@ def _follow(state, places, laws, time_step, hooks):
     cache=True,
 )
 def _measure_into(state, to_actuators, to_joints, exact, constants, memory, out):
-    """Measures `state`; the oldest measurement of the queue goes out and this one in, or out at once if it has none.
+    """Measures `state`. The queue outputs its oldest measurement and stores this one; without a queue it is output now.
 
-    `memory` is the last reading and velocity of the actuators, then the queue; `constants` are resolutions (n), decay
-    of the low-pass, time step.
+    `memory` holds the last reading and velocity of the actuators, then the queue. `constants` holds the resolutions
+    (n), the decay of the low-pass and the time step.
     """
     n, num_positions = to_actuators.shape
     decay, time_step = constants[n], constants[n + 1]

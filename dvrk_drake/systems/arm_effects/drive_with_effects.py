@@ -1,4 +1,4 @@
-"""The drive of a real arm: the parts of `ArmEffects` between a plant and the ports of its station."""
+"""Drive of a real arm: the parts of `ArmEffects` between a plant and the ports of its station."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from dvrk_drake.systems.ideal_drive import DrivePorts, PlantJoints, add_true_sta
 
 @dataclass(frozen=True)
 class DriveWithEffects:
-    """What `add_drive_with_effects` needs.
+    """Arguments of `add_drive_with_effects`.
 
     Attributes:
-        arm: that is simulated.
-        plant: finalized, of which `instance` is the arm, `joints` its joints, `parts` what was added to it.
-        effects: all of them.
-        seed: of the noise.
-        home: (n,) where the arm rests before it starts.
+        arm: Arm that is simulated.
+        plant: Finalized plant. `instance` is the arm, `joints` its joints, `parts` the effects that were added to it.
+        effects: All effects of the arm.
+        seed: Seed of the noise.
+        home: Pose (n,) of the arm at rest before the start.
     """
 
     arm: Arm
@@ -42,7 +42,7 @@ class DriveWithEffects:
 
 
 def add_drive_with_effects(builder: DiagramBuilder, drive: DriveWithEffects) -> tuple[DrivePorts, DriveStep]:
-    """Connects a finalized plant's inputs; returns the ports and the system that knows what was measured."""
+    """Connects the inputs of a finalized plant. Returns the ports and the system that stores past measurements."""
     drive.parts.finish(drive.joints)
     plant, delay = drive.plant, drive.effects.delay or DelayEffect()
     step = builder.AddNamedSystem("drive_step", DriveStep(drive.arm, drive.parts, drive.effects, drive.home))
@@ -74,7 +74,7 @@ def add_drive_with_effects(builder: DiagramBuilder, drive: DriveWithEffects) -> 
 def _late(builder: DiagramBuilder, name: str, steps: int, port: OutputPort, drive: DriveWithEffects) -> OutputPort:
     if steps == 0:
         return port
-    # What goes in comes out a step later by itself: the plant steps while it is stored.
+        # The sampled input already causes a delay of one step, because the plant steps while it is stored.
     delay = builder.AddNamedSystem(name, DiscreteTimeDelay(drive.parts.time_step, steps - 1, drive.arm.num_joints))
     builder.Connect(port, delay.get_input_port())
     return delay.get_output_port()

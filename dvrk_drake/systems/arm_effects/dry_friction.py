@@ -1,4 +1,4 @@
-"""Effects of a real arm that are parts of its plant, first of all dry friction: elements of Drake's own solver."""
+"""Effects of a real arm that are parts of its plant, mainly dry friction, as elements of Drake's solver."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from dvrk_drake.models.effects_schema import FRICTION_KINDS, ArmEffects, Frictio
 from dvrk_drake.systems.arm_effects.drive_joints import DriveJoints
 from dvrk_drake.systems.ideal_drive import PlantJoints
 
-#: Of the springs of presliding [s]: their damping over their stiffness. An arm that is hit rings for a moment, not for
-#: minutes. Drake limits the sum of spring and damper to the element's coefficient, so sliding is the same.
+#: Relaxation time of the presliding springs [s]: damping over stiffness. It limits the ringing after an impact. Drake
+#: limits the sum of spring and damper to the element's coefficient, so sliding friction is unchanged.
 RELAXATION = 0.02
 
 
 @dataclass(frozen=True)
 class Slider:
-    """An elasto-plastic element in a finalized plant, a spring that gives way: an actuator with a gain and a limit.
+    """Elasto-plastic element in a finalized plant, realised as an actuator with a gain and an effort limit.
 
     Attributes:
-        code: of its kind, for `effect_step`.
-        actuator: index among those of the instance.
-        position: index of its joint's position in the plant.
-        travel: of that joint until it slips [rad, m].
-        fall_speed: at which it holds 1/e of that [rad/s, m/s]; 0 if it holds the same at all speeds.
-        side: -1 if what its kind says of motion towards +x is of motion towards -x, else 1.
+        code: Code of its kind, for `effect_step`.
+        actuator: Index of its actuator in the instance.
+        position: Index of its joint's position in the plant.
+        travel: Travel of that joint until it slips [rad, m].
+        fall_speed: Speed at which its slip limit is 1/e of the value at rest [rad/s, m/s]; 0 if it is constant.
+        side: -1 if the kind is applied with +x and -x exchanged, else 1.
     """
 
     code: int
@@ -44,7 +44,7 @@ class Slider:
 
     @staticmethod
     def of(element: tuple[JointActuator, FrictionEffect, float], order: Sequence[object]) -> Slider:
-        """Of one of `add_friction`'s elements, `order` being the indices of the instance's actuators."""
+        """Returns the slider of an element of `add_friction`. `order` lists the indices of the instance's actuators."""
         actuator, effect, ratio = element
         side = 1.0 if effect.coefficient * ratio > 0 else -1.0
         return Slider(
@@ -62,23 +62,25 @@ def add_friction(
 ) -> list[tuple[JointActuator, FrictionEffect, float]]:
     """Adds friction to a plant that is not finalized.
 
-    The solver takes each element at the end of the step, so it takes energy in every step, whatever its stiffness:
+    The solver evaluates each element at the end of the step. So it dissipates energy in every step, for any stiffness:
 
-    - "presliding" with coefficient c and scale s: effort -c clip((x - x_s + T v) / s, +-1), where x_s is what
-      `DriveStep` says and T = `RELAXATION`: a spring that gives way. Below c it holds without creep. With a fall speed
-      w it holds c exp(-(v/w)^2): Stribeck's, lost when it slides; T is 0, as its spring's force is all that it has.
-    - "presliding forward": the same with 0 instead of -1: what friction towards +x has more than towards -x; with a
-      negative coefficient the other way round. T is 0.
-    - Where these two hold less than c, the hook comes two time steps h late and they act like viscous friction of
-      2 h c / s, so give them a travel s well above 2 h v.
-    - "coulomb": -c clip(v / s, +-1); the smoothed sign of an identification. It creeps below c, at a speed up to s.
+    - "presliding" with coefficient c and scale s: effort -c clip((x - x_s + T v) / s, +-1). x_s is the anchor from
+      `DriveStep` and T = `RELAXATION`. Below c it holds without creep. With a fall speed w the limit is
+      c exp(-(v/w)^2), Stribeck friction that vanishes while sliding. T is then 0, since the limit applies to the spring
+      only.
+    - "presliding forward": the same with 0 instead of -1, for the excess of friction towards +x over friction towards
+      -x. A negative coefficient exchanges the directions. T is 0.
+    - Where these two hold less than c, the anchor is two time steps h late. They then act like viscous friction of
+      2 h c / s, so choose a travel s well above 2 h v.
+    - "coulomb": -c clip(v / s, +-1), the smoothed sign function of an identification. Below c it creeps with a speed up
+      to s.
     - "viscous": -c v.
 
     Returns:
-        what needs a `DriveStep`: actuator of the plant, its effect, and coordinate over the actuator's joint.
+        Elements that need a `DriveStep`: actuator of the plant, its effect, and ratio of coordinate to actuator joint.
 
     Raises:
-        StationError: an effect that the arm cannot have.
+        StationError: An effect that the arm cannot have.
     """
     followed = []
     for i, effect in enumerate(friction):
@@ -105,7 +107,7 @@ def add_friction(
 
 
 def _copy_rotor(plant: MultibodyPlant, actuator: JointActuator) -> None:
-    """Of several actuators on a joint Drake takes only the last one's rotor inertia (1.51 to 1.58): say it again."""
+    """Copies the rotor inertia to a new actuator. Drake uses only that of a joint's last actuator (1.51 to 1.58)."""
     for index in plant.GetJointActuatorIndices():
         motor = plant.get_joint_actuator(index)
         if motor.joint().index() == actuator.joint().index() and motor.default_rotor_inertia() > 0:
@@ -118,29 +120,29 @@ def _add_damping(joint: Joint, damping: float) -> None:
 
 
 class PlantEffects:
-    """Adds them to a plant that is not finalized, and says afterwards where they are in it.
+    """Adds the effects to a plant that is not finalized, and provides their indices after it is finalized.
 
     Attributes:
-        drive: the joints that were added for coordinates of the drive.
-        to_actuators: (n, nq) positions of the plant to those of the arm's actuators; after `finish`.
-        from_motors: (nv, n) efforts of the motors to those on the plant; after `finish`.
-        joint_index: (n,) of the joints in the plant's q and v; after `finish`.
-        sliders: friction that follows; after `finish`.
-        num_actuators: of the plant's instance; after `finish`.
+        drive: Joints that were added for coordinates of the drive.
+        to_actuators: Matrix (n, nq) from plant positions to positions of the arm's actuators; after `finish`.
+        from_motors: Matrix (nv, n) from motor efforts to generalized forces of the plant; after `finish`.
+        joint_index: Indices (n,) of the joints in the plant's q and v; after `finish`.
+        sliders: Friction elements with a moving anchor; after `finish`.
+        num_actuators: Number of actuators of the plant's instance; after `finish`.
     """
 
     def __init__(self, plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex, effects: ArmEffects) -> None:
-        """Of the `arm` that `add_arm` added to `plant` as `instance`; `friction`, `stops` and `stretch` count.
+        """Adds `friction`, `stops` and `stretch` to the `arm` that `add_arm` added to `plant` as `instance`.
 
         Raises:
-            StationError: an effect that the arm cannot have.
+            StationError: An effect that the arm cannot have.
         """
         self._plant, self._arm = plant, arm
         self.drive = DriveJoints(plant, arm, instance)
         for actuator, cable in effects.stretch.items():
             self.drive.add_motor(actuator, cable)
         self._elements = add_friction(plant, arm, self.drive, effects.friction)
-        # Drake disarms the gains of all of an instance's actuators while their desired state is not connected.
+        # Drake disables the gains of all actuators of an instance while their desired state is not connected.
         self.needs_desired_state = any(effect.kind != "viscous" for effect in effects.friction)
         if effects.stops:
             rows, lower, upper = arm.limit_matrix()
@@ -151,12 +153,12 @@ class PlantEffects:
 
     @property
     def time_step(self) -> float:
-        """Of the plant [s]."""
+        """Time step of the plant [s]."""
         step: float = self._plant.time_step()
         return step
 
     def finish(self, joints: PlantJoints) -> None:
-        """To be called when the plant is finalized."""
+        """Computes the indices. Call it when the plant is finalized."""
         order = [actuator.index() for actuator in joints.actuators]
         self.num_actuators = len(order)
         self.sliders = [Slider.of(element, order) for element in self._elements]

@@ -1,1 +1,1 @@
-"""What stands between whoever commands an arm and its motors; neither Drake nor LCM is needed for it."""
+"""Command guard between the senders of commands and the motors of an arm. Independent of Drake and LCM."""

@@ -1,4 +1,4 @@
-"""The watchdog between whoever commands an arm and its motors: no Drake, no LCM, for simulated and real arms."""
+"""Command guard of an arm: checks commands and measurements without Drake or LCM, for simulated and real arms."""
 
 from __future__ import annotations
 
@@ -31,13 +31,14 @@ from dvrk_drake.systems.guard.settings import GuardSettings
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
 
-#: No longer time between two steps is made up for in rate limits [s].
+#: Largest time step that the rate limits use [s]. They do not compensate for longer intervals between two steps.
 _MAX_STEP = 0.01
 
-#: After a longer time without a measurement, the next one is not compared with it [s]: somebody may have moved the arm.
+#: Longest gap after which a measurement is compared with the previous one [s]. After a longer gap the arm may have been
+#: moved.
 _MAX_GAP = 0.1
 
-#: States in which a position controller leads the arm to a target.
+#: States in which a position controller regulates the arm to a target.
 _REGULATED = (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_POSITION)
 
 _ACTIVE = {
@@ -47,74 +48,93 @@ _ACTIVE = {
 
 
 class CommandGuard:
-    """Takes commands as they arrive and says, once a period, what the arm shall do.
+    """Watchdog between the sender of commands and the motors of an arm.
 
-    Call `receive` with every command and `step` once a period (1 ms), both with the arm's clock in microseconds, the
-    one that its status messages carry. `step` returns what to do; whoever calls it does that and nothing else.
+    Call `receive` with every command and `step` once per period (1 ms). Both take the arm's clock in microseconds, the
+    clock of its status messages. `step` returns the output for this period. The caller applies it unchanged.
 
-    **States** (lcmt_dvrk_status.STATE_*) and what the arm does in them:
+    **States** (lcmt_dvrk_status.STATE_*) and the behaviour of the arm in each of them:
 
-    - OFF: motors without power. Leaves for HOLD on a HOLD command only.
-    - HOLD: the arm regulates to a latched pose. The first state. Nobody need command.
-    - STARTING: as HOLD, while a sender's POSITION or EFFORT commands are watched.
-    - POSITION, EFFORT: the last command acts, inside the limits of GuardLimits.
-    - FAULT: as HOLD. After a fault of a measurement, efforts hold the joints with a valid position, and the others have
-      the gravity effort of their last valid pose. As OFF where the motors had no power.
+    - OFF: The motors have no power. Only a HOLD command leaves this state, to HOLD.
+    - HOLD: The arm regulates to a latched pose. This is the initial state. It needs no commands.
+    - STARTING: As HOLD, while the POSITION or EFFORT commands of a sender are monitored.
+    - POSITION, EFFORT: The last command acts, inside the limits of GuardLimits.
+    - FAULT: As HOLD. After a measurement fault, efforts hold the joints that have a valid position. The other joints
+      get the gravity effort of their last valid pose. As OFF if the motors had no power.
 
     ::
 
-        HOLD --OFF after a HOLD--> OFF --HOLD--> HOLD       any --HOLD--> HOLD, but from FAULT
+        HOLD --OFF after a HOLD--> OFF --HOLD--> HOLD       any --HOLD--> HOLD, except from FAULT
         HOLD --POSITION, EFFORT--> STARTING --good for start_time--> POSITION, EFFORT
-        STARTING --refused, expired, bad measurement, stepped too seldom--> HOLD
-        POSITION, EFFORT --HOLD--> HOLD; --expired, bad measurement, stepped too seldom--> HOLD until a resume
+        STARTING --refused, expired, bad measurement, period too long--> HOLD
+        POSITION, EFFORT --HOLD--> HOLD; --expired, bad measurement, period too long--> HOLD until a resume
         POSITION, EFFORT --the other mode--> STARTING
         any --fault--> FAULT --HOLD with reset_fault, changed from false to true--> HOLD
 
-    **Expiry**: a command is obeyed until `expiry` after the measurement that it answers (its `status_utime`), whenever
-    it came; who answers one measurement again and again gains no time. Then the arm holds. See `CommandExpiry`.
+    **Expiry**: A command expires `expiry` after the measurement that it answers (its `status_utime`). Its time of
+    arrival does not matter. Repeating the answer to one measurement does not extend its expiry. After the expiry the
+    arm holds. See `CommandExpiry`.
 
-    **Measurements** are checked: numbers, age, and plausibility (`Plausibility`). One that is not finite or too old
-    ends commands; while the arm holds, some in a row are tolerated, and more are a fault. One that is
-    not compared with an earlier one (the first one, and after a gap, OFF or a reset) must not be far beyond a limit.
+    **Measurements** are checked for finite numbers, age and plausibility (`Plausibility`). A measurement that is not
+    finite or too old ends the control by commands. While the arm holds, a few such measurements in a row are tolerated.
+    More of them are a fault. A measurement that cannot be compared with an earlier one must not be far beyond a limit.
+    This applies to the first one and to the first one after a gap, OFF or a reset.
 
-    **Period**: a guard that is not stepped for `longest_period`, or with a median period above `slow_period`, accepts
-    no POSITION and EFFORT: what it limits would come too late.
+    **Period**: The guard accepts no POSITION and EFFORT commands if it was not stepped for `longest_period`, or if its
+    median period is above `slow_period`. Its limits would act too late.
 
-    **Resume**: when a command in force ended for one of these reasons, the watchdog took over. The guard then refuses
-    POSITION and EFFORT until an operator resumes, in the way in which a fault is reset; `hold_reason` is why. It is no
-    fault: the arm holds, and OFF is allowed. A HOLD command before the silence, and STARTING that ends, need no resume.
-    `GuardSettings.resume_automatically` switches this off; the next sender is then watched as the first was.
+    **Resume**: The watchdog takes over when a command in force ends for one of these reasons. The guard then refuses
+    POSITION and EFFORT until an operator resumes, in the same way in which a fault is reset. `hold_reason` states the
+    reason. This is not a fault: the arm holds, and OFF is allowed. No resume is needed if the sender commanded HOLD
+    before it stopped sending, or if STARTING ended. `GuardSettings.resume_automatically` disables this requirement. The
+    next sender then passes through STARTING as the first one did.
 
-    **What is refused** (`lcmt_dvrk_status.REFUSAL_*` has the list): commands that are not finite, expired when they
-    come, out of order or sent twice, after a jump of the sender's sequence or clock, in a mode that is not accepted
-    now. They do not act and do not keep an older command alive, so a stream of bad commands ends in HOLD.
+    **Refused commands** (`lcmt_dvrk_status.REFUSAL_*` lists the reasons): commands that are not finite, expired on
+    arrival, out of order, duplicated, after a jump of the sender's sequence or clock, or in a mode that is not accepted
+    in this state. They do not act, and they do not extend the expiry of an older command. So a stream of bad commands
+    ends in HOLD.
 
-    **What is ignored**: messages that are unreadable, not authentic, of another arm, size or session, or of a second
-    sender while the first one still sends. They are counted separately and change nothing: the first sender stays in
-    command. Without a key, a sender is only as good as its sender_id, which anybody on the network can copy.
+    **Ignored messages**: messages that are unreadable, not authentic, or of another arm, size or session. Messages of a
+    second sender are ignored while the first one still sends. They are counted separately and change nothing, so the
+    first sender stays in control. Without a key, a sender is identified by its sender_id only, which any process on the
+    network can copy.
 
-    **OFF** drops an arm without brakes, so it must be in `modes`, and no single message does it: the arm must hold, and
-    the sender's last command must have been HOLD. A fault refuses it: the cause is unknown, so the arm stays held until
-    an operator resets the fault. In an emergency, press the stop button.
+    **OFF** drops an arm without brakes, so it must be in `modes`, and a single message is not sufficient. The arm must
+    hold, and the sender's last command must have been HOLD. The guard refuses OFF during a fault and keeps holding the
+    arm until an operator resets the fault. In an emergency, press the stop button.
 
-    **Start guard**: before commands act they must have come without a gap of `expiry` and without a refusal for
-    `start_time`, all near the present: efforts near the measured ones, positions near the measured ones, also where the
-    feed-forward velocity leads; for efforts the pose must not be beyond a limit by half the margin, the present effort
-    not beyond what commands may use, and near the model's gravity effort. A sender that starts with something else is
-    refused, so a restarted or confused controller moves nothing.
+    **Start check**: Commands act only after a stream without a gap of `expiry` and without a refusal for `start_time`.
+    All of them must be close to the present state:
 
-    **Faults** are latched: measurements that are not plausible, not finite or too old, a pose beyond a limit (by half
-    the margin) while efforts act, a joint that does not follow or is pushed away, efforts that oscillate, the arm's
-    clock going backwards or standing still, an output that is not finite, and what a driver reports. The reset must be
-    meant: the flag must change from false to true in a HOLD command, and a cause that lasts faults again.
+    - Commanded efforts must be near the measured efforts.
+    - Commanded positions must be near the measured positions, including the lead of the feedforward velocity.
+    - For efforts, the pose must not be beyond a limit by more than half of the margin. The present effort must be
+      inside the limit for commands and near the model's gravity effort.
 
-    **Without a bump**: HOLD keeps the target that was regulated to, after POSITION only while the arm is near it, and
-    else latches the measured pose; POSITION starts from the held pose; EFFORT starts from the measured effort, and the
-    soft wall, for whoever starts inside it, comes on in `start_time`; each at its limited rate.
+    A sender that starts with other values is refused, so a controller that was restarted or is in a wrong state does
+    not move the arm.
 
-    **Clocks**: the sender's and the arm's are never compared, only how far each went between two commands; so they need
-    not be synchronised. Commands after a jump of the sender's clock are refused until what is in force has expired; a
-    jump of the arm's clock forward expires it.
+    **Faults** are latched. Causes are:
+
+    - measurements that are not plausible, not finite or too old,
+    - a pose beyond a limit by more than half of the margin while efforts act,
+    - a joint that does not follow its target or is pushed away from it,
+    - efforts that oscillate,
+    - an arm clock that goes backwards or stands still,
+    - an output that is not finite,
+    - a fault that the driver reports.
+
+    A reset needs a HOLD command in which the flag changes from false to true. A cause that persists triggers the fault
+    again.
+
+    **Bumpless transfer**: HOLD keeps the target of the regulation. After POSITION it does so only while the arm is near
+    the target, otherwise it latches the measured pose. POSITION starts from the held pose, and EFFORT from the measured
+    effort. If EFFORT starts inside a soft wall, the effort of the wall increases over `start_time`. All transitions are
+    limited in rate.
+
+    **Clocks**: The clocks of the sender and of the arm are never compared, only their advance between two commands, so
+    they need not be synchronised. After a jump of the sender's clock, commands are refused until the command in force
+    has expired. A forward jump of the arm's clock makes the command in force expire.
     """
 
     def __init__(
@@ -126,20 +146,20 @@ class CommandGuard:
         modes: tuple[int, ...] | None = None,
         wall_clock: Callable[[], int] | None = None,
     ):
-        """A guard in HOLD.
+        """Creates a guard in HOLD.
 
         Args:
-            arm: whose limits are kept.
-            session_id: not 0; drawn anew whenever the arm starts.
-            model: of the arm, mounted as it is, e.g. `ControlModel(IdentifiedModel.from_arm(arm))`; an identified model
-                detects more.
-            settings: the defaults of GuardSettings if None.
-            modes: which of POSITION, EFFORT and OFF are accepted; POSITION and EFFORT if None.
-            wall_clock: monotonic time of the computer [us], by which commands expire as well; None: by the arm's clock
-                only, as for an arm in a simulated Diagram. Copies of the guard share it.
+            arm: Arm whose limits are enforced.
+            session_id: Random identifier of the session, not 0. It changes with every start of the arm.
+            model: Model of the arm as mounted, e.g. `ControlModel(IdentifiedModel.from_arm(arm))`. An identified model
+                detects more faults.
+            settings: Settings of the guard. None: the defaults of GuardSettings.
+            modes: Accepted modes among POSITION, EFFORT and OFF. None: POSITION and EFFORT.
+            wall_clock: Monotonic time of the computer [us], by which commands expire additionally. None: the arm's
+                clock only, as for an arm in a simulated Diagram. Copies of the guard share it.
 
         Raises:
-            StationError: no session, unknown modes, or settings or an arm's gains that guard nothing.
+            StationError: The session is 0, a mode is unknown, or the settings or the arm's gains are out of range.
         """
         if unknown := set(modes or ()) - {*_ACTIVE, lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD}:
             raise StationError(f"modes must be of POSITION, EFFORT and OFF; got {sorted(unknown)}")
@@ -151,7 +171,7 @@ class CommandGuard:
         self.arm_name, self.num_joints, self.session_id = arm.name, arm.num_joints, session_id
         self.state = lcmt_dvrk_status.STATE_HOLD
         self.fault_code, self.fault_text = lcmt_dvrk_status.FAULT_NONE, ""
-        #: Why the watchdog took over, until an operator resumes; or "".
+        #: Reason for which the watchdog took over, until an operator resumes. Empty: it did not.
         self.hold_reason = ""
         self.refusal_code = self.ignored_code = lcmt_dvrk_status.REFUSAL_NONE
         self.counts = GuardCounts()
@@ -163,7 +183,7 @@ class CommandGuard:
         )
         self._force = CommandInForce()
         self._powered = True
-        #: What is wrong with the last measurement, in words; or "".
+        #: Description of the error of the last measurement. Empty: no error.
         self._problem = ""
         self._measured = Measurement(arm.num_joints, round(1e6 * self.settings.measurement_age))
         self._plausibility = Plausibility(arm, model, self.settings.plausibility, self.limits.speed)
@@ -174,7 +194,7 @@ class CommandGuard:
         self._commanded = self.output.effort
 
     def __deepcopy__(self, memo: object) -> CommandGuard:
-        # A Drake context copies its state before every update, so this must be quick. No array is changed in place.
+        # A Drake context copies its state before every update, so copying must be fast. No array is changed in place.
         other = object.__new__(CommandGuard)
         other.__dict__.update(self.__dict__)
         for name in (
@@ -195,7 +215,7 @@ class CommandGuard:
 
     @property
     def accepted_modes(self) -> int:
-        """Bit 1 << mode for each mode that a command may have now."""
+        """Accepted modes in the present state: bit 1 << mode is set for each of them."""
         if self.state == lcmt_dvrk_status.STATE_FAULT:
             return 1 << lcmt_dvrk_command.HOLD
         modes = {lcmt_dvrk_command.HOLD, *self._modes}
@@ -207,12 +227,12 @@ class CommandGuard:
 
     @property
     def sender_id(self) -> int:
-        """Whose commands are in force or being watched; 0: nobody's."""
+        """Identifier of the sender whose commands are in force or being monitored. 0: none."""
         return self._stream.sender_id if self._is_watched_or_in_force() else 0
 
     @property
     def last_sender_id(self) -> int:
-        """Whose commands were accepted last; 0: nobody's."""
+        """Identifier of the sender whose command was accepted last. 0: none."""
         return self._stream.sender_id
 
     @property
@@ -222,22 +242,22 @@ class CommandGuard:
 
     @property
     def waits_for(self) -> str:
-        """Why no POSITION and EFFORT is accepted while there is no fault, in words; "" if they are.
+        """Reason why POSITION and EFFORT are not accepted although there is no fault. Empty: they are accepted.
 
-        Either `hold_reason`, until an operator resumes, or a guard that is stepped too seldom.
+        The reason is either `hold_reason`, until an operator resumes, or a period of the guard that is too long.
         """
         return self.hold_reason or self._period.fault
 
     @property
     def gravity_effort(self) -> Vector:
-        """(n,) gravity effort of the model at the last good measurement [N m, N]."""
+        """Gravity effort (n,) of the model at the last good measurement [N m, N]."""
         return self._plausibility.gravity
 
     def receive(self, command: lcmt_dvrk_command | None, utime: int) -> int:
-        """Takes one command, or None for a message that was none, that arrived at `utime` [us].
+        """Receives one command that arrived at `utime` [us]. None stands for an unreadable message.
 
         Returns:
-            lcmt_dvrk_status.REFUSAL_NONE, or why it was refused.
+            lcmt_dvrk_status.REFUSAL_NONE, or the reason of the refusal.
         """
         self._expire(utime)
         code = foreign_refusal(command, self.arm_name, self.num_joints, self.session_id)
@@ -256,24 +276,24 @@ class CommandGuard:
         return code
 
     def ignore(self, code: int, count: int = 1) -> None:
-        """Counts messages that were not given to `receive` because they do not belong to the session.
+        """Counts messages that were not passed to `receive` because they do not belong to the session.
 
         Args:
-            code: lcmt_dvrk_status.REFUSAL_*, why the last one was ignored.
-            count: how many there were.
+            code: Reason why the last one was ignored, lcmt_dvrk_status.REFUSAL_*.
+            count: Number of messages.
         """
         self.counts.ignored += count
         self.ignored_code = code
 
     def step(self, utime: int, measured_utime: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> GuardOutput:
-        """What to do from `utime` [us] on.
+        """Returns the output of the guard for the period that starts at `utime` [us].
 
         Args:
-            utime: the arm's clock now [us].
-            measured_utime: the arm's clock when q, v and effort were measured [us]; too old is a fault.
-            q: measured positions (n,) [rad, m].
-            v: velocities (n,) [rad/s, m/s].
-            effort: what the motors applied (n,) [N m, N].
+            utime: Present time of the arm's clock [us].
+            measured_utime: Time of the measurement of q, v and effort on the arm's clock [us]. Too old is a fault.
+            q: Measured positions (n,) [rad, m].
+            v: Velocities (n,) [rad/s, m/s].
+            effort: Applied motor efforts (n,) [N m, N].
         """
         dt, problem = self._measured.advance(utime)
         if dt < 0:
@@ -306,13 +326,13 @@ class CommandGuard:
         return self.output
 
     def report_fault(self, text: str, code: int = lcmt_dvrk_status.FAULT_DRIVER, *, has_power: bool = True) -> None:
-        """Latches a fault, for drivers whose arm reports one: before each `step`, as long as it lasts.
+        """Latches a fault that the arm's driver reports. Call it before each `step` while the fault lasts.
 
         Args:
-            text: what it is, with its numbers; the first one stays until it is reset.
+            text: Description of the fault with its numbers. The first description is kept until the reset.
             code: lcmt_dvrk_status.FAULT_*.
-            has_power: False if the motors cannot hold the arm. It is as OFF then, and a reset holds it where it is
-                found, not where it was.
+            has_power: False if the motors cannot hold the arm. The output is then as in OFF, and a reset holds the arm
+                at its measured pose, not at the earlier one.
         """
         if self.state != lcmt_dvrk_status.STATE_FAULT:
             powered = self._powered
@@ -322,7 +342,7 @@ class CommandGuard:
         self._powered &= has_power
 
     def _measure(self, measured_utime: int, q: ArrayLike, v: ArrayLike, effort: ArrayLike) -> None:
-        """Takes a measurement and checks it; what is wrong with it ends in HOLD or FAULT."""
+        """Checks a measurement and stores it. An error leads to HOLD or FAULT."""
         measured, plausibility = self._measured, self._plausibility
         first = measured.q is None
         begins = plausibility.begins or measured.time_since(measured_utime) >= _MAX_GAP
@@ -330,16 +350,16 @@ class CommandGuard:
         self._problem = problem = measured.take(measured_utime, q, v, effort, implausible_pose)
         if problem:
             if first or measured.bad > self.settings.plausibility.bad_samples:
-                # An arm that was never measured has no pose that it could be held at.
+                # Without any measurement there is no pose to hold.
                 self.report_fault(problem, lcmt_dvrk_status.FAULT_MEASUREMENT, has_power=not first)
                 plausibility.reject_all()
             elif self._is_watched_or_in_force():
                 self._take_over(problem)
             return
         if first:
-            self._follower.latch(self._q(), np.zeros(self.num_joints))  # it stands so far
+            self._follower.latch(self._q(), np.zeros(self.num_joints))  # the arm is taken to be at rest
         elif measured.dt == 0:
-            return  # the same measurement again
+            return  # repeated measurement
         if begins:
             plausibility.forget()
         commanded = self._commanded if self.state == lcmt_dvrk_status.STATE_EFFORT else None
@@ -347,7 +367,7 @@ class CommandGuard:
         if fault:
             self.report_fault(fault, lcmt_dvrk_status.FAULT_IMPLAUSIBLE)
         if not self._powered:
-            plausibility.forget()  # somebody may move the arm, in any way
+            plausibility.forget()  # the arm may be moved by hand
 
     def _watch_period(self, dt: float) -> None:
         if self._expiry.wall is not None:
@@ -360,7 +380,7 @@ class CommandGuard:
         return self.state in (lcmt_dvrk_status.STATE_STARTING, *_ACTIVE.values())
 
     def _q(self) -> Vector:
-        """The measured pose (n,), or where it was last wanted."""
+        """Returns the measured pose (n,), or the last target without a measurement."""
         return self._follower.target if self._measured.q is None else self._measured.q
 
     def _expire(self, utime: int) -> None:
@@ -371,10 +391,10 @@ class CommandGuard:
             self._take_over(reason)
 
     def _take_over(self, reason: str) -> None:
-        """Goes to HOLD, until an operator resumes if commands acted; has no effect in OFF and in FAULT.
+        """Changes to HOLD. A resume is needed if commands acted. Has no effect in OFF and in FAULT.
 
         Args:
-            reason: in words; the first one stays until the resume.
+            reason: Description of the reason. The first one is kept until the resume.
         """
         if self.state in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_FAULT):
             return
@@ -384,12 +404,12 @@ class CommandGuard:
             self.hold_reason = self.hold_reason or reason
 
     def _refusal_now(self, command: lcmt_dvrk_command, utime: int) -> int:
-        """REFUSAL_* of a command of this session, given who sent what before and what the arm is doing."""
+        """Returns REFUSAL_* of a command of this session, from the earlier commands and the present state."""
         if self._stream.is_other_sender(command, utime):
             return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
         if self._measured.utime is None or not 0 <= utime - command.status_utime <= self._expiry.expiry:
             return lcmt_dvrk_status.REFUSAL_STALE
-        # The stream first: what does not continue it interrupts nothing.
+        # The stream is checked first: a command that does not continue it interrupts nothing.
         if (code := self._stream.refusal(command, utime)) != lcmt_dvrk_status.REFUSAL_NONE:
             return code
         if (code := content_refusal(command)) != lcmt_dvrk_status.REFUSAL_NONE:
@@ -405,7 +425,7 @@ class CommandGuard:
         if command.control_mode < 0 or not self.accepted_modes >> command.control_mode & 1:
             return lcmt_dvrk_status.REFUSAL_BAD_MODE
         if command.control_mode == lcmt_dvrk_command.HOLD and self._measured.bad and not self._powered:
-            return lcmt_dvrk_status.REFUSAL_STALE  # nobody knows where it would be held
+            return lcmt_dvrk_status.REFUSAL_STALE  # the pose to hold is unknown
         if command.control_mode in _ACTIVE:
             return self.limits.refusal_to_start(command, self._q(), self._measured.effort, self._plausibility.gravity)
         return lcmt_dvrk_status.REFUSAL_NONE
@@ -422,7 +442,7 @@ class CommandGuard:
         if mode == lcmt_dvrk_command.OFF:
             self.state, self._powered = lcmt_dvrk_status.STATE_OFF, False
         elif mode == lcmt_dvrk_command.HOLD:
-            # A pose that is not measured now, or that no arm has, is not where a reset may hold the arm.
+            # A reset must not hold a pose that is not measured at present or that is implausible.
             problem = self._problem or self.limits.implausible_pose(self._q())
             if resets and problem and self.state == lcmt_dvrk_status.STATE_FAULT:
                 self.fault_text = problem
@@ -451,7 +471,7 @@ class CommandGuard:
             self._follower.begin_effort(self._measured.effort, self._q())
 
     def _hold(self) -> None:
-        """To HOLD, at the pose that is held already or else at the measured one."""
+        """Changes to HOLD at the pose that is already held, otherwise at the measured pose."""
         q = self._q()
         regulated = (
             self.state in (lcmt_dvrk_status.STATE_HOLD, lcmt_dvrk_status.STATE_STARTING, lcmt_dvrk_status.STATE_FAULT)

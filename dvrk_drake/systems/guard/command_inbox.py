@@ -1,4 +1,4 @@
-"""Inbox between the network and a command guard: drops foreign messages at once and bounds what a flood costs."""
+"""Inbox between the network and a command guard. Drops foreign messages early and bounds the cost of a flood."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-#: Most commands that are kept from one step to the next, of the sender in command and of all others [each].
+#: Largest number of commands kept between two steps, for the sender in control and for all others [each].
 _CAPACITY = 16
-#: Where sequence, sender_id and session_id are in an encoded command, and where arm_name begins [bytes].
+#: Offsets of sequence, sender_id and session_id in an encoded command, and the start of arm_name [bytes].
 _SEQUENCE, _SENDER, _SESSION, _NAME = slice(16, 24), slice(24, 32), slice(32, 40), 48
 
 _UNREADABLE = lcmt_dvrk_status.REFUSAL_UNREADABLE
@@ -25,22 +25,22 @@ def _sequence(data: bytes) -> int:
 
 
 class CommandInbox:
-    """Commands that arrived since the guard's last step, not decoded yet.
+    """Buffer for encoded commands that arrived since the last step of the guard.
 
-    `put` looks at the bytes only: length, type, arm, session and, with a key, the authentication code. What fails is
-    counted and dropped, in a few microseconds. Of the rest it keeps a bounded number, with room of its own for the
-    sender in command, so that a flood of other senders does not displace its commands. Of these it keeps the latest in
-    sequence, so that a flood of copies of earlier ones does not either. `deliver` decodes what was kept and gives it to
-    the guard.
+    `put` examines only the bytes: length, type, arm, session and, with a key, the authentication code. Messages that
+    fail are counted and dropped within a few microseconds. A bounded number of the others is kept. The sender in
+    control has its own part of the buffer, so a flood of other senders does not displace its commands. Its commands
+    with the latest sequence are kept, so a flood of copies of earlier commands does not displace them either. `deliver`
+    decodes the kept messages and passes them to the guard.
     """
 
     def __init__(self, guard: CommandGuard, key: MessageKey | None = None, capacity: int = _CAPACITY) -> None:
-        """Empty inbox for one guard.
+        """Creates an empty inbox for one guard.
 
         Args:
-            guard: whose arm and session the commands must be meant for; copies of it can be delivered to as well.
-            key: must have signed the commands; None: codes are not verified.
-            capacity: most commands that are kept of the sender in command, and of all others together.
+            guard: Guard whose arm and session the commands must address. Copies of it are accepted by `deliver`.
+            key: Key that must have signed the commands. None: codes are not verified.
+            capacity: Largest number of commands kept of the sender in control, and of all others together.
         """
         name = guard.arm_name.encode() + b"\0"
         self._fingerprint = lcmt_dvrk_command()._get_packed_fingerprint()
@@ -56,7 +56,7 @@ class CommandInbox:
         self._ignored, self._code = 0, lcmt_dvrk_status.REFUSAL_NONE
 
     def put(self, data: bytes) -> None:
-        """Takes a message of the command channel, as it came over the wire."""
+        """Stores a message of the command channel as received."""
         code = self._refusal(data)
         if code == lcmt_dvrk_status.REFUSAL_NONE:
             messages = self._own if data[_SENDER] == self._sender else self._others
@@ -72,11 +72,11 @@ class CommandInbox:
         self._code = code
 
     def deliver(self, guard: CommandGuard, utime: int) -> None:
-        """Gives what was kept to the guard, as arrived at `utime` [us], and what was dropped to its counts."""
+        """Passes kept messages to the guard, with arrival at `utime` [us], and adds dropped ones to its counts."""
         if self._ignored:
             guard.ignore(self._code, self._ignored)
             self._ignored = 0
-        # Commands of the sender in command come first, in their order; the order between senders does not matter.
+        # Commands of the sender in control come first, in their order. The order between senders does not matter.
         for messages in (self._own, self._others):
             for data in messages:
                 guard.receive(decode(lcmt_dvrk_command, data), utime)
@@ -84,7 +84,7 @@ class CommandInbox:
         self._sender = struct.pack(">q", guard.last_sender_id)
 
     def _refusal(self, data: bytes) -> int:
-        """Returns lcmt_dvrk_status.REFUSAL_* by the bytes of a message."""
+        """Returns lcmt_dvrk_status.REFUSAL_* from the bytes of a message."""
         if data[:8] != self._fingerprint:
             return _UNREADABLE
         if data[_SESSION] != self._session:

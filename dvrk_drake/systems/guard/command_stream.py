@@ -1,4 +1,4 @@
-"""Checks of a command that do not depend on what the arm does: by itself, and after its sender's other commands."""
+"""Checks of a command that do not depend on the state of the arm: its content and its position in the stream."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.systems.guard.limits import Vector
 
-#: Refusals of messages that do not belong to the session or to the sender in command. They are counted separately.
+#: Refusals of messages that do not belong to the session or to the sender in control. They are counted separately.
 FOREIGN = frozenset(
     {
         lcmt_dvrk_status.REFUSAL_UNREADABLE,
@@ -24,8 +24,8 @@ FOREIGN = frozenset(
     }
 )
 
-#: Refusals of commands that do not continue their sender's stream, as copies and replays of its commands. They do not
-#: interrupt it.
+#: Refusals of commands that do not continue their sender's stream, such as copies and replays. They do not interrupt
+#: it.
 OUT_OF_STREAM = frozenset(
     {
         lcmt_dvrk_status.REFUSAL_STALE,
@@ -39,19 +39,19 @@ OUT_OF_STREAM = frozenset(
 def is_finite(numbers: list[float]) -> bool:
     """Returns whether all numbers are finite and the sum of their magnitudes is below 1e6.
 
-    A list, since numpy takes longer for a few numbers and warns of an overflow.
+    The argument is a list, because numpy takes longer for a few numbers and warns of an overflow.
     """
     return sum(map(abs, numbers)) < IMPLAUSIBLE
 
 
 def foreign_refusal(command: lcmt_dvrk_command | None, arm_name: str, num_joints: int, session_id: int) -> int:
-    """Returns lcmt_dvrk_status.REFUSAL_* of a command that is not meant for this arm and session, else REFUSAL_NONE.
+    """Returns lcmt_dvrk_status.REFUSAL_* of a command that does not address this arm and session, else REFUSAL_NONE.
 
     Args:
-        command: as received; None: it was not readable.
-        arm_name: of the arm that it must be meant for.
-        num_joints: of that arm.
-        session_id: of that arm.
+        command: Received command. None: it was not readable.
+        arm_name: Name of the arm that it must address.
+        num_joints: Number of joints of that arm.
+        session_id: Session of that arm.
     """
     if command is None:
         return lcmt_dvrk_status.REFUSAL_UNREADABLE
@@ -68,7 +68,7 @@ def foreign_refusal(command: lcmt_dvrk_command | None, arm_name: str, num_joints
 
 
 def content_refusal(command: lcmt_dvrk_command) -> int:
-    """Returns lcmt_dvrk_status.REFUSAL_* of a command whose numbers or flags are wrong, else REFUSAL_NONE."""
+    """Returns lcmt_dvrk_status.REFUSAL_* of a command with invalid numbers or flags, else REFUSAL_NONE."""
     if not is_finite([*command.position, *command.velocity, *command.effort]):
         return lcmt_dvrk_status.REFUSAL_NOT_FINITE
     if command.reset_fault and command.control_mode != lcmt_dvrk_command.HOLD:
@@ -78,7 +78,7 @@ def content_refusal(command: lcmt_dvrk_command) -> int:
 
 @dataclass
 class GuardCounts:
-    """Commands since the guard was made: accepted, missing, refused, ignored; and how often one in force expired."""
+    """Counts of commands since the guard was created: accepted, missing, refused, ignored, and expired in force."""
 
     accepted: int = 0
     lost: int = 0
@@ -89,16 +89,16 @@ class GuardCounts:
 
 @dataclass
 class CommandInForce:
-    """The command in force or being watched.
+    """Command in force or being monitored.
 
-    The numbers that act are copies, which whoever made the command cannot change any more.
+    The numbers are copied, so that later changes of the message have no effect.
 
     Attributes:
-        command: itself.
-        position: (n,) and so on, its numbers.
-        status_utime: of the measurement that it answers [us].
-        wall_utime: time of that measurement by the guard's wall clock, if it has one [us].
-        good_since: since when its stream has been good [us].
+        command: The command.
+        position: Commanded positions (n,); the other numbers accordingly.
+        status_utime: Time of the measurement that it answers [us].
+        wall_utime: Time of that measurement on the guard's wall clock, if there is one [us].
+        good_since: Time since which its stream has been good [us].
     """
 
     command: lcmt_dvrk_command = field(default_factory=lcmt_dvrk_command)
@@ -110,7 +110,7 @@ class CommandInForce:
     good_since: int = 0
 
     def take(self, command: lcmt_dvrk_command) -> None:
-        """Goes on to this command of the same stream."""
+        """Replaces the command by the next one of the same stream."""
         self.command, self.status_utime = command, command.status_utime
         self.position, self.velocity, self.effort = (
             np.array(numbers, float) for numbers in (command.position, command.velocity, command.effort)
@@ -119,23 +119,24 @@ class CommandInForce:
 
 @dataclass
 class CommandStream:
-    """The commands of one sender. All times in us, arrivals on the arm's clock.
+    """Stream of the commands of one sender. All times are in us; arrivals are on the arm's clock.
 
-    A sender keeps its place while its commands are accepted. A second sender is refused until no command of the first
-    one has been accepted for `expiry`. A refused command keeps no place, or whoever repeats one would keep an operator
-    from resuming.
+    A sender stays in control while its commands are accepted. A second sender is refused until no command of the first
+    one has been accepted for `expiry`. A refused command does not extend the control. Otherwise a process that repeats
+    one command could prevent an operator from resuming.
 
     Sequence and time of a command are compared with those of the last accepted command, unless that is older than
-    `expiry`. A refused command changes neither, so a spoofed sequence or time does not end the control of the true
-    sender; a sender whose own clock or sequence jumped starts anew when its last accepted command has expired.
+    `expiry`. A refused command changes neither. So a spoofed sequence or time does not end the control of the genuine
+    sender. A sender whose own clock or sequence jumped restarts when its last accepted command has expired.
 
     Attributes:
-        expiry: time after which a silent sender may be followed by another one, and after which sequence and time of
-            the last accepted command no longer count.
-        clock_tolerance: by how much the sender's clock and the arm's may differ from one accepted command to the next.
-        sequence_jump: largest difference in sequence from one accepted command to the next.
-        sender_id: the sender; 0: none yet.
-        lost: commands missing between accepted ones.
+        expiry: Time after which another sender may replace a silent one. After the same time, sequence and time of the
+            last accepted command are no longer compared.
+        clock_tolerance: Allowed difference of the advance of the sender's and the arm's clock between two accepted
+            commands.
+        sequence_jump: Largest difference in sequence between two accepted commands.
+        sender_id: Identifier of the sender. 0: none yet.
+        lost: Number of commands missing between accepted ones.
     """
 
     expiry: int
@@ -149,14 +150,14 @@ class CommandStream:
     _can_turn_off: bool = False
 
     def is_other_sender(self, command: lcmt_dvrk_command, utime: int) -> bool:
-        """Returns whether the command is of another sender than the one that has its place."""
+        """Returns whether the command comes from another sender than the one in control."""
         return command.sender_id != self.sender_id != 0 and utime - self._arrival <= self.expiry
 
     def refusal(self, command: lcmt_dvrk_command, utime: int) -> int:
         """Returns REFUSAL_* of a command that does not continue its sender's stream, or REFUSAL_NONE."""
         if self.is_other_sender(command, utime):
             return lcmt_dvrk_status.REFUSAL_OTHER_SENDER
-        # A sender that is not another one and was heard lately is the same.
+        # The sender is the one in control; its last accepted command must be recent.
         if self._last is not None and utime - self._arrival <= self.expiry:
             step = command.sequence - self._last.sequence
             if step <= 0:
@@ -171,7 +172,7 @@ class CommandStream:
         return lcmt_dvrk_status.REFUSAL_NONE
 
     def accept(self, command: lcmt_dvrk_command, utime: int) -> bool:
-        """Goes on to this command; True if it asks for a reset: reset_fault changed from false to true."""
+        """Accepts this command. Returns True if it requests a reset: reset_fault changed from false to true."""
         if command.sender_id != self.sender_id:
             self.forget()
             self.sender_id = command.sender_id
@@ -184,7 +185,7 @@ class CommandStream:
         return resets
 
     def forget(self) -> None:
-        """Forgets who was heard, for when the arm's own clock cannot be trusted."""
+        """Discards the sender and its last command, for an arm clock that is not reliable."""
         self.sender_id, self._last = 0, None
         self._can_reset = self._can_turn_off = False
 

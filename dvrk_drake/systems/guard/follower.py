@@ -1,4 +1,4 @@
-"""What an arm does from period to period with what its command guard has let pass."""
+"""Computes an arm's output in each period from the commands that its guard accepted."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from dvrk_drake.systems.guard.limits import Flags, GuardLimits, Mask, Vector, cl
 
 @dataclass
 class GuardOutput:
-    """What the arm shall do until the next step; n joints in the arm's order, always finite and inside the limits.
+    """Output of the guard until the next step, for n joints in the arm's order. Always finite and inside the limits.
 
     Attributes:
         control_mode: lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT.
-        position: (n,) where to regulate to in HOLD and POSITION; else the measured pose [rad, m].
-        velocity: (n,) feed-forward in POSITION; else zero [rad/s, m/s].
-        effort: (n,) what the motors shall apply in EFFORT; else zero [N m, N].
-        joint_flags: (n,) lcmt_dvrk_status.FLAG_* of what was limited.
+        position: Target (n,) of the regulation in HOLD and POSITION; otherwise the measured pose [rad, m].
+        velocity: Feedforward velocity (n,) in POSITION; otherwise zero [rad/s, m/s].
+        effort: Motor effort (n,) in EFFORT; otherwise zero [N m, N].
+        joint_flags: lcmt_dvrk_status.FLAG_* (n,) of the limits that acted.
     """
 
     control_mode: int
@@ -35,39 +35,39 @@ class GuardOutput:
 
 
 class Follower:
-    """Follows commands inside the limits, each kind from what the arm does when it begins. All arrays are (n,).
+    """Follows commands inside the limits. Each mode starts from the present state of the arm. All arrays are (n,).
 
     Attributes:
-        target: where the arm is regulated to in HOLD and POSITION [rad, m].
+        target: Target of the regulation in HOLD and POSITION [rad, m].
     """
 
     def __init__(self, limits: GuardLimits) -> None:
-        """At rest; no array is changed in place, so copies may share them."""
+        """Creates a follower at rest. No array is changed in place, so copies may share them."""
         self._limits, self._zero = limits, np.zeros(len(limits.effort_limits))
         self.target = self._laggard = self._effort = self._kick = self._zero
 
     def off(self, q: Vector) -> GuardOutput:
-        """No power, at the measured q."""
+        """Returns the output without power, at the measured q."""
         return self._output(lcmt_dvrk_command.OFF, q)
 
     def latch(self, q: Vector, v: Vector) -> None:
-        """Makes the measured q the target; an arm that moves at v may go on until it has been braked."""
+        """Makes the measured q the target. The following error allows for the braking distance of an arm at speed v."""
         self.target = q.copy()
         speed = self._limits.speed
         self._laggard = q + self._limits.following_time * clip(v, -speed, speed)
 
     def hold(self, dt: float) -> GuardOutput:
-        """At the target, `dt` seconds on."""
+        """Returns the output that holds the target, `dt` seconds after the last one."""
         self._follow_late(dt)
         return self._output(lcmt_dvrk_command.HOLD, self.target)
 
     def hold_valid_joints(self, q: Vector, v: Vector, valid: Mask, gravity: Vector) -> GuardOutput:
-        """Efforts that hold the joints with a `valid` (n,) position, and leave the others with their `gravity` effort.
+        """Returns efforts that hold the joints with a valid position. The others get their gravity effort.
 
         Args:
-            q, v: measured (n,) [rad, m, rad/s, m/s].
-            valid: joints with a valid position; the others get no feedback.
-            gravity: (n,) effort that the pose needs, with the last valid positions of the other joints [N m, N].
+            q, v: Measured positions and velocities (n,) [rad, m, rad/s, m/s].
+            valid: Mask (n,) of joints with a valid position. The others get no feedback.
+            gravity: Gravity effort (n,) of the pose, with the last valid positions of the other joints [N m, N].
         """
         limits = self._limits
         largest, least = limits.fault_effort, limits.fault_effort / 3
@@ -79,15 +79,15 @@ class Follower:
         return self._output(lcmt_dvrk_command.EFFORT, q, effort=effort, flags=flags)
 
     def is_near(self, q: Vector) -> bool:
-        """Whether q is as near to the target as position commands must be to a pose from which they start."""
+        """Returns whether q is as near to the target as the first position commands must be to the start pose."""
         return bool(np.all(np.abs(self.target - q) <= self._limits.start_position))
 
     def begin_position(self) -> None:
-        """Position commands act from now on; the target begins where it is."""
+        """Starts following position commands. The target starts from its present value."""
         self._laggard = self.target
 
     def follow_position(self, position: Vector, velocity: Vector, dt: float) -> GuardOutput:
-        """`dt` seconds on towards a position, with a feed-forward velocity [rad, m, rad/s, m/s]."""
+        """Returns the output `dt` seconds on, towards a position with a feedforward velocity [rad, m, rad/s, m/s]."""
         self.target, flags = self._limits.limit_position(position, self.target, dt)
         self._follow_late(dt)
         velocity = self._limits.limit_velocity(velocity, self.target, flags)
@@ -97,10 +97,10 @@ class Follower:
         self._laggard = self._laggard + min(dt / self._limits.following_time, 1.0) * (self.target - self._laggard)
 
     def astray(self, q: Vector) -> str:
-        """The joint that follows its target worst, in words, if it is further from it than allowed; or "".
+        """Describes the joint that is furthest from its target, if this is further than allowed. Empty: none.
 
-        A position controller without feed-forward is late by Kd/Kp. So an arm may be anywhere between the target and
-        one that follows it late, by first order with the time constant `following_time`, and that much beside it.
+        A position controller without feedforward lags by Kd/Kp. The arm may therefore be anywhere between the target
+        and the target filtered to first order with the time constant `following_time`, plus the allowed error.
         """
         ahead = q - np.maximum(self.target, self._laggard)
         behind = np.minimum(self.target, self._laggard) - q
@@ -114,14 +114,14 @@ class Follower:
         )
 
     def begin_effort(self, effort: Vector, q: Vector) -> None:
-        """Effort commands act from now on, from the measured effort at the pose q [N m, N, rad, m]."""
+        """Starts following effort commands, from the measured effort at the pose q [N m, N, rad, m]."""
         limit = self._limits.command_limits
         self._effort = clip(effort, -limit, limit)
-        # What the walls add at once to an arm at rest. `follow_effort` leaves it out, less and less.
+        # Initial effort of the walls on an arm at rest. `follow_effort` subtracts a decreasing share of it.
         self._kick = self._limits.wall_effort(q, self._zero)[0]
 
     def follow_effort(self, effort: Vector, q: Vector, v: Vector, dt: float, begun: float) -> GuardOutput:
-        """`dt` seconds on towards an effort, at q, v; `begun` says which share of the beginning has passed, 0 to 1."""
+        """Returns the output `dt` seconds on, towards an effort at q, v. `begun` is the elapsed share of the start."""
         self._effort, flags = self._limits.follow_effort(effort, self._effort, dt)
         left_out = None if begun == 1.0 else (1.0 - begun) * self._kick
         applied, walls = self._limits.restrain_effort(self._effort, q, v, left_out)
@@ -136,7 +136,7 @@ class Follower:
         effort: Vector | None = None,
         flags: Flags | None = None,
     ) -> GuardOutput:
-        """Arrays of its own, which whoever gets them may change."""
+        """Returns an output with arrays of its own, which the caller may change."""
         return GuardOutput(
             mode,
             position.copy(),

@@ -1,4 +1,4 @@
-"""Keeps commands inside an arm's limits of effort, rate and position: what a command guard does with good commands."""
+"""Limits of effort, rate and position that a command guard applies to accepted commands."""
 
 from __future__ import annotations
 
@@ -22,46 +22,49 @@ _ROUNDING = 1e-12
 
 _CLAMPED, _RATE_LIMITED = np.int8(lcmt_dvrk_status.FLAG_EFFORT_CLAMPED), np.int8(lcmt_dvrk_status.FLAG_RATE_LIMITED)
 
-#: How many times the gains of the position controller, which 1 kHz permits, a soft wall may have; more chatters.
+#: Largest gain of a soft wall, as a multiple of the position controller's gain at 1 kHz. Larger gains cause chatter.
 _WALL_GAIN = 4.0
 
 
 def clip(x: Vector, lower: ArrayLike, upper: ArrayLike) -> Vector:
-    """Returns x (n,) within lower and upper; np.clip takes several times as long for a few numbers."""
+    """Returns x (n,) limited to lower and upper. np.clip takes several times as long for small arrays."""
     return np.minimum(np.maximum(x, lower), upper)
 
 
 def is_any(mask: Mask) -> bool:
-    """Returns whether any of (n,) is true; mask.any() takes several times as long for a few joints."""
+    """Returns whether any element of the mask (n,) is true. mask.any() takes several times as long for small arrays."""
     return True in mask.tolist()
 
 
 class GuardLimits:
-    """Limits of one arm, for n joints in its order.
+    """Limits of one arm with n joints, in its order of joints.
 
-    **Effort commands** meet a soft wall before each position limit lower <= A q <= upper, the joint box and the coupled
-    limits alike: a spring and damper along the limit's own coordinate c = A_k q,
+    **Effort commands** are limited by a soft wall before each position limit lower <= A q <= upper. This applies to the
+    joint ranges and to the coupled limits. The wall is a spring and damper along the coordinate of the limit,
+    c = A_k q:
 
         lambda = 2 F_k clip(depth, 0, 1),  tau -= A_k' lambda,
 
-    F_k the effort that outweighs every motor that can push along c, and depth that of c + T_k dc/dt in the wall: 0
-    where it begins, 1 at the limit. It is as wide as the margin, or wider where its gains would exceed four times those
-    of the joint's position controller: one period late, they would chatter. So at half of its width no outward command
-    is left, and at the limit all that the motors have is directed inward; what approaches fast is met earlier, by T_k,
-    the ratio Kd/Kp of the joint's position controller. The arm is never pulled, only pushed back. Without efforts (a
-    falling arm) the wall pushes all the same. Joints that are faster than they may be are braked: above 1.25 times the
-    speed nothing drives them on. Commands are clamped and limited in rate before; what the wall adds is not delayed.
+    F_k is the effort that exceeds the sum of all motors that can push along c. depth is the position of c + T_k dc/dt
+    in the wall: 0 at its beginning, 1 at the limit. T_k is the ratio Kd/Kp of the joint's position controller, so the
+    wall acts earlier on a joint that approaches fast. The wall is as wide as the margin. It is wider where its gains
+    would exceed four times those of the joint's position controller, because larger gains chatter with a delay of one
+    period. At half of the width, no outward effort remains. At the limit, the full motor effort is directed inward.
 
-    **Position commands** move a target that is limited in rate and never leaves the limits; a target that starts
-    outside moves no further out. A position controller goes Kd/Kp v beyond a target that stands with a feed-forward v,
-    so the velocity is limited until that point is inside as well.
+    The wall only pushes the arm back and never pulls it. It also acts without commanded efforts, e.g. on a falling arm.
+    Joints above their speed limit are braked. Above 1.25 times the limit, no effort accelerates them further. Commands
+    are clamped and limited in rate before the wall acts. The effort of the wall is not delayed.
+
+    **Position commands** move a target that is limited in rate and stays inside the limits. A target that starts
+    outside moves no further outward. With a feedforward velocity v, a position controller settles Kd/Kp v beyond a
+    constant target. The velocity is therefore limited until that point is inside the limits as well.
     """
 
     def __init__(self, arm: Arm, settings: GuardSettings) -> None:
-        """Of `arm`.
+        """Creates the limits of `arm`.
 
         Raises:
-            StationError: a number of the arm is not finite or not in its range, see `Arm.check`.
+            StationError: A number of the arm is not finite or out of range, see `Arm.check`.
         """
         n = arm.num_joints
         try:
@@ -97,7 +100,7 @@ class GuardLimits:
         self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT
 
     def beyond(self, q: Vector) -> str:
-        """The worst position limit that the pose q (n,) is beyond by more than half of its margin, in words; or ""."""
+        """Describes the position limit that q (n,) exceeds most, by more than half of its margin. Empty: none."""
         c = self.A.dot(q)
         excess = np.abs(c - self._middle) - self._allowed
         k = int(excess.argmax())
@@ -106,10 +109,10 @@ class GuardLimits:
         return f"{self.names[k]} = {c[k]:.4g} is beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}"
 
     def implausible_pose(self, q: Vector) -> str:
-        """The first position limit that the pose q (n,) is beyond by more than half of the limit's range, or "".
+        """Describes the first position limit that q (n,) exceeds by more than half of its range. Empty: none.
 
-        An arm may rest a little beyond a limit, whose place is calibrated. Half of the range is far beyond any
-        mechanical stop.
+        An arm may rest slightly beyond a limit, because limits depend on calibration. Half of the range is far beyond
+        any mechanical stop.
         """
         c = self.A @ q
         far = np.flatnonzero(np.abs(c - self._middle) > self.upper - self.lower)
@@ -123,9 +126,9 @@ class GuardLimits:
         )
 
     def refusal_to_start(self, command: lcmt_dvrk_command, q: Vector, effort: Vector, gravity: Vector) -> int:
-        """REFUSAL_START_* of a command that would begin to act at the measured q and effort (n,), or REFUSAL_NONE.
+        """Returns REFUSAL_START_* of a command that would begin to act at the measured q and effort (n,).
 
-        `gravity` (n,) is the model's gravity effort at q.
+        `gravity` (n,) is the model's gravity effort at q. The result is REFUSAL_NONE for an accepted command.
         """
         if command.control_mode == lcmt_dvrk_command.EFFORT:
             if self.beyond(q):
@@ -141,9 +144,9 @@ class GuardLimits:
         return lcmt_dvrk_status.REFUSAL_START_FAR if np.any(far) else lcmt_dvrk_status.REFUSAL_NONE
 
     def follow_effort(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:
-        """Effort (n,) `dt` seconds after `last`, which follows `command` clamped and at a limited rate; joint flags.
+        """Returns the effort (n,) that follows `command`, clamped and limited in rate, and the joint flags.
 
-        All are (n,) [N m, N] and finite; `last` is inside the effort limits.
+        All arrays are (n,) [N m, N] and finite. `last` is the effort `dt` seconds before, inside the effort limits.
         """
         clamped = clip(command, -self.command_limits, self.command_limits)
         step = self._effort_rate * dt
@@ -153,7 +156,7 @@ class GuardLimits:
         return effort, (clamped != command) * _CLAMPED | (effort != clamped) * _RATE_LIMITED
 
     def wall_effort(self, q: Vector, v: Vector) -> tuple[Vector, Flags]:
-        """Effort (n,) that the walls add at q, v (n,) [N m, N], and the joint flags."""
+        """Returns the effort (n,) of the walls at q, v (n,) [N m, N], and the joint flags."""
         flags = np.zeros(len(q), np.int8)
         c = self.A.dot(q) + self._wall_look_ahead * self.A.dot(v)
         if not is_any(np.abs(c - self._middle) > self._free):
@@ -167,10 +170,10 @@ class GuardLimits:
     def restrain_effort(
         self, effort: Vector, q: Vector, v: Vector, left_out: Vector | None = None
     ) -> tuple[Vector, Flags]:
-        """`effort` with what the walls and the speed limit add at q, v, all (n,); joint flags.
+        """Returns `effort` plus the efforts of the walls and of the speed limit at q, v, and the joint flags.
 
-        Not limited in rate: it must not come late, and it is continuous in the state. `left_out` (n,) of what the walls
-        add is not added, at most all of it.
+        All arrays are (n,). The rate of these efforts is not limited: they must not be delayed, and they are continuous
+        in the state. `left_out` (n,) is subtracted from the effort of the walls, at most to zero.
         """
         limit = self.effort_limits
         added, flags = self.wall_effort(q, v)
@@ -183,7 +186,7 @@ class GuardLimits:
         return clip(effort + added, -limit, limit), flags
 
     def limit_position(self, command: Vector, last: Vector, dt: float) -> tuple[Vector, Flags]:
-        """Target (n,) for `command`, `dt` seconds after the target `last`, and the flags of the joints."""
+        """Returns the target (n,) for `command`, `dt` seconds after the target `last`, and the joint flags."""
         step = self.speed * dt
         target = clip(command, last - step, last + step)
         flags = np.where(target != command, lcmt_dvrk_status.FLAG_RATE_LIMITED, 0).astype(np.int8)
@@ -191,7 +194,7 @@ class GuardLimits:
         return inside, flags | limited
 
     def limit_velocity(self, command: Vector, target: Vector, flags: Flags) -> Vector:
-        """Feed-forward velocity (n,) at `target`: the command's where its position is followed as it is, else zero."""
+        """Returns the feedforward velocity (n,) at `target`: the command if the position is not limited, else 0."""
         velocity = np.where(flags == 0, clip(command, -self.speed, self.speed), 0.0)
         wanted = self._look_ahead * velocity
         ahead, _ = self._inside(target + wanted, target)
@@ -200,7 +203,7 @@ class GuardLimits:
         return velocity * clip(part, 0, 1)
 
     def _inside(self, target: Vector, last: Vector) -> tuple[Vector, Flags]:
-        """`target` kept inside the limits, or no further outside than `last`; joint flags."""
+        """Returns `target` (n,) limited to the ranges, or no further outside than `last`, and the joint flags."""
         n = len(last)
         flags = np.zeros(n, np.int8)
         c = self.A @ last
@@ -212,12 +215,12 @@ class GuardLimits:
             change = row @ inside - c[k]
             allowed = clip(change, lower[k] - c[k], upper[k] - c[k])
             if allowed != change:
-                # The joints of this limit go the same part of their way, so that they stop on it together.
+                # All joints of this limit move by the same fraction, so that they stop on it together.
                 part = np.where(row != 0, allowed / change, 1.0)
                 inside = last + part * (inside - last)
                 flags[row != 0] |= lcmt_dvrk_status.FLAG_COUPLED_LIMIT
         c = self.A @ inside
         if np.any((c > upper + _ROUNDING) | (c < lower - _ROUNDING)):
-            # Coupled limits that share joints can undo one another's correction: then stay.
+            # Corrections of coupled limits that share joints can cancel each other. The target is then kept.
             return last.copy(), flags
         return inside, flags

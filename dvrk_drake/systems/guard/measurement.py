@@ -1,4 +1,4 @@
-"""What an arm measured last and when, and what can be said against it."""
+"""Last measurement of an arm, its time, and the checks of its clock and numbers."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from numpy.typing import ArrayLike
 from dvrk_drake.systems.guard.command_stream import is_finite
 from dvrk_drake.systems.guard.limits import Vector
 
-#: By a clock that stands still nothing expires; Drake takes two steps at the time at which it starts.
+#: Largest number of steps at one time. Commands do not expire while the clock stands still. Drake steps twice at start.
 _MAX_STEPS_AT_ONE_TIME = 10
 
 
 @dataclass
 class Measurement:
-    """Of an arm with n joints, on its own clock [us].
+    """Last measurement of an arm with n joints, on the arm's clock [us].
 
     Attributes:
-        num_joints: n.
-        oldest: above this age it is none [us].
-        utime: when the last step was; None: not yet.
-        q: last good positions (n,) [rad, m]; None: there were none yet.
-        v: velocities (n,) [rad/s, m/s].
-        effort: what the motors apply (n,) [N m, N].
-        dt: from the good measurement before to the last one [s]; 0 if it is the same one, inf if there was none.
-        bad: number of measurements since the last good one.
+        num_joints: Number of joints n.
+        oldest: Largest age of a valid measurement [us].
+        utime: Time of the last step. None: not yet stepped.
+        q: Last good positions (n,) [rad, m]. None: no good measurement yet.
+        v: Velocities (n,) [rad/s, m/s].
+        effort: Applied motor efforts (n,) [N m, N].
+        dt: Time between the last two good measurements [s]; 0 for a repeated one, inf for the first one.
+        bad: Number of measurements since the last good one.
     """
 
     num_joints: int
@@ -46,7 +46,7 @@ class Measurement:
         self.v = self.effort = np.zeros(self.num_joints)
 
     def advance(self, utime: int) -> tuple[float, str]:
-        """Goes on to `utime`: the time that has passed [s], and what is wrong with the clock, in words, or ""."""
+        """Advances to `utime`. Returns the elapsed time [s] and the fault of the clock, empty if there is none."""
         dt = 0.0 if self.utime is None else 1e-6 * (utime - self.utime)
         self._steps_at_one_time = 0 if dt else self._steps_at_one_time + 1
         self.utime = utime
@@ -56,7 +56,7 @@ class Measurement:
         return dt, "the arm's clock stands still" if self._steps_at_one_time > _MAX_STEPS_AT_ONE_TIME else ""
 
     def time_since(self, measured_utime: int) -> float:
-        """Returns the time from the last good measurement to `measured_utime` [us] in s; inf if there was none."""
+        """Returns the time from the last good measurement to `measured_utime` [us] in s; inf without one."""
         return math.inf if self._measured_utime is None else 1e-6 * (measured_utime - self._measured_utime)
 
     def take(
@@ -67,9 +67,9 @@ class Measurement:
         effort: ArrayLike,
         implausible_pose: Callable[[Vector], str] | None = None,
     ) -> str:
-        """Takes what was measured at `measured_utime` [us]; why it is none, in words, or "".
+        """Stores what was measured at `measured_utime` [us]. Returns the reason if it is invalid, otherwise "".
 
-        `implausible_pose` says what is wrong with positions that are not compared with earlier ones.
+        `implausible_pose` checks positions that are not compared with earlier ones, and describes their error.
         """
         assert self.utime is not None
         age, dt = self.utime - measured_utime, self.time_since(measured_utime)

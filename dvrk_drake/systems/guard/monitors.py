@@ -1,4 +1,4 @@
-"""Monitors of what the guard does itself: how often it is stepped, and whether its efforts oscillate."""
+"""Monitors of the guard itself: period of its steps and oscillation of its efforts."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.systems.guard.settings import GuardSettings
 
-#: Periods of which the median is taken.
+#: Number of periods for the median.
 _PERIODS = 100
 
-#: Time constant [s] of the mean effort that is subtracted: what alternates slower than about 1 Hz is motion.
+#: Time constant [s] of the subtracted mean effort. Variations slower than about 1 Hz count as motion.
 _MEAN_TIME = 0.2
 
 
 class PeriodMonitor:
-    """Median and worst of the last 100 periods between two steps of the guard.
+    """Monitor of the last 100 periods between two steps of the guard: median and longest.
 
     Attributes:
-        fault: what is wrong with the last periods, in words; "" if nothing is.
+        fault: Description of the fault of the last periods. Empty: none.
     """
 
     def __init__(self, settings: GuardSettings) -> None:
-        """No period so far."""
+        """Creates a monitor without any period."""
         self._slow_period, self._longest_period = settings.slow_period, settings.longest_period
-        # A bit for each of the last periods, set if it was slow: an int is quick to copy, shift and count.
+        # One bit per period, set for a slow one: an int is fast to copy, shift and count.
         self._slow = 0
         self.fault = ""
 
@@ -48,24 +48,24 @@ class PeriodMonitor:
 
 
 class OscillationMonitor:
-    """Reversals of the efforts that the guard commands, counted with a fading memory.
+    """Monitor that counts reversals of the commanded efforts, with exponential decay.
 
     The alternating part of an effort is x = tau - filter(tau), with a first-order filter. A reversal is a change of x
     from above +`oscillation` to below -`oscillation` of the effort limit, or back.
     """
 
     def __init__(self, settings: GuardSettings, arm: Arm) -> None:
-        """Monitor for the joints of `arm`."""
+        """Creates a monitor for the joints of `arm`."""
         self._scale, self._time = 1.0 / (settings.oscillation * arm.effort_limits), settings.oscillation_time
         self._allowed = settings.oscillation_reversals
         self._mean: Vector | None = None
 
     def restart(self) -> None:
-        """Begins anew."""
+        """Resets the counts and filters."""
         self._mean = None
 
     def add(self, effort: Vector, dt: float) -> int | None:
-        """Adds an effort (n,) [N m, N] that was commanded for `dt` [s]; returns the joint that oscillates, or None."""
+        """Adds an effort (n,) [N m, N] commanded for `dt` [s]. Returns the index of an oscillating joint, or None."""
         scaled = self._scale * effort
         if self._mean is None:
             self._mean = scaled

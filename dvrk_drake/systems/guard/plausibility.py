@@ -1,4 +1,4 @@
-"""Plausibility checks of measurements that are finite and fresh but may be wrong: stuck, jumping, inconsistent."""
+"""Plausibility checks of finite, recent measurements that may be wrong: stuck, jumping or inconsistent."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from dvrk_drake.systems.guard.settings import PlausibilitySettings
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
 
-#: The mass matrix is evaluated again after this time [s]: it changes slowly, and evaluating it costs as much as a tick.
+#: Period of evaluating the mass matrix [s]. It changes slowly, and its evaluation takes as long as a step of the guard.
 _MASS_MATRIX_PERIOD = 0.05
 
-#: Within this time after power on an arm that lies on something may get its effort without a motion [s].
+#: Time after power on in which an arm that rests on an object may take up its effort without a motion [s].
 _POWER_ON = 0.25
 
-#: Encoder counts by which measured positions may deviate beyond the tolerances.
+#: Encoder counts by which measured positions may deviate in addition to the tolerances.
 _COUNTS = 3.0
 
 
 class ArmModel(Protocol):
-    """Model of the arm that the guard needs, such as `dvrk_drake.dynamics.identified_model.ControlModel`."""
+    """Protocol of the arm model that the guard uses, such as `dvrk_drake.dynamics.identified_model.ControlModel`."""
 
     def gravity_effort(self, q: Vector) -> Vector:
-        """Returns the effort (n,) [N m, N] that holds the arm at q (n,) [rad, m]."""
+        """Returns the effort (n,) [N m, N] that compensates gravity at q (n,) [rad, m]."""
 
     def mass_matrix(self, q: Vector) -> NDArray[np.float64]:
         """Returns the mass matrix (n, n) at q (n,)."""
@@ -36,16 +36,16 @@ class ArmModel(Protocol):
 
 @dataclass(slots=True)
 class Sample:
-    """One measurement of n joints with what belongs to it; SI units, prismatic joints in m and N.
+    """One measurement of n joints with related quantities. SI units; prismatic joints in m and N.
 
     Attributes:
-        dt: time since the measurement before [s].
-        q, v: (n,) measured positions and velocities.
-        step: (n,) change of position since the measurement before.
-        speed: (n,) larger magnitude of the velocities of both measurements.
-        effort: (n,) measured effort of the motors.
-        net_effort: (n,) measured effort without the model's gravity effort.
-        commanded: (n,) effort that the guard commanded before, or None while it commands positions.
+        dt: Time since the previous measurement [s].
+        q, v: Measured positions and velocities (n,).
+        step: Change of position (n,) since the previous measurement.
+        speed: Larger magnitude (n,) of the velocities of both measurements.
+        effort: Measured effort (n,) of the motors.
+        net_effort: Measured effort (n,) minus the model's gravity effort.
+        commanded: Effort (n,) that the guard commanded before, or None while it commands positions.
     """
 
     dt: float
@@ -59,34 +59,34 @@ class Sample:
 
 
 class Check(Protocol):
-    """One plausibility check. It keeps no state of its own: a guard is copied at every update of a Drake context.
+    """Protocol of one plausibility check. It has no state of its own, as Drake copies the guard at every update.
 
     Attributes:
-        text: what is wrong with a joint that the check finds.
-        about_position: whether the joint has no valid position then.
+        text: Description of the error of a joint that the check finds.
+        about_position: True if the position of such a joint is invalid.
     """
 
     text: str
     about_position: bool
 
     def begin(self, sample: Sample) -> Any:
-        """Returns the state before `sample`, the first one."""
+        """Returns the state before `sample`, the first sample."""
 
     def check(self, sample: Sample, state: Any) -> tuple[Any, Mask]:
-        """Returns the next state and which joints (n,) are implausible."""
+        """Returns the next state and a mask (n,) of the implausible joints."""
 
 
 class PositionJump:
-    """Position steps that no joint can make: |dq| > tolerance + (dt + jitter) min(|v|, 1.5 speed limit)."""
+    """Check of position steps that no joint can make: |dq| > tolerance + (dt + jitter) min(|v|, 1.5 speed limit)."""
 
     text, about_position = "the position jumps", True
 
     def __init__(self, settings: PlausibilitySettings, tolerance: Vector, speed_limit: Vector) -> None:
-        """Check with a tolerance [rad, m] for joints that have speed limits [rad/s, m/s], both (n,)."""
+        """Creates the check with tolerances (n,) [rad, m] and speed limits (n,) [rad/s, m/s] of the joints."""
         self._tolerance, self._fastest, self._jitter = tolerance, 1.5 * speed_limit, settings.jitter
 
     def begin(self, sample: Sample) -> None:
-        """No state."""
+        """Returns None: this check has no state."""
 
     def check(self, sample: Sample, state: None) -> tuple[None, Mask]:
         """See `Check.check`."""
@@ -95,25 +95,25 @@ class PositionJump:
 
 
 class VelocityConsistency:
-    """Velocities that disagree with the change of position.
+    """Check that velocities agree with the change of position.
 
-    The difference e of the change of position and the integrated velocity fades with the time constant T,
+    The difference e of the change of position and the integrated velocity decays with the time constant T,
 
-        e' = (1 - dt/T) e + dq - v dt,    |e| <= tolerance + r T + delay s,
+        e' = (1 - dt/T) e + dq - v dt,    |e| <= tolerance + r T + delay s.
 
-    where s is the largest recent speed, fading likewise: a velocity that is estimated with a delay deviates while the
+    s is the largest recent speed, which decays in the same way: a velocity estimate with a delay deviates while the
     joint accelerates. r is the error of a velocity that is estimated from the time between two encoder counts.
     """
 
     text, about_position = "position and velocity disagree", True
 
     def __init__(self, settings: PlausibilitySettings, tolerance: Vector, counts: Vector) -> None:
-        """Check with a tolerance for joints with encoder counts, both (n,) [rad, m]."""
+        """Creates the check with tolerances and encoder counts of the joints, both (n,) [rad, m]."""
         self._delay, self._memory = settings.velocity_delay, settings.velocity_memory
         self._tolerance = tolerance + self._memory * settings.velocity_counts * counts
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector]:
-        """Difference e and speed s, both (n,)."""
+        """Returns the difference e and the speed s, both (n,)."""
         return np.zeros_like(sample.q), sample.speed
 
     def check(self, sample: Sample, state: tuple[Vector, Vector]) -> tuple[tuple[Vector, Vector], Mask]:
@@ -125,21 +125,22 @@ class VelocityConsistency:
 
 
 class FrozenPosition:
-    """Positions that stay exactly the same while the effort on the joint changes.
+    """Check of positions that stay constant while the effort on the joint changes.
 
-    Motor encoders sit in front of cables and structure that give way. So an effort that changes by a good part of its
-    limit turns the encoder by at least a count, also where a joint presses against a stop or is held by a hand.
+    Between the motor encoders and the links there are elastic cables and structure. A change of the effort by a
+    considerable part of its limit therefore turns the encoder by at least one count. This also holds for a joint that
+    presses against a stop or is held by a hand.
     """
 
     text, about_position = "the position does not change although the effort does", True
 
     def __init__(self, settings: PlausibilitySettings, effort_limits: Vector, counts: Vector) -> None:
-        """Check for joints with effort limits [N m, N] and encoder counts [rad, m], both (n,)."""
+        """Creates the check with effort limits [N m, N] and encoder counts [rad, m] of the joints, both (n,)."""
         self._allowed = settings.frozen_effort * effort_limits
         self._least_time = settings.frozen_time + counts / settings.frozen_speed
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector, float]:
-        """Effort at the last change of position, time for which it has differed too much (n,), and time since now."""
+        """Returns effort at the last position change, time of excessive difference (n,), and time since the start."""
         return sample.net_effort, np.zeros_like(sample.q), 0.0
 
     def check(self, sample: Sample, state: tuple[Vector, Vector, float]) -> tuple[tuple[Vector, Vector, float], Mask]:
@@ -152,24 +153,24 @@ class FrozenPosition:
 
 
 class Response:
-    """Accelerations that do not follow from the efforts.
+    """Check that accelerations agree with the efforts.
 
-    The unexplained effort r = filter(tau - G(q)) - M(q) filter(vd) holds friction, the forces of hands and obstacles,
-    the model's errors, and whatever is wrong with sensors or motors. With a first-order filter of time constant T,
-    filter(vd) = (v - filter(v)) / T needs no differentiation. A part that lasts is taken as an error of the model and
-    subtracted. Coriolis terms are left out; they are small at the speeds that the guard allows.
+    The unexplained effort r = filter(tau - G(q)) - M(q) filter(vd) contains friction, external forces, model errors,
+    and errors of sensors or motors. With a first-order filter of time constant T, filter(vd) = (v - filter(v)) / T
+    needs no differentiation. A lasting part is attributed to the model and subtracted. Coriolis terms are omitted. They
+    are small at the speeds that the guard allows.
     """
 
     text, about_position = "the motion does not follow from the effort", True
 
     def __init__(self, settings: PlausibilitySettings, arm: Arm, model: ArmModel) -> None:
-        """Check for the joints of `arm` with a model of it."""
+        """Creates the check for the joints of `arm` with its model."""
         hand_effort = arm.per_joint(settings.hand_effort, 10 * settings.hand_effort)
         self._allowed, self._time = settings.response * arm.effort_limits + hand_effort, settings.response_time
         self._memory, self._model = settings.response_memory, model
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector, Vector, NDArray[np.float64], float]:
-        """Filtered effort, filtered velocity, lasting effort (n,), M / T (n, n), and its age [s]."""
+        """Returns filtered effort, filtered velocity, lasting effort (n,), M / T (n, n), and the age of M / T [s]."""
         M = self._model.mass_matrix(sample.q) / self._time
         return sample.net_effort, sample.v, sample.net_effort, M, 0.0
 
@@ -184,24 +185,24 @@ class Response:
         velocity = velocity + gain * (sample.v - velocity)
         unexplained = effort - M.dot(sample.v - velocity) - lasting
         lasting = lasting + min(sample.dt / self._memory, 1.0) * unexplained
-        # Inverted, since an effort that is not a number is not explained either.
+        # Negated comparison, so that an effort that is NaN is unexplained, too.
         return (effort, velocity, lasting, M, age), ~(np.abs(unexplained) <= self._allowed)
 
 
 class SilentEffort:
-    """Measured efforts that do not show what is commanded: a sensor that reads zero, or a motor without power."""
+    """Check that measured efforts follow the commanded ones. Finds sensors that read zero and motors without power."""
 
     text, about_position = "the measured effort does not show the commanded one", False
 
     def __init__(self, settings: PlausibilitySettings, arm: Arm) -> None:
-        """Check for the joints of `arm`."""
+        """Creates the check for the joints of `arm`."""
         self._commanded, self._time = settings.silent_effort * arm.effort_limits, settings.silent_time
         self._least = 0.1 * self._commanded
         self._J, self._J_inverse = arm.transmission.matrix, arm.transmission.inverse.matrix
         self._largest = np.array([arm.effects.saturation.get(name, np.inf) for name in arm.joint_names])
 
     def begin(self, sample: Sample) -> Vector:
-        """Time (n,) for which the commanded effort has not shown [s]."""
+        """Returns the time (n,) for which the commanded effort has not appeared [s]."""
         return np.zeros_like(sample.q)
 
     def check(self, sample: Sample, state: Vector) -> tuple[Vector, Mask]:
@@ -211,7 +212,7 @@ class SilentEffort:
         else:
             hidden = self._hidden(sample.commanded, sample.effort)
             if is_any(hidden):
-                # Coupled actuators may not have the effort although each joint's is inside its limit.
+                # Coupled actuators may be unable to apply the effort although each joint is inside its limit.
                 actuators = np.clip(sample.commanded @ self._J_inverse, -self._largest, self._largest)
                 hidden &= self._hidden(actuators @ self._J, sample.effort)
             state = hidden * (state + sample.dt)
@@ -223,23 +224,23 @@ class SilentEffort:
 
 
 class Plausibility:
-    """All checks of an arm's measurements, one sample at a time.
+    """All plausibility checks of an arm's measurements, applied sample by sample.
 
     Attributes:
-        gravity: (n,) the model's gravity effort at the last sample [N m, N].
-        invalid: (n,) joints without a valid position since the last `restart`.
-        fault: what was implausible in the last sample, in words; "" if nothing was.
-        last_valid: (n,) positions of the `invalid` joints before their fault [rad, m]; meaningless for the others.
+        gravity: The model's gravity effort (n,) at the last sample [N m, N].
+        invalid: Mask (n,) of joints without a valid position since the last `restart`.
+        fault: Description of the error of the last sample. Empty: no error.
+        last_valid: Positions (n,) of the `invalid` joints before their fault [rad, m]; undefined for the others.
     """
 
     def __init__(self, arm: Arm, model: ArmModel, settings: PlausibilitySettings, speed_limit: Vector) -> None:
-        """Checks for `arm`.
+        """Creates the checks for `arm`.
 
         Args:
-            arm: with n joints.
-            model: of that arm, mounted as it is.
-            settings: tolerances.
-            speed_limit: (n,) that the guard keeps [rad/s, m/s].
+            arm: Arm with n joints.
+            model: Model of that arm as mounted.
+            settings: Tolerances.
+            speed_limit: Speed limits (n,) that the guard enforces [rad/s, m/s].
         """
         self.model, self._names = model, arm.joint_names
         counts = arm.encoder_counts()
@@ -258,26 +259,26 @@ class Plausibility:
         self.restart()
 
     def restart(self) -> None:
-        """Takes all positions as valid, and begins anew with the next sample."""
+        """Marks all positions as valid and restarts the checks with the next sample."""
         self.invalid, self.fault = self._none, ""
         self.forget()
 
     @property
     def begins(self) -> bool:
-        """Whether the next sample is compared with none before."""
+        """Returns whether the next sample is compared with no previous sample."""
         return self._before is None
 
     def forget(self) -> None:
-        """Does not compare the next sample with the ones before."""
+        """Excludes the previous samples from the comparison with the next one."""
         self._before: tuple[Vector, Vector] | None = None
 
     def check(self, dt: float, q: Vector, v: Vector, effort: Vector, commanded: Vector | None) -> str:
-        """Checks one measurement; all arrays are (n,) and finite, and not changed in place.
+        """Checks one measurement. All arrays are (n,), finite and not changed in place.
 
         Args:
-            dt: since the measurement before [s].
-            q, v, effort: measured positions, velocities and efforts.
-            commanded: effort that the guard commanded before, or None.
+            dt: Time since the previous measurement [s].
+            q, v, effort: Measured positions, velocities and efforts.
+            commanded: Effort that the guard commanded before, or None.
 
         Returns:
             `fault`.
@@ -304,7 +305,7 @@ class Plausibility:
         return self.fault
 
     def reject_all(self) -> None:
-        """Takes all joints as without a valid position, for measurements that are lost."""
+        """Marks the positions of all joints as invalid, for lost measurements."""
         self._reject(~self._none)
 
     def _find(self, check: Check, joints: Mask) -> None:
@@ -316,6 +317,6 @@ class Plausibility:
             self._reject(joints)
 
     def _reject(self, joints: Mask) -> None:
-        # What is found now began before: the pose of then is the last one that is valid.
+        # An error began before its detection. The last valid pose is the one at that earlier time.
         self.last_valid = np.where(joints & ~self.invalid, self._poses[0], self.last_valid)
         self.invalid = self.invalid | joints

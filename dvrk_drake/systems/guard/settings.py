@@ -1,4 +1,4 @@
-"""What a command guard allows, as a schema for yaml_load_typed.
+"""Settings of a command guard, as a schema for yaml_load_typed.
 
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
@@ -14,26 +14,27 @@ class PlausibilitySettings:
     """Tolerances of the plausibility checks of measurements, see `dvrk_drake.systems.guard.plausibility`.
 
     Attributes:
-        position_tolerance: by which positions may step, and disagree with the velocities, beyond what follows
-            [rad; a tenth of the number in m on a prismatic joint]; three encoder counts are added.
-        jitter: by which the time between two measurements may be wrong [s].
-        velocity_delay: largest delay of the velocity estimate [s].
-        velocity_counts: rate of encoder counts by which a velocity may be wrong [1/s]: an estimate from the time
-            between two counts keeps its last value for a while when none comes.
-        velocity_memory: time constant with which positions and velocities are compared [s].
-        frozen_effort: change of effort under which a position must change, as a fraction of the effort limit.
-        frozen_time: for which a position may stay the same under that change [s].
-        frozen_speed: at which a joint takes the time that it is given to move by an encoder count [rad/s, m/s].
-        response: effort that the motion does not explain, as a fraction of the effort limit, beyond `hand_effort`.
-        hand_effort: on a wrist, of a hand or a wrong model [N m; ten times the number in N on a prismatic joint].
-        response_time: time constant of the filters of effort and acceleration [s].
-        response_memory: time constant with which unexplained effort that lasts is taken as an error of the model [s].
-        start_gravity: difference of measured effort and gravity effort at which efforts may start, as a fraction of the
-            effort limit, beyond the arm's dry friction and `hand_effort`.
-        silent_effort: commanded effort that must show in the measured one, as a fraction of the effort limit.
-        silent_time: within which it must [s].
-        detection_time: age of the pose that is taken as valid when a fault is found [s].
-        bad_samples: number of measurements in a row that may be late or not finite while the arm holds.
+        position_tolerance: Tolerance of position steps and of the difference of positions and integrated velocities
+            [rad; a tenth of the number in m on a prismatic joint]. Three encoder counts are added.
+        jitter: Largest error of the time between two measurements [s].
+        velocity_delay: Largest delay of the velocity estimate [s].
+        velocity_counts: Error of the velocity as a rate of encoder counts [1/s]. An estimate from the time between two
+            counts keeps its last value for a while when no count arrives.
+        velocity_memory: Time constant of the comparison of positions and velocities [s].
+        frozen_effort: Change of effort that must change a position, as a fraction of the effort limit.
+        frozen_time: Longest time for which a position may stay constant under that change [s].
+        frozen_speed: Lowest speed at which a joint is expected to move by an encoder count [rad/s, m/s].
+        response: Allowed unexplained effort beyond `hand_effort`, as a fraction of the effort limit.
+        hand_effort: Effort of a hand on a wrist joint, or of a model error [N m; ten times the number in N on a
+            prismatic joint].
+        response_time: Time constant of the filters of effort and acceleration [s].
+        response_memory: Time constant with which lasting unexplained effort is attributed to the model [s].
+        start_gravity: Allowed difference of measured effort and gravity effort at the start of efforts, as a fraction
+            of the effort limit, in addition to the arm's dry friction and `hand_effort`.
+        silent_effort: Commanded effort that must appear in the measured one, as a fraction of the effort limit.
+        silent_time: Time within which it must appear [s].
+        detection_time: Age of the pose that is taken as valid when a fault is detected [s].
+        bad_samples: Number of consecutive measurements that may be late or not finite while the arm holds.
     """
 
     position_tolerance: float = field(default=0.01, metadata=within(0.001, 0.1, "rad"))
@@ -57,39 +58,41 @@ class PlausibilitySettings:
 
 @dataclass
 class GuardSettings:
-    """What a command guard allows.
+    """Settings of a command guard.
 
-    The range of each setting stands beside it; outside, the guard would guard nothing, or nobody could command.
+    The range of each setting is next to it. Values outside disable the protection or reject all commands.
 
     Attributes:
-        expiry: age at which a command is not obeyed any more, counted from the measurement that it answers [s]; and
-            how long a sender must be silent before another may follow it.
-        measurement_age: above this age a measurement is none [s].
-        start_time: how long commands must be good before they act [s].
-        clock_tolerance: by how much a sender's clock and the arm's may differ between two commands [s].
-        sequence_jump: by how much the sequence of a sender's commands may grow from one to the next; 1000 is one second
-            at 1 kHz. A command beyond it is refused.
-        start_effort: how far from the present effort effort commands may start, as a fraction of the effort limit.
-        margin: least width of the soft wall before each position limit [rad], how far from the present pose position
-            commands may start, and twice how far beyond a limit is a fault while efforts act; at most
-            `margin_fraction` of the range, which counts on short or prismatic joints.
-        margin_fraction: see margin.
-        effort_fraction: of each effort limit that effort commands may use; soft wall and brake always have all of it.
-        effort_rise_time: in which the commanded effort may grow from zero to its limit [s].
-        traverse_time: in which a joint may cross its range [s]: the speed that it may have. Commanded positions go no
-            faster, and while efforts act it is braked above.
-        following_error: how far from its commanded position a joint may be, as a fraction of its range.
-        following_time: how late the arm's position controller may follow [s]; a PD controller: Kd/Kp.
-        fault_effort: that held joints may use after a fault of a measurement, as a fraction of the effort limit; where
-            gravity needs nearly as much or more, a third of it beyond the gravity effort.
-        slow_period: largest median of the last 100 periods between two steps of the guard [s].
-        longest_period: largest time between two steps of the guard [s].
-        oscillation: alternating part of the commanded effort that counts as a reversal, as a fraction of the effort
+        expiry: Age at which a command expires, counted from the measurement that it answers [s]. Another sender may
+            take over after the same time without a command.
+        measurement_age: Largest age of a valid measurement [s].
+        start_time: Time for which commands must be good before they act [s].
+        clock_tolerance: Allowed difference of the advance of a sender's clock and the arm's between two commands [s].
+        sequence_jump: Largest increment of the sequence of a sender's commands. 1000 is one second at 1 kHz. A command
+            beyond it is refused.
+        start_effort: Allowed difference of the first commanded efforts from the present ones, as a fraction of the
+            effort limit.
+        margin: Least width of the soft wall before each position limit [rad]. It is also the allowed difference of the
+            first commanded positions from the present pose. While efforts act, half of it beyond a limit is a fault.
+            It is at most `margin_fraction` of the range, which applies to short or prismatic joints.
+        margin_fraction: See `margin`.
+        effort_fraction: Fraction of each effort limit that effort commands may use. Soft wall and brake always have
+            the whole limit.
+        effort_rise_time: Shortest time in which the commanded effort grows from zero to its limit [s].
+        traverse_time: Shortest time in which a joint may cross its range [s]. It defines the speed limit: commanded
+            positions move no faster, and while efforts act the joint is braked above it.
+        following_error: Allowed distance of a joint from its commanded position, as a fraction of its range.
+        following_time: Allowed lag of the arm's position controller [s], Kd/Kp for a PD controller.
+        fault_effort: Effort of held joints after a measurement fault, as a fraction of the effort limit. If gravity
+            needs nearly as much or more, a third of it in addition to the gravity effort.
+        slow_period: Largest median of the last 100 periods between two steps of the guard [s].
+        longest_period: Largest time between two steps of the guard [s].
+        oscillation: Alternating part of the commanded effort that counts as a reversal, as a fraction of the effort
             limit.
-        oscillation_reversals: number of them, fading with `oscillation_time`, that is allowed.
-        oscillation_time: see oscillation_reversals [s].
-        resume_automatically: whether commands may act again after the watchdog took over, without an operator's reset.
-        plausibility: tolerances of the checks of measurements.
+        oscillation_reversals: Allowed number of reversals, weighted exponentially with `oscillation_time`.
+        oscillation_time: See `oscillation_reversals` [s].
+        resume_automatically: Allows commands to act again after the watchdog took over without an operator's reset.
+        plausibility: Tolerances of the checks of measurements.
     """
 
     expiry: float = field(default=0.05, metadata=within(0.002, 1.0, "s"))
@@ -118,10 +121,10 @@ class GuardSettings:
         self.check()
 
     def check(self) -> None:
-        """Refuses settings that switch the guard off.
+        """Checks that all settings are inside their ranges.
 
         Raises:
-            StationError: one is outside its range.
+            StationError: A setting is outside its range.
         """
         if not isinstance(self.resume_automatically, bool):
             raise StationError(

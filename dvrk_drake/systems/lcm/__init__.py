@@ -1,1 +1,1 @@
-"""The systems that talk LCM, both ends of an arm's channels; as pydrake.systems.lcm is to Drake's systems."""
+"""Systems for both ends of an arm's LCM channels, as pydrake.systems.lcm contains Drake's LCM systems."""

@@ -1,4 +1,4 @@
-"""The systems that connect a Diagram with one arm over LCM."""
+"""Systems that connect a Diagram with one arm over LCM."""
 
 from __future__ import annotations
 
@@ -20,12 +20,10 @@ from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
 
 class TolerantSerializer(PySerializer):
-    """As Drake's for Python types, but a message that cannot be read or is not wanted leaves the last one in place.
+    """Serializer that keeps the last message if a new one is unreadable or unwanted, and signs messages with a key.
 
-    What is sent is signed if there is a key.
-
-    Drake's own lets the decoder's exception out of `HandleSubscriptions`, so that anybody on the network can stop the
-    process.
+    Drake's serializer for Python types passes the decoder's exception through `HandleSubscriptions`. Any process on the
+    network could then stop this one.
     """
 
     def __init__(
@@ -35,12 +33,12 @@ class TolerantSerializer(PySerializer):
         read: Callable[[bytes], Any] | None = None,
         key: MessageKey | None = None,
     ) -> None:
-        """Serializer of a type made by lcm-gen.
+        """Creates a serializer of a type that lcm-gen generated.
 
         Args:
-            message_type: the type.
-            read: returns the message in the bytes received, or None if it is to be ignored; default: decodes it.
-            key: signs what is sent.
+            message_type: Type of the message.
+            read: Function that returns the message in the received bytes, or None to ignore it. Default: the decoder.
+            key: Key that signs the messages to be sent.
         """
         super().__init__(message_type)
         self._read = read or (lambda data: decode(message_type, data))
@@ -53,7 +51,7 @@ class TolerantSerializer(PySerializer):
             abstract_value.set_value(message)
 
     def Serialize(self, abstract_value: AbstractValue) -> bytes:
-        """Returns the message as it goes over the wire."""
+        """Returns the encoded message, signed if there is a key."""
         data: bytes = super().Serialize(abstract_value)
         return data if self._key is None else self._key.sign(data)
 
@@ -61,20 +59,21 @@ class TolerantSerializer(PySerializer):
 def connect_arm(
     builder: DiagramBuilder, arm: Arm, driver: DvrkDriver, lcm: DrakeLcmInterface | None = None
 ) -> tuple[DvrkStatusReceiver, DvrkCommandSender]:
-    """Adds the controller's end of both channels of `arm`; a command goes out every `driver.status_period`.
+    """Adds the controller's end of both channels of `arm`. A command is sent every `driver.status_period`.
 
     Args:
-        builder: of the Diagram.
-        arm: whose channels they are; what does not continue the first session that it tells of is ignored, see
+        builder: Builder of the Diagram.
+        arm: Arm of the channels. Messages that do not continue the first received session are ignored, see
             `StatusFilter`.
-        driver: its configuration. Its key verifies statuses and signs commands.
-        lcm: whose `HandleSubscriptions` somebody else calls; None: one at `driver.lcm_url` that a Simulator handles.
+        driver: Configuration of the driver. Its key verifies statuses and signs commands.
+        lcm: LCM interface whose `HandleSubscriptions` the caller calls. None: a new one at `driver.lcm_url`, which a
+            Simulator handles.
 
     Returns:
-        What receives the status, and what sends the command.
+        Receiver of the status and sender of the command.
 
     Raises:
-        KeyFileError: the driver's key cannot be used.
+        KeyFileError: The driver's key cannot be used.
     """
     key = driver.load_key()
     statuses = StatusFilter(arm.name, arm.num_joints, key)

@@ -1,4 +1,4 @@
-"""The command channel of an arm as systems: the controller's sender, and the arm's receiver with its command guard."""
+"""Systems for the command channel of an arm: the controller's sender, and the arm's receiver with its command guard."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _MODES = (lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD, lcmt_dvrk_command.POSIT
 
 
 def draw_id() -> int:
-    """A random sender_id or session_id: never 0, and two of them never alike."""
+    """Returns a random sender_id or session_id. It is never 0 and practically unique."""
     return 1 + secrets.randbelow(2**62)
 
 
 class DvrkCommandSender(LeafSystem):
-    """Makes the command that answers a status, for an LcmPublisherSystem.
+    """Computes the command that answers a status, for an LcmPublisherSystem.
 
     .. pydrake_system::
 
@@ -41,19 +41,18 @@ class DvrkCommandSender(LeafSystem):
 
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
-    - `lcmt_dvrk_status`: the status that is answered: its session, time and sequence go into the command. A command
-      that is sent again without a new status is refused by the arm as sent twice, so a controller that hears nothing
-      ends in a hold.
-    - `effort` (n) and `desired_state` (2n: q, then v): what is asked for.
-    - `control_mode` (1): lcmt_dvrk_command.HOLD, POSITION, EFFORT or OFF; anything else is HOLD. Unconnected: EFFORT if
+    - `lcmt_dvrk_status`: status to answer. The command carries its session, time and sequence. The arm refuses a
+      command that is repeated without a new status as sent twice. So without new statuses, the arm holds.
+    - `effort` (n) and `desired_state` (2n: q, then v): commanded values.
+    - `control_mode` (1): lcmt_dvrk_command.HOLD, POSITION, EFFORT or OFF. Other values mean HOLD. Unconnected: EFFORT if
       `effort` is connected, else POSITION if `desired_state` is, else HOLD.
-    - `reset_fault` (1): not zero: asks to clear a fault, or to resume after the watchdog took over; the mode is then
+    - `reset_fault` (1): not zero requests to reset a fault, or to resume after the watchdog took over. The mode is then
       HOLD.
-    - `lcmt_dvrk_command`: the message. It is HOLD whenever what is asked for is not connected or not finite.
+    - `lcmt_dvrk_command`: the message. It is HOLD whenever the commanded values are not connected or not finite.
     """
 
     def __init__(self, arm: Arm, sender_id: int | None = None) -> None:
-        """Of a controller of `arm`; its `sender_id` is drawn if not given."""
+        """Creates the sender of a controller of `arm`. Without a `sender_id`, a random one is used."""
         super().__init__()
         n = arm.num_joints
         self._arm_name, self._num_joints = arm.name, n
@@ -69,7 +68,7 @@ class DvrkCommandSender(LeafSystem):
 
     @property
     def sender_id(self) -> int:
-        """By which the arm tells this sender from others."""
+        """Identifier by which the arm distinguishes this sender from others."""
         return self._sender_id
 
     def _calc_command(self, context: Context, output: AbstractValue) -> None:
@@ -104,10 +103,9 @@ class DvrkCommandSender(LeafSystem):
 
 
 class DvrkCommandReceiver(LeafSystem):
-    """Receives commands for one arm, lets its guard judge them, and says what motors and position controller do.
+    """Receives commands for one arm, checks them with its guard, and outputs the resulting efforts and targets.
 
-    Until a command acts it holds the measured pose, like Drake's receivers, and whenever the guard takes over.
-
+    It holds the measured pose until a command acts, like Drake's receivers, and whenever the guard takes over.
     .. pydrake_system::
 
         name: DvrkCommandReceiver
@@ -125,26 +123,26 @@ class DvrkCommandReceiver(LeafSystem):
 
     Ports, for n joints in the arm's order [rad, rad/s, N m; m, m/s, N on a prismatic joint]:
 
-    - `lcmt_dvrk_command`: a command, e.g. from an LcmSubscriberSystem; the same one is taken once. Drake keeps only the
-      newest message of a channel, and no bytes that a key could verify: a process that moves an arm gives every message
-      to `Receive` instead.
-    - `state_estimated` (2n): q, then v, measured. `effort_measured` (n): what the motors apply.
-    - `position_control_effort` (n): what the arm's own position controller asks for now.
-    - `gravity_effort` (n): the arm's own gravity compensation. Connected, it is added to commanded efforts, and
-      commands are understood without it.
-    - `control_mode` (1): lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT, what is in force.
-    - `desired_state` (2n): where that position controller shall go; the measured pose at rest while efforts act.
-    - `effort` (n): what the motors shall apply: zero when off, the guarded command in EFFORT (with the
-      arm's own gravity compensation inside the effort limits), else `position_control_effort`, or the gravity effort of
-      the last good measurement where that is not finite.
-    - `guard`: the CommandGuard, to be read only.
+    - `lcmt_dvrk_command`: a command, e.g. from an LcmSubscriberSystem. Repeated messages are received once. Drake keeps
+      only the newest message of a channel, and not the bytes that a key could verify. A process that moves an arm
+      passes every message to `Receive` instead.
+    - `state_estimated` (2n): measured q, then v. `effort_measured` (n): applied motor efforts.
+    - `position_control_effort` (n): present effort of the arm's own position controller.
+    - `gravity_effort` (n): the arm's own gravity compensation. If connected, it is added to commanded efforts, and
+      commands are interpreted without it.
+    - `control_mode` (1): mode in force: lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT.
+    - `desired_state` (2n): target of that position controller; the measured pose at rest while efforts act.
+    - `effort` (n): motor efforts to apply. They are zero when off. In EFFORT they are the guarded command, with the
+      arm's own gravity compensation inside the effort limits. Otherwise they are `position_control_effort`, or the
+      gravity effort of the last good measurement where that is not finite.
+    - `guard`: the CommandGuard, read-only.
 
-    The measurement is always fresh. The guard is abstract state; it is updated once a period of the clock, and
-    Drake does that before discrete plants of the same time are stepped, so a command acts in the step that follows it.
+    The measurement is always recent. The guard is abstract state that is updated once per period of the clock. Drake
+    updates it before it steps discrete plants at the same time, so a command acts in the step that follows it.
 
     Attributes:
-        stalled: whether the guard stands still, as in a bridge whose process is stopped. Messages then wait in the
-            inbox, and the outputs follow what the guard said last.
+        stalled: True stops the guard, as in a bridge whose process is stopped. Messages then wait in the inbox, and the
+            outputs keep the guard's last values.
     """
 
     def __init__(
@@ -154,13 +152,13 @@ class DvrkCommandReceiver(LeafSystem):
         clock: ArmClock | None = None,
         key: MessageKey | None = None,
     ) -> None:
-        """Of `arm` with a `guard` of it.
+        """Creates the receiver of `arm` with its `guard`.
 
         Args:
-            arm: for the number of its joints and their effort limits.
-            guard: its state at first; each context has its own.
-            clock: by which commands are judged, once a period; None: ArmClock().
-            key: must have signed what `Receive` takes; None: not verified.
+            arm: Arm that defines the number of joints and their effort limits.
+            guard: Guard in its initial state. Each context has its own copy.
+            clock: Clock of the arm, whose period is that of the guard. None: ArmClock().
+            key: Key that must have signed the messages for `Receive`. None: not verified.
         """
         super().__init__()
         n = arm.num_joints
@@ -185,11 +183,11 @@ class DvrkCommandReceiver(LeafSystem):
         self._inbox = CommandInbox(guard, key)
 
     def Receive(self, data: bytes) -> None:
-        """Puts a message, as it came over the wire, into the inbox that the next update takes."""
+        """Adds a received message to the inbox that the next update reads."""
         self._inbox.put(data)
 
     def GetGuard(self, context: Context) -> CommandGuard:
-        """The guard of this context, to be read only."""
+        """Returns the guard of this context, read-only."""
         return context.get_abstract_state(int(self._guard)).get_value()
 
     def _update(self, context: Context, state: State) -> None:
@@ -226,7 +224,7 @@ class DvrkCommandReceiver(LeafSystem):
             output.SetFromVector(np.clip(told.effort + gravity, -self._effort_limits, self._effort_limits))
         else:
             effort = self._position_control.Eval(context)
-            # A position controller whose measurement is lost for a few periods has no effort that could be applied.
+            # The position controller has no valid effort while its measurement is lost for a few periods.
             effort = effort if is_finite(effort.tolist()) else self.GetGuard(context).gravity_effort
             output.SetFromVector(np.clip(effort, -self._effort_limits, self._effort_limits))
 

@@ -1,4 +1,4 @@
-"""How an arm is driven over LCM, as a schema for yaml_load_typed.
+"""Configuration of an arm's driver over LCM, as a schema for yaml_load_typed.
 
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
@@ -23,20 +23,20 @@ _MODES = {
 
 @dataclass
 class DvrkDriver:
-    """Configuration of the driver of one arm, as Drake's IiwaDriver is for its arm.
+    """Configuration of the driver of one arm, comparable to Drake's IiwaDriver.
 
     Attributes:
-        lcm_url: of the LCM network; empty: the environment's LCM_DEFAULT_URL, or LCM's default.
-        status_period: in which the arm says what it measures, and controllers answer [s].
-        control_modes: modes that the arm accepts beside hold: position, effort, "off" (quoted: to YAML off is false).
-            An arm that is off falls, so it is not in the default.
-        key_file: key that commands must be signed with and statuses are signed with, as `dvrk-drake key` makes it,
-            relative to the driver's YAML file; empty: messages are not authenticated, and any process on the network
-            can command the arm.
-        gravity_compensation: the arm adds its own gravity compensation to commanded efforts, as a dVRK does on request.
-        model: file of the identified model with which the guard checks measurements, relative to the driver's YAML
-            file; empty: what the arm's SDF states.
-        guard: what its command guard allows.
+        lcm_url: URL of the LCM network. Empty: LCM_DEFAULT_URL of the environment, or LCM's default.
+        status_period: Period in which the arm sends its status and controllers answer [s].
+        control_modes: Modes that the arm accepts besides hold: position, effort, "off" (quoted, since YAML reads off as
+            false). An arm that is off falls, so it is not in the default.
+        key_file: Key that must sign commands and that signs statuses, created by `dvrk-drake key`. The path is relative
+            to the driver's YAML file. Empty: messages are not authenticated, and any process on the network can
+            command the arm.
+        gravity_compensation: The arm adds its own gravity compensation to commanded efforts, as a dVRK does on request.
+        model: File of the identified model with which the guard checks measurements, relative to the driver's YAML
+            file. Empty: the model of the arm's SDF.
+        guard: Settings of the command guard.
     """
 
     lcm_url: str = ""
@@ -51,10 +51,10 @@ class DvrkDriver:
         self.check()
 
     def check(self) -> None:
-        """Checks the values; whoever sets them one by one, as yaml_load_typed does, calls it again.
+        """Checks the values. Call it again after setting fields one by one, as yaml_load_typed does.
 
         Raises:
-            StationError: an unknown control mode, a period out of its range, or a guard's setting.
+            StationError: An unknown control mode, a period out of its range, or an invalid setting of the guard.
         """
         self.guard.check()
         if any(mode not in _MODES for mode in self.control_modes):
@@ -63,28 +63,28 @@ class DvrkDriver:
             raise StationError(fault)
 
     def relative_to(self, folder: Path) -> None:
-        """Resolves relative `key_file` and `model`, which are meant relative to `folder`."""
+        """Resolves relative paths in `key_file` and `model` against `folder`."""
         if self.key_file:
             self.key_file = str(folder / self.key_file)
         if self.model:
             self.model = str(folder / self.model)
 
     def load_model(self, arm: Arm) -> IdentifiedModel | None:
-        """Returns the model in `model`, or None without one.
+        """Returns the model in the file `model`, or None if there is none.
 
         Raises:
-            ModelError: it cannot be read, or is not of `arm`.
+            ModelError: The file cannot be read, or is not a model of `arm`.
         """
         return IdentifiedModel.load(self.model, arm) if self.model else None
 
     def load_key(self) -> MessageKey | None:
-        """Returns the key in `key_file`, or None without one.
+        """Returns the key in `key_file`, or None if there is none.
 
         Raises:
-            KeyFileError: as `MessageKey.load`.
+            KeyFileError: As `MessageKey.load`.
         """
         return MessageKey.load(self.key_file) if self.key_file else None
 
     def accepted_modes(self) -> tuple[int, ...]:
-        """`control_modes` as values of lcmt_dvrk_command.control_mode."""
+        """Returns `control_modes` as values of lcmt_dvrk_command.control_mode."""
         return tuple(_MODES[mode] for mode in self.control_modes)

@@ -1,4 +1,4 @@
-"""The status channel of an arm as systems: the arm's sender with its clock, and the controller's receiver."""
+"""Systems for the status channel of an arm: the arm's sender with its clock, and the controller's receiver."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 
 @dataclass(frozen=True)
 class ArmClock:
-    """An arm's clock, which begins with the context's time and never jumps.
+    """Clock of an arm. It advances with the context's time and never jumps.
 
     Attributes:
-        start_utime: at time zero of the context [us].
-        period: in which the arm measures, judges and tells [s].
+        start_utime: Value at time zero of the context [us].
+        period: Period in which the arm measures, updates its guard and sends its status [s].
     """
 
     start_utime: int = 0
     period: float = 1e-3
 
     def utime(self, context: Context) -> int:
-        """Now [us]."""
+        """Returns the present time [us]."""
         return self.start_utime + round(1e6 * context.get_time())
 
     def ticks(self, context: Context) -> int:
-        """How many periods have begun since time zero."""
+        """Returns the number of periods that have begun since time zero."""
         return round(context.get_time() / self.period)
 
 
 class DvrkStatusSender(LeafSystem):
-    """Says in a message what one arm measures and what its guard decided, for an LcmPublisherSystem.
+    """Computes the status message of one arm, its measurements and the state of its guard, for an LcmPublisherSystem.
 
     .. pydrake_system::
 
@@ -50,7 +50,7 @@ class DvrkStatusSender(LeafSystem):
         output_ports:
         - lcmt_dvrk_status
 
-    - `state_estimated` (2n): q, then v; `effort_measured`, `effort_commanded` (n): what the motors apply and were told
+    - `state_estimated` (2n): q, then v; `effort_measured`, `effort_commanded` (n): applied and commanded motor efforts
       [rad, rad/s, N m; m, m/s, N on a prismatic joint].
     - `guard`: the CommandGuard, from DvrkCommandReceiver.
     - `lcmt_dvrk_status`: the message. Its sequence is the number of periods since time zero.
@@ -64,13 +64,13 @@ class DvrkStatusSender(LeafSystem):
         *,
         gravity_compensation: bool = False,
     ) -> None:
-        """Of `arm`.
+        """Creates the sender of `arm`.
 
         Args:
-            arm: named in the message.
-            guard: a guard of that arm, for the type of the port.
-            clock: whose time and count of periods messages carry; None: ArmClock().
-            gravity_compensation: whether the arm adds its own to commanded efforts.
+            arm: Arm that the message names.
+            guard: Guard of that arm, which defines the type of the port.
+            clock: Clock that provides the time and the number of periods. None: ArmClock().
+            gravity_compensation: True if the arm adds its own gravity compensation to commanded efforts.
         """
         super().__init__()
         n = arm.num_joints
@@ -101,7 +101,7 @@ class DvrkStatusSender(LeafSystem):
 
 
 def fill_in_guard(status: lcmt_dvrk_status, guard: CommandGuard) -> None:
-    """Sets the fields of `status` that tell what a guard decided, for bridges as well."""
+    """Sets the fields of `status` that describe the state of a guard. Bridges use it as well."""
     status.session_id = guard.session_id
     status.guard_state, status.accepted_modes = guard.state, guard.accepted_modes
     status.fault_code, status.fault_text = guard.fault_code, guard.fault_text or guard.waits_for
@@ -116,7 +116,7 @@ def fill_in_guard(status: lcmt_dvrk_status, guard: CommandGuard) -> None:
 
 
 class DvrkStatusReceiver(LeafSystem):
-    """What one arm measures, as ports, from the status of an LcmSubscriberSystem.
+    """Outputs the measurements of one arm from its status, which an LcmSubscriberSystem receives.
 
     .. pydrake_system::
 
@@ -130,12 +130,12 @@ class DvrkStatusReceiver(LeafSystem):
         - effort_measured
 
     `state_estimated` has 2n numbers, q, then v, the others n, in the arm's order [rad, rad/s, N m; m, m/s, N on a
-    prismatic joint]. Without a message of this arm, as before the first one, all are NaN: a pose that nobody measured
-    is not zero.
+    prismatic joint]. Without a message of this arm, as before the first one, all of them are NaN, because zero would be
+    a valid pose.
     """
 
     def __init__(self, arm: Arm) -> None:
-        """Of `arm`; messages of another arm or size count as none."""
+        """Creates the receiver of `arm`. Messages of another arm or size are treated as missing."""
         super().__init__()
         n = arm.num_joints
         self._arm_name, self._num_joints = arm.name, n

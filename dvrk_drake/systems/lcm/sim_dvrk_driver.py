@@ -1,4 +1,4 @@
-"""What stands between the messages and the motors of a simulated arm."""
+"""Simulated driver between the LCM messages and the motors of a simulated arm."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from dvrk_drake.systems.lcm.dvrk_status import ArmClock, DvrkStatusSender
 
 
 class SimDvrkDriver(Diagram):
-    """An arm's own controller, simulated: command guard, position controller, status.
+    """Simulation of an arm's own controller: command guard, position controller and status.
 
     .. pydrake_system::
 
@@ -35,8 +35,8 @@ class SimDvrkDriver(Diagram):
         - effort_commanded
         - lcmt_dvrk_status
 
-    Ports as in DvrkCommandReceiver and DvrkStatusSender. The position controller, which holds the arm whenever no
-    command acts, is a GravityPidController with the model's gravity; a real arm's has friction instead.
+    The ports are those of DvrkCommandReceiver and DvrkStatusSender. The position controller holds the arm whenever no
+    command acts. It is a GravityPidController with the model's gravity. The one of a real arm has to overcome friction.
     """
 
     def __init__(
@@ -49,19 +49,19 @@ class SimDvrkDriver(Diagram):
         wall_clock: Callable[[], int] | None = None,
         key: MessageKey | None = None,
     ) -> None:
-        """Driver of `arm`.
+        """Creates the driver of `arm`.
 
         Args:
-            arm: as it is simulated, mounting included.
-            driver: its configuration.
-            model: of the simulated arm, which the position controller compensates; None: what the arm's SDF states. The
-                guard checks measurements with the driver's model, or else with this one.
-            start_utime: the arm's clock at time zero of the context [us].
-            wall_clock: of the guard [us]; None: commands expire by the context's time only.
-            key: must have signed what `Receive` takes; None: not verified.
+            arm: Arm as simulated, including its mounting.
+            driver: Configuration of the driver.
+            model: Model of the simulated arm, which the position controller compensates. None: the model of the arm's
+                SDF. The guard checks measurements with the driver's model, or else with this one.
+            start_utime: The arm's clock at time zero of the context [us].
+            wall_clock: Wall clock of the guard [us]. None: commands expire by the context's time only.
+            key: Key that must have signed the messages for `Receive`. None: not verified.
 
         Raises:
-            ModelError: the driver's model cannot be read, or is of another arm.
+            ModelError: The driver's model cannot be read, or is of another arm.
         """
         super().__init__()
         clock = ArmClock(start_utime, driver.status_period)
@@ -105,18 +105,18 @@ class SimDvrkDriver(Diagram):
         self.set_name(f"{arm.name.lower()}_driver")
 
     def Receive(self, data: bytes) -> None:
-        """Takes a message of the command channel, as it came over the wire, at the next update."""
+        """Receives a message of the command channel, which the next update reads."""
         self._receiver.Receive(data)
 
     def SetStalled(self, stalled: bool) -> None:
-        """Stops the guard, as in a bridge whose process is stopped, or lets it go on.
+        """Stops the guard, as in a bridge whose process is stopped, or restarts it.
 
-        While it is stopped, no command is received and the motors do what they were told last.
+        While it is stopped, no command is received and the motors keep their last efforts.
         """
         self._receiver.stalled = stalled
 
     def GetGuard(self, context: Context) -> CommandGuard:
-        """The guard in this driver's context, to be read only."""
+        """Returns the guard in this driver's context, read-only."""
         return self._receiver.GetGuard(self.GetSubsystemContext(self._receiver, context))
 
 
@@ -131,24 +131,24 @@ def apply_driver_config(
     subscribe: bool = True,
     wall_clock: Callable[[], int] | None = None,
 ) -> SimDvrkDriver:
-    """Puts a simulated station behind LCM: DVRK_COMMAND_<ARM> moves it, DVRK_STATUS_<ARM> tells of it.
+    """Connects a simulated station to LCM: DVRK_COMMAND_<ARM> moves it, DVRK_STATUS_<ARM> reports its state.
 
     Args:
-        driver: its configuration; its `lcm_url` is not read. Its key verifies commands and signs statuses.
-        station: in `builder`, with its effort input free.
-        lcm: whose `HandleSubscriptions` is called by somebody else, e.g. an LcmInterfaceSystem or a loop.
-        builder: of the Diagram.
-        model: see SimDvrkDriver.
-        start_utime: the arm's clock at time zero of the context [us].
-        subscribe: take commands from `lcm`, which over UDP keeps the newest one between two calls of
-            `HandleSubscriptions`. False: somebody else gives every message to `SimDvrkDriver.Receive`.
-        wall_clock: of the guard, for a simulation that is stepped by the wall clock [us].
+        driver: Configuration of the driver; its `lcm_url` is not used. Its key verifies commands and signs statuses.
+        station: Station in `builder`, with its effort input unconnected.
+        lcm: LCM interface whose `HandleSubscriptions` the caller calls, e.g. an LcmInterfaceSystem or a loop.
+        builder: Builder of the Diagram.
+        model: See SimDvrkDriver.
+        start_utime: The arm's clock at time zero of the context [us].
+        subscribe: True receives commands from `lcm`, which over UDP keeps the newest one between two calls of
+            `HandleSubscriptions`. False: the caller passes every message to `SimDvrkDriver.Receive`.
+        wall_clock: Wall clock of the guard [us], for a simulation that is stepped by the wall clock.
 
     Returns:
         The driver that was added.
 
     Raises:
-        KeyFileError: the driver's key cannot be used.
+        KeyFileError: The driver's key cannot be used.
     """
     arm, name, key = station.arm, station.arm.name.lower(), driver.load_key()
     sim_driver = builder.AddSystem(
