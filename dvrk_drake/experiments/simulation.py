@@ -204,7 +204,7 @@ def samples(log: VectorLogSink, simulator: Simulator) -> NDArray[np.float64]:
 
 @contextmanager
 def recorded_in(meshcat: Meshcat | None, **options: Any) -> Iterator[None]:
-    """Records the animation of the simulation in the block, with `options` of StartRecording, unless Meshcat is None."""
+    """Records an animation of the simulation in the block with `options` of StartRecording, unless Meshcat is None."""
     if meshcat is not None:
         meshcat.StartRecording(**options)
     yield

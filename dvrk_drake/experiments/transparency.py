@@ -87,7 +87,7 @@ class OperatorForces:
 
 
 def random_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int = 0) -> PiecewisePolynomial:
-    """Makes a smooth joint motion through random poses at the speed of a hand, as a substitute for a recorded motion."""
+    """Makes a smooth joint motion through random poses at the speed of a hand; substitutes a recorded motion."""
     q = arm.sample_poses(poses, np.random.default_rng(seed), margin=0.25)
     times = seconds_each * np.arange(poses, dtype=float)
     return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
