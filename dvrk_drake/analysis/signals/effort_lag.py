@@ -48,7 +48,8 @@ def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
     """Estimates the delay of each effort by a fit with delays of up to 40 ms in both directions.
 
     The regressors are the actuator's Coulomb and viscous friction, all accelerations, and sine and cosine of all
-    positions. Presliding friction, which builds up after a reversal, resembles a delay. One motion cannot separate them.
+    positions. Presliding friction, which builds up after a reversal, resembles a delay. One motion cannot separate the
+    two.
 
     Args:
         signals: Signals of the actuators, because friction acts there.

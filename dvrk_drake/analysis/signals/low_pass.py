@@ -82,7 +82,7 @@ def _filter(sos, state, x):  # pragma: no cover - compiled
 
 
 def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the correlation (2 m - 1,) of a and b (m,): the sum over t of a(t + lag) b(t), for lags 1 - m .. m - 1."""
+    """Returns the correlation (2 m - 1,), the sum over t of a(t + lag) b(t) of a, b (m,), for lags 1 - m .. m - 1."""
     count = len(a)
     size = 1 << (2 * count - 1).bit_length()
     circular = np.fft.irfft(np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size)), size)

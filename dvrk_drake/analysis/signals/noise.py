@@ -63,8 +63,8 @@ def spectra(x: NDArray[np.float64], rate: float, period: float | None) -> Spectr
 def cut_offs(of: Spectra) -> NDArray[np.float64]:
     """Returns the lowest frequencies (n,) above which the signal is below the noise [Hz], at least `MIN_CUT_OFF`.
 
-    Both spectra are smoothed over five lines. If the signal exceeds the noise at all frequencies, the result is half the
-    sampling rate.
+    Both spectra are smoothed over five lines. If the signal exceeds the noise at all frequencies, the result is half
+    the sampling rate.
     """
     kernel = np.ones(5) / 5
     result = []

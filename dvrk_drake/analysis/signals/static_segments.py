@@ -1,4 +1,4 @@
-"""Static segments of a recording as poses: rests of a motion, slow parts of one without rests, or poses already."""
+"""Extracts static poses from a recording: rests of a motion, or its low-speed segments."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_ROWS, Recording
 
-#: Cut-off of the zero-phase low-pass for speeds [Hz], at most half the rate of a motion, and its order.
+#: Cut-off of the zero-phase low-pass filter for speeds [Hz], at most half the rate of a motion, and its order.
 CUT_OFF, ORDER = 10.0, 4
-#: At rest: all joints slower than this [rad/s], [m/s], for this long [s], and within this of its begin [rad], [m].
+#: Rest: largest speed of all joints [rad/s], [m/s], least duration [s], largest distance from its start [rad], [m].
 MAX_REST_SPEED, MIN_REST, SAME_REST = (0.02, 0.002), 0.3, (0.01, 0.001)
 
 
 def static_poses(recording: Recording, arm: Arm) -> Recording | None:
-    """One row for each pose at which the arm rests for 0.3 s: means over the later half, when it has settled.
+    """Extracts one row per pose at which the arm rests for 0.3 s, averaged over the settled second half.
 
-    Rests at one pose are averaged. A gap in the times ends a rest: nobody knows what the arm did meanwhile.
+    Rests at the same pose are averaged. A gap in the times ends a rest, because the motion in the gap is unknown.
 
     Args:
-        recording: over time; its speeds are qd, or q differentiated.
-        arm: which was recorded.
+        recording: Motion. Its speeds are qd, or the derivative of q.
+        arm: Arm that was recorded.
 
     Returns:
-        The rests in joint coordinates and without time; None if `recording` is no motion: no times that increase by
-        less than 0.05 s, or fewer than 100 rows. It may have no rows.
+        The rests in joint coordinates and without time, possibly with no rows. None if `recording` is not a motion: its
+        times do not increase by less than 0.05 s, or it has fewer than 100 rows.
 
     Raises:
-        RecordingError: no efforts, or another arm's.
+        RecordingError: The recording has no efforts, or is of another arm.
     """
     moving = recording.in_joint_coordinates(arm)
     t = moving.t
@@ -60,7 +60,7 @@ def static_poses(recording: Recording, arm: Arm) -> Recording | None:
 
 
 def smooth_velocity(recording: Recording) -> NDArray[np.float64]:
-    """(m, n) velocities of a motion below the cut-off, without delay."""
+    """Returns the velocities (m, n) of a motion, low-pass filtered without delay."""
     t = np.asarray(recording.t)
     qd = np.gradient(recording.q, t, axis=0) if recording.qd is None else recording.qd
     rate = 1 / float(np.median(np.diff(t)))
@@ -70,9 +70,9 @@ def smooth_velocity(recording: Recording) -> NDArray[np.float64]:
 def stationary_runs(
     still: NDArray[np.bool_], q: NDArray[np.float64], same: NDArray[np.float64], least: int
 ) -> Iterator[NDArray[np.int_]]:
-    """Consecutive rows, `least` or more, where `still` (m,) holds and q (m, n) stays within `same` (n,) of the first.
+    """Yields runs of `least` or more rows in which `still` (m,) holds and q (m, n) stays within `same` (n,) of its start.
 
-    A run ends where q leaves, and the next one begins there.
+    A run ends where q leaves this range, and the next run begins there.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     for first, end in edges.reshape(-1, 2):
@@ -85,23 +85,23 @@ def stationary_runs(
             start = stop
 
 
-#: Slow: below this share of the joint's top speed, and of its top acceleration.
+#: Largest speed and acceleration in a low-speed segment, as shares of the joint's largest values.
 SLOW_SPEED, SLOW_ACCELERATION = 0.1, 0.2
-#: Rows closer than this are averaged [s].
+#: Rows with shorter intervals than this are averaged [s].
 MIN_PERIOD = 0.005
-#: Fewest consecutive samples that make a slow part.
+#: Fewest consecutive samples of a low-speed segment.
 MIN_SAMPLES = 3
-#: A slow part ends where any joint is further than this from where it began [rad], [m]; those of one joint whose poses
-#: agree this well are repetitions of one.
+#: Largest distance of any joint from the start of a low-speed segment [rad], [m]. Segments of one joint whose poses
+#: agree within it are repetitions.
 SAME_PART = 0.05, 0.005
 
 
 class LowSpeedSegments(NamedTuple):
-    """Slow parts of a motion, one row each.
+    """Low-speed segments of a motion, one row each.
 
     Attributes:
-        recording: their mean poses and torques, in joint coordinates, without time.
-        measured: (m, n) True at the one joint that was slow: only its torque is a holding torque.
+        recording: Mean poses and torques of the segments, in joint coordinates, without time.
+        measured: (m, n) True at the one joint that is slow. Only its torque is a holding torque.
     """
 
     recording: Recording
@@ -109,15 +109,14 @@ class LowSpeedSegments(NamedTuple):
 
 
 def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
-    """Finds them, joint by joint, and averages each with its repetitions.
+    """Extracts low-speed segments of a motion as static poses, per joint, averaged with their repetitions.
 
-    While other joints still move, their velocities and accelerations leave a little inertial torque in it; and dry
-    friction stays in it, of either sign. Both are errors here: a motion wants dynamic identification, or rests of the
-    whole arm (`static_poses`).
+    The torques contain two errors: inertial torques from the motion of other joints, and dry friction of either sign. If
+    possible, use dynamic identification for a motion, or poses at which the whole arm rests (`static_poses`).
 
     Raises:
-        RecordingError: no efforts, or another arm's.
-        IdentificationError: no times or speeds, or nothing in it is slow.
+        RecordingError: The recording has no efforts, or is of another arm.
+        IdentificationError: The recording has no times or speeds, or no low-speed segments.
     """
     moving = recording.in_joint_coordinates(arm)
     moving.measured_effort()
@@ -131,7 +130,7 @@ def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
     tau, t = moving.measured_effort(), np.asarray(moving.t)
     v = smooth_velocity(moving)
     vd = np.gradient(v, t, axis=0)
-    # The 99 % quantile, not the maximum: one spike must not make everything else slow.
+    # Use the 99 % quantile instead of the maximum, so that one spike does not classify all other rows as slow.
     is_slow = np.abs(v) < SLOW_SPEED * np.quantile(np.abs(v), 0.99, axis=0)
     is_slow &= np.diff(t, append=t[-1])[:, None] < MAX_PERIOD
     is_slow &= np.abs(vd) < SLOW_ACCELERATION * np.quantile(np.abs(vd), 0.99, axis=0)
@@ -157,7 +156,7 @@ def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
 
 
 def _thinned(recording: Recording) -> Recording:
-    """Means over blocks of rows, such that about 200 a second are left: more say nothing new below the cut-off."""
+    """Averages blocks of rows to about 200 rows per second, because the low-pass filter removes faster changes."""
     t, qd, tau = recording.t, recording.qd, recording.measured_effort()
     if t is None or qd is None:
         return recording
@@ -174,9 +173,9 @@ def _thinned(recording: Recording) -> Recording:
 
 
 def _longest_of_each_pass(runs: Iterable[NDArray[np.int_]]) -> Iterator[NDArray[np.int_]]:
-    """One run of those that follow each other without a row between: friction is the same in all of them.
+    """Yields the longest of each series of adjacent runs.
 
-    Left out one at a time they would vouch for each other.
+    Friction is the same in all runs of a series. They are not independent, so cross-validation requires one of them.
     """
     longest: NDArray[np.int_] | None = None
     last = -2
@@ -192,7 +191,10 @@ def _longest_of_each_pass(runs: Iterable[NDArray[np.int_]]) -> Iterator[NDArray[
 
 
 def _parts_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Arm) -> list[NDArray[np.int_]]:
-    """Rows of each slow part of one joint, repetitions joined; the other joints stay within `SAME_PART` in each."""
+    """Returns the rows of each low-speed segment of one joint, with repetitions joined.
+
+    The other joints stay within `SAME_PART` in each segment.
+    """
     same = arm.per_joint(*SAME_PART)
     parts: list[NDArray[np.int_]] = []
     means = np.empty((0, arm.num_joints))
@@ -209,7 +211,7 @@ def _parts_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Ar
     return parts
 
 
-#: What must be said where slow parts are used.
+#: Note on models that are identified from low-speed segments.
 LOW_SPEED_NOTE = (
     "where a joint is slow is taken for a pose of it; friction stays in its torque, and other joints may move: trust "
     "the ten-fold errors, and another day's recording, not the fit"
@@ -217,13 +219,13 @@ LOW_SPEED_NOTE = (
 
 
 class Poses(NamedTuple):
-    """What `find_poses` found.
+    """Result of `find_poses`.
 
     Attributes:
-        recording: one row a pose, or the recording as it was.
-        measured: (m, n) where an effort is a holding torque; None: everywhere.
-        note: where the poses are from, or "".
-        moves: the arm moves all the time: there are no poses, but a dynamic model can be had.
+        recording: One row per pose, or the unchanged recording.
+        measured: (m, n) True where an effort is a holding torque. None if all are.
+        note: Origin of the poses, or "".
+        moves: True if the arm moves all the time. There are no poses then, but a dynamic model can be identified.
     """
 
     recording: Recording
@@ -233,16 +235,16 @@ class Poses(NamedTuple):
 
 
 def find_poses(recording: Recording, arm: Arm, with_low_speed_segments: bool = False) -> Poses:
-    """The rests of a motion if there are `MIN_POSES`, else its slow parts if wanted, else the recording as it is.
+    """Returns the rests of a motion if there are `MIN_POSES`, or its low-speed segments, or the unchanged recording.
 
     Args:
-        recording: poses or a motion, in either coordinates.
-        arm: which was recorded.
-        with_low_speed_segments: of a motion without enough rests, see `low_speed_segments`.
+        recording: Poses or a motion, in joint or actuator coordinates.
+        arm: Arm that was recorded.
+        with_low_speed_segments: Use low-speed segments if a motion has too few rests, see `low_speed_segments`.
 
     Raises:
-        RecordingError: the recording does not fit the arm, has no efforts, or is a motion whose times go back.
-        IdentificationError: no slow parts, where they are wanted.
+        RecordingError: The recording does not fit the arm, has no efforts, or is a motion with decreasing times.
+        IdentificationError: Low-speed segments are requested, and there are none.
     """
     recording.check_fits(arm)
     _check_times(recording, arm)
@@ -255,7 +257,7 @@ def find_poses(recording: Recording, arm: Arm, with_low_speed_segments: bool = F
 
 
 def _check_times(recording: Recording, arm: Arm) -> None:
-    """Refuses a motion whose times do not increase: it would be taken for poses."""
+    """Rejects a motion whose times do not increase, because it would be treated as poses."""
     t = recording.t
     if t is None or len(t) < MIN_ROWS or recording.has_increasing_times:
         return

@@ -1,4 +1,4 @@
-"""Which joint effects a static recording supports, chosen by cross-validation."""
+"""Selects the joint effects of a static model by cross-validation."""
 
 from __future__ import annotations
 
@@ -22,28 +22,27 @@ from dvrk_drake.models.arm import Arm
 if TYPE_CHECKING:
     from dvrk_drake.dynamics.static_model import StaticModel
 
-#: Prior standard deviation of a base parameter, as a share of what would use up some joint's effort limit by itself.
+#: Prior standard deviation of a base parameter. The unit is the value at which it alone reaches a joint's effort limit.
 BASE_PRIOR = 0.25
-#: Prior standard deviation of an effect, as a share of the effort that the limits of the joints allow along its
-#: coordinate. Offsets are kept small: over a narrow range a large one would take the place of gravity, and mislead
-#: outside of it.
+#: Prior standard deviation of an effect, as a share of the effort that the joint limits allow along its coordinate.
+#: Offsets have a small deviation. Over a narrow range a large offset would replace gravity and be wrong outside of it.
 EFFECT_PRIOR = {"offset": 0.03, "cable sine": 0.3, "cable cosine": 0.3, "spring": 0.3}
 #: Least standard deviation of a torque measurement, as a share of the effort limit.
 SIGMA_FLOOR = 2e-3
-#: An effect must lower the sum of squared left-out residuals (in sigma) by this much a coefficient: about log(poses).
+#: Least reduction of the sum of squared held-out residuals (in sigma) per coefficient, about log(poses).
 MIN_GAIN = 4.0
-#: And by this many of its own standard errors over poses.
+#: Least reduction in standard errors over poses.
 MIN_SIGNIFICANCE = 1.5
-#: A cable or spring is considered if its coordinate moved by this much [rad]: less, and a sine or spring would fit the
-#: servo's error, a cosine be an offset.
+#: Least travel of a coordinate for a cable or a spring to be a candidate [rad]. Over less travel, a sine or a spring
+#: would fit the servo error, and a cosine would equal an offset.
 MIN_SPAN = {"cable sine": 0.25, "cable cosine": 1.5, "spring": 0.25}
 
 
 class StaticProblem:
-    """The regression of one recording's torques on base parameters and any choice of effects."""
+    """Regression of one recording's torques on base parameters and any set of effects."""
 
     def __init__(self, arm: Arm, q: NDArray[np.float64], tau: NDArray[np.float64], usable: NDArray[np.bool_]):
-        """Of poses q (m, n) and torques tau (m, n) with `usable` (m, n) False where a measurement is excluded."""
+        """Constructs the problem for poses q (m, n) and torques tau (m, n). `usable` (m, n) is False if excluded."""
         from dvrk_drake.dynamics.static_model import compile_static_model  # sympy takes 0.3 s, and motions need none
 
         self.arm, self.q, self.tau, self.usable = arm, q, tau, usable
@@ -52,11 +51,11 @@ class StaticProblem:
         self.sigma_floor = SIGMA_FLOOR * arm.effort_limits
 
     def subset(self, rows: NDArray[np.bool_]) -> StaticProblem:
-        """The problem of some of the poses."""
+        """Returns the problem for a subset of the poses."""
         return StaticProblem(self.arm, self.q[rows], self.tau[rows], self.usable[rows])
 
     def regressor(self, effects: Sequence[ActuatorEffect]) -> NDArray[np.float64]:
-        """X (m, n, b + e)."""
+        """Returns the regressor X (m, n, b + e)."""
         X = np.zeros((*self.tau.shape, self._Y.shape[2] + len(effects)))
         X[..., : self._Y.shape[2]] = self._Y
         for column, effect in enumerate(effects, start=self._Y.shape[2]):
@@ -64,7 +63,7 @@ class StaticProblem:
         return X
 
     def prior_precision(self, effects: Sequence[ActuatorEffect]) -> NDArray[np.float64]:
-        """(b + e,) inverse prior variances about zero."""
+        """Returns the reciprocal prior variances (b + e,) about zero."""
         effect_sd = [
             EFFECT_PRIOR[effect.kind] * _effort_limit(self.arm, effect.coordinate) / _largest_shape(effect)
             for effect in effects
@@ -75,16 +74,16 @@ class StaticProblem:
     def fit(
         self, effects: Sequence[ActuatorEffect], iterations: int = 12, start: NDArray[np.float64] | None = None
     ) -> RobustFit:
-        """Robust, shrunk fit with the given effects; `start` (n,) as in `robust_fit`."""
+        """Returns the robust fit with shrinkage for the given effects; `start` (n,) as in `robust_fit`."""
         X, prior = self.regressor(effects), self.prior_precision(effects)
         return robust_fit(X, self.tau, self.usable, prior, self.sigma_floor, iterations, start)
 
 
 def candidate_effects(problem: StaticProblem) -> list[list[ActuatorEffect]]:
-    """What may act at each joint that the poses say something of: an offset, a cable's pull, a spring.
+    """Returns groups of candidate effects per joint that the poses can identify: an offset, a cable, a spring.
 
-    A spring where the arm's file says that the joint's drive has one (`motion.known_effects`). Other coordinates of the
-    transmission gain nothing here: they predict other recordings of the MTM a little worse.
+    A spring is a candidate if the arm file lists it for the joint's drive (`motion.known_effects`). Other coordinates of
+    the transmission are not candidates, because they slightly increase the error on other MTM recordings.
     """
     arm, groups = problem.arm, []
     for joint in arm.joint_names:
@@ -111,10 +110,10 @@ def _cables(problem: StaticProblem, coordinate: str) -> list[ActuatorEffect]:
 
 
 def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
-    """Adds the effect (or all of one joint's) that lowers the leave-one-out error most, until none clearly does.
+    """Adds the effect, or all effects of one joint, that reduces the leave-one-out error most, while it is significant.
 
-    "Clearly": by more than `MIN_GAIN` per coefficient and by more than 1.5 of the gain's own standard errors over
-    poses. Squared errors are capped at nine variances so that no single pose decides.
+    A reduction is significant if it exceeds `MIN_GAIN` per coefficient and `MIN_SIGNIFICANCE` standard errors over
+    poses. Squared errors are limited to nine variances, so that no single pose decides.
     """
     chosen: tuple[ActuatorEffect, ...] = ()
     current = problem.fit(chosen)
@@ -140,20 +139,20 @@ def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
 
 
 def _says_the_same(effect: ActuatorEffect, chosen: Sequence[ActuatorEffect]) -> bool:
-    """Whether it is a spring beside a cable of the same joint, or a cable beside its spring: both fit a range."""
+    """Returns whether the chosen effects have a cable for this spring, or a spring for this cable, at the same joint."""
     joint = effect.coordinate.partition(".")[2]
     laws = {e.kind.partition(" ")[0] for e in chosen if e.coordinate.partition(".")[2] == joint}
     return (effect.kind == "spring" and "cable" in laws) or (effect.kind.startswith("cable") and "spring" in laws)
 
 
 def _loss(problem: StaticProblem, fit: RobustFit, sigma: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m,) capped squared leave-one-out error of each pose in units of sigma."""
+    """Returns the limited squared leave-one-out error (m,) of each pose in units of sigma."""
     return (np.minimum((fit.fit.leave_one_out_residuals / sigma) ** 2, 9.0) * problem.usable).sum(axis=1)
 
 
 @cache
 def _largest_base_parameters(model: StaticModel) -> NDArray[np.float64]:
-    """(b,) size at which each base parameter alone would need some joint's whole effort limit somewhere in the box."""
+    """Returns the size (b,) at which each base parameter alone reaches the effort limit of a joint in some pose."""
     arm = model.gravity.arm
     q = np.random.default_rng(0).uniform(arm.position_lower, arm.position_upper, (3000, arm.num_joints))
     largest = np.abs(model.regressor(q)).max(axis=0)
@@ -163,7 +162,10 @@ def _largest_base_parameters(model: StaticModel) -> NDArray[np.float64]:
 
 @cache
 def _is_gravity_too(model: StaticModel, effect: ActuatorEffect) -> bool:
-    """Whether no measurement could tell the effect from gravity, as a spring at a yaw joint that lifts weight."""
+    """Returns whether the effect cannot be separated from gravity by any measurement.
+
+    An example is a spring at a yaw joint that lifts weight.
+    """
     arm = model.gravity.arm
     poses = arm.sample_poses(100, np.random.default_rng(0))
     Y = model.regressor(poses).reshape(-1, len(model.gravity.base.names))
@@ -173,17 +175,17 @@ def _is_gravity_too(model: StaticModel, effect: ActuatorEffect) -> bool:
 
 
 def effect_column(arm: Arm, effect: ActuatorEffect, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m, n) torque of an effect of position on the joints at poses q (m, n), per unit of its coefficient."""
+    """Returns the joint torques (m, n) of a position-dependent effect at poses q (m, n), per unit of its coefficient."""
     x = position_along(arm, effect.coordinate, q)
     return effect.column(x, 0 * x)[:, None] * joint_row(arm, effect.coordinate)
 
 
 def _largest_shape(effect: ActuatorEffect) -> float:
-    """Its effort at most, per unit of its coefficient."""
+    """Returns the largest effort of the effect per unit of its coefficient."""
     return effect.scale if effect.kind == "spring" else 1.0
 
 
 def _effort_limit(arm: Arm, coordinate: str) -> float:
-    """Largest effort along the coordinate that no joint's limit is below."""
+    """Returns the largest effort along the coordinate that is within the limits of all joints."""
     row = np.abs(joint_row(arm, coordinate))
     return float(np.min(arm.effort_limits[row > 1e-9] / row[row > 1e-9]))

@@ -1,4 +1,4 @@
-"""Measurements that may not be holding torques at all: poses that press on a stop, or torques no arm can give."""
+"""Finds measurements that are not holding torques: poses at a joint stop, and torques beyond the effort limit."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
 
-#: Within this distance of a limit a joint may rest on its stop [rad], [m].
+#: Distance from a limit within which a joint may be at its stop [rad], [m].
 STOP_MARGIN = 0.01, 0.002
 
 
 @dataclass(frozen=True)
 class ExcludedMeasurement:
-    """Why the torque of some joints in one pose is not used: `where` names the pose, `reason` is readable."""
+    """Measurement that is not used, with the name of the pose in `where` and a readable `reason`."""
 
     row: int
     joints: tuple[int, ...]
@@ -28,18 +28,20 @@ class ExcludedMeasurement:
 def find_excluded(
     recording: Recording, arm: Arm, measured: NDArray[np.bool_] | None = None
 ) -> list[ExcludedMeasurement]:
-    """What can be excluded before any fit. A stop carries load, so it makes the torque of its own joints meaningless.
+    """Returns the measurements to exclude before any fit.
+
+    A stop carries load, so the torques of its joints are not holding torques.
 
     Args:
-        recording: in joint coordinates, with efforts.
-        arm: whose limits count.
-        measured: (m, n) False where an effort is no holding torque and need not be excluded; by default all are.
+        recording: Recording in joint coordinates, with efforts.
+        arm: Arm with the limits.
+        measured: (m, n) False where an effort is not a holding torque and need not be excluded. By default all are True.
     """
     excluded = []
     A, lower, upper = arm.limit_matrix()
     names = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
     values = recording.q @ A.T
-    # A coupled limit is where contact begins, and stops there are soft: no margin inside of it.
+    # A coupled limit is the position at first contact, and its stop is soft. It has no margin.
     margin = np.concatenate([arm.per_joint(*STOP_MARGIN), np.zeros(len(arm.coupled_limits))])
     at_stop = (values < lower + margin) | (values > upper - margin)
     for row, limit in np.argwhere(at_stop):
@@ -63,10 +65,10 @@ def find_excluded(
 
 
 def check_effort_unit(recording: Recording, arm: Arm) -> None:
-    """Refuses efforts that no motor of the arm gives: they are in another unit.
+    """Rejects efforts beyond the capability of the motors, which indicate another unit.
 
     Raises:
-        RecordingError: most efforts of a joint exceed its limit.
+        RecordingError: Most efforts of a joint exceed its limit.
     """
     typical = np.median(np.abs(recording.measured_effort()), axis=0)
     if np.any(typical > arm.effort_limits):
@@ -81,7 +83,7 @@ def check_effort_unit(recording: Recording, arm: Arm) -> None:
 def exclude_outliers(
     recording: Recording, arm: Arm, outliers: NDArray[np.bool_], residuals: NDArray[np.float64]
 ) -> list[ExcludedMeasurement]:
-    """The measurements that a robust fit rejected, (m, n) each."""
+    """Returns the measurements that a robust fit rejected, for masks and residuals (m, n)."""
     return [
         ExcludedMeasurement(
             int(row),
@@ -94,7 +96,7 @@ def exclude_outliers(
 
 
 def usable_measurements(shape: tuple[int, int], excluded: list[ExcludedMeasurement]) -> NDArray[np.bool_]:
-    """(m, n) mask: False where an excluded measurement names the pose and the joint."""
+    """Returns a mask (m, n) that is False for excluded measurements."""
     usable = np.ones(shape, dtype=bool)
     for measurement in excluded:
         usable[measurement.row, list(measurement.joints)] = False

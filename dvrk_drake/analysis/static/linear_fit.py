@@ -1,4 +1,4 @@
-"""Weighted least squares over poses with shrinkage, robust weights and leave-one-pose-out residuals in closed form."""
+"""Weighted least squares over poses, with shrinkage, robust weights and closed-form leave-one-pose-out residuals."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-#: A residual beyond this many robust standard deviations counts less (Huber), beyond the next one not at all.
+#: Residuals beyond the first number of robust standard deviations have less weight (Huber), beyond the second none.
 HUBER_LIMIT, REJECTION_LIMIT = 3.0, 6.0
 
 
 @dataclass(frozen=True)
 class LinearFit:
-    """tau = X theta fitted over m poses of n joints.
+    """Fit of tau = X theta over m poses of n joints.
 
     Attributes:
-        theta: (p,).
-        covariance: (p, p) of theta, for unit variance of the weighted residuals.
-        residuals: (m, n) measured minus fitted, of every measurement, also those with no weight.
-        leave_one_out_residuals: (m, n) measured minus what a fit to all other poses predicts.
+        theta: (p,) estimates.
+        covariance: (p, p) covariance of theta, for unit variance of the weighted residuals.
+        residuals: (m, n) measured minus fitted values of all measurements, including those with zero weight.
+        leave_one_out_residuals: (m, n) measured values minus predictions of a fit to all other poses.
     """
 
     theta: NDArray[np.float64]
@@ -30,12 +30,12 @@ class LinearFit:
 
 @dataclass(frozen=True)
 class RobustFit:
-    """A `LinearFit` with the weights it ended with.
+    """`LinearFit` with robust weights.
 
     Attributes:
-        fit: the last weighted fit.
+        fit: Last weighted fit.
         sigma: (n,) standard deviation of each joint's residual.
-        outliers: (m, n) measurements that were rejected.
+        outliers: (m, n) mask of the rejected measurements.
     """
 
     fit: LinearFit
@@ -51,20 +51,20 @@ def weighted_fit(
 ) -> LinearFit:
     """Minimizes sum(weights (tau - X theta)^2) + sum(prior_precision theta^2).
 
-    The left-out residuals are exact: for pose i with hat block H_i = X_i A^-1 X_i' W_i they are (I - H_i)^-1 e_i.
+    The leave-one-out residuals are exact. For pose i with hat block H_i = X_i A^-1 X_i' W_i they are (I - H_i)^-1 e_i.
 
     Args:
         X: (m, n, p) regressor.
         tau: (m, n) measured torques.
-        weights: (m, n) inverse variances; 0 leaves a measurement out.
+        weights: (m, n) inverse variances; 0 excludes a measurement.
         prior_precision: (p,) inverse variance of each parameter about zero; 0 for no shrinkage.
 
     Raises:
-        numpy.linalg.LinAlgError: the data and the prior together do not determine theta.
+        numpy.linalg.LinAlgError: The data and the prior together do not determine theta.
     """
     WX = weights[..., None] * X
     A = np.einsum("mnp,mnr->pr", X, WX) + np.diag(prior_precision)
-    # Scaled to a unit diagonal: parameters range over decades (kg m at the shoulder, g mm at the handle).
+    # Scale to a unit diagonal, because parameters range over decades (kg m at the shoulder, g mm at the handle).
     scale = 1 / np.sqrt(np.diag(A))
     covariance = np.linalg.inv(A * np.outer(scale, scale)) * np.outer(scale, scale)
     theta = covariance @ np.einsum("mnp,mn->p", WX, tau)
@@ -83,16 +83,16 @@ def robust_fit(
     iterations: int = 12,
     start: NDArray[np.float64] | None = None,
 ) -> RobustFit:
-    """Iteratively reweighted `weighted_fit`: each joint by its own spread, single bad measurements less or not at all.
+    """Fits by iteratively reweighted least squares, with one variance per joint and reduced weights for outliers.
 
     Args:
         X: (m, n, p) regressor.
         tau: (m, n) measured torques.
-        usable: (m, n), False leaves a measurement out.
-        prior_precision: (p,) as in `weighted_fit`.
-        sigma_floor: (n,) least standard deviation to assume of each joint.
-        iterations: of reweighting.
-        start: (n,) standard deviations to start from; by default the spread of tau itself.
+        usable: (m, n) False excludes a measurement.
+        prior_precision: (p,) prior precision, as in `weighted_fit`.
+        sigma_floor: (n,) least standard deviation to assume for each joint.
+        iterations: Number of reweighting iterations.
+        start: (n,) initial standard deviations. By default they are the spread of tau.
     """
     sigma = np.maximum(_spread(tau, usable) if start is None else start, sigma_floor)
     weights = usable.astype(float)
@@ -109,14 +109,15 @@ def robust_fit(
 
 
 def rms(values: NDArray[np.float64]) -> float:
-    """Root mean square; 0 of nothing."""
+    """Returns the root mean square, 0 for an empty array."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
 
 
 def _spread(values: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Robust standard deviation about zero of each column: 1.4826 median |x|, never below half the 90 % quantile's.
+    """Returns a robust standard deviation about zero of each column: 1.4826 median |x|, with a lower limit.
 
-    Friction holds many measurements of a wrist at nearly zero, so the median alone may say 0.
+    The lower limit is half of the estimate from the 90 % quantile. Friction keeps many torques of a wrist near zero, so
+    the median alone may be 0.
     """
     masked = np.where(usable, np.abs(values), np.nan)
     enough = usable.sum(axis=0) >= 3

@@ -1,4 +1,4 @@
-"""Parameters of the static model from recorded poses and holding torques (paper, III.I, and further)."""
+"""Identifies the static model from recorded poses and holding torques (paper, III.I, with extensions)."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ from dvrk_drake.recordings.recording import REST_SPEED, SAME_POSE, Recording
 
 Method = Literal["robust", "paper"]
 
-#: Fewest distinct poses that are accepted.
+#: Fewest distinct poses for an identification.
 MIN_POSES = 8
-#: A joint whose measured torque stays below this share of its effort limit says nothing about its model, unless
-#: leave-one-out explains most of it: less than the second share of it is left.
+#: Least measured torque of a joint, as a share of its effort limit, for using its model. A joint below it is used only if
+#: its leave-one-out error is below the second share of its torque.
 MIN_TORQUE, CLEAR_GAIN_RATIO = 0.02, 0.5
-#: Nor does one that moved by less than this share of its range: its torque elsewhere would be a guess.
+#: Least travel of a joint, as a share of its range, for using its model. Elsewhere its torque would be extrapolated.
 MIN_MOTION = 0.02
-#: The same for low-speed segments of a motion: over less, friction has the same direction in all of them.
+#: Least travel for low-speed segments of a motion. Over less travel, friction has the same direction in all of them.
 MIN_SEGMENT_MOTION = 0.05
-#: Leave-one-out must lower the RMS error to this share of zero torque's, or the joint's torque is scaled down.
+#: Largest ratio of the leave-one-out RMS error to that of zero torque. Above it the feedforward scale is reduced.
 MIN_GAIN_RATIO = 0.98
 FOLDS = 10
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class StaticIdentification(Identification):
-    """A model identified from poses.
+    """Model identified from poses.
 
     Attributes:
-        excluded: measurements that were left out, and why.
+        excluded: Measurements that were excluded, with reasons.
         residuals: (m, n) measured minus fitted efforts [N m; N].
-        leave_one_out_residuals: (m, n) the same for poses predicted from all others.
-        measured: (m, n) False where an effort is no holding torque.
+        leave_one_out_residuals: (m, n) measured efforts minus predictions from all other poses [N m; N].
+        measured: (m, n) False where an effort is not a holding torque.
     """
 
     excluded: list[ExcludedMeasurement]
@@ -74,22 +74,23 @@ def identify_static(
 ) -> StaticIdentification:
     """Identifies the static model of `arm` from a recording of poses at rest.
 
-    "paper": unweighted least squares on the base parameters, eq. 9-10 of the paper.
-    "robust" (default): each joint weighted by its own spread, measurements on a stop or far off left out, effects
-    chosen by leave-one-out, every parameter shrunk toward zero by a prior derived from the effort limits, and a joint's
-    torque scaled down where leave-one-out says that the model is no better than zero torque, or where the joint hardly
-    moved. Samples of one pose are averaged first: left out one at a time they would vouch for each other.
+    Method "paper" is unweighted least squares on the base parameters, eq. 9-10 of the paper.
+
+    Method "robust" (default) weights each joint by its residual variance. It excludes measurements at joint stops and
+    outliers. Effects are chosen by leave-one-out cross-validation. A prior from the effort limits shrinks all parameters
+    toward zero. The feedforward scale of a joint is reduced if its leave-one-out error is no better than that of zero
+    torque, or if the joint hardly moved. Repeated samples of one pose are not independent, so they are averaged first.
 
     Args:
-        recording: poses with efforts, in either coordinates.
-        arm: the arm it was recorded on.
-        method: see above.
-        progress: called with the finished share, 0..1.
-        measured: (m, n) False where an effort is no holding torque, as `low_speed_segments` gives it; by default all are.
+        recording: Poses with efforts, in joint or actuator coordinates.
+        arm: Arm that was recorded.
+        method: "robust" or "paper".
+        progress: Callback that receives the finished share, 0 to 1.
+        measured: (m, n) False where an effort is not a holding torque, from `low_speed_segments`. By default all are True.
 
     Raises:
-        RecordingError: the recording does not fit the arm or has no efforts.
-        IdentificationError: too few poses, a motion instead of poses, or (method "paper") a rank too low.
+        RecordingError: The recording does not fit the arm or has no efforts.
+        IdentificationError: There are too few poses, the recording is a motion, or the rank is too low (method "paper").
     """
     from dvrk_drake.dynamics.static_model import compile_static_model  # sympy takes 0.3 s, and motions need none
 
@@ -115,7 +116,7 @@ def identify_static(
                 "least squares has no unique answer: record more varied poses or use --method robust"
             )
         fit = weighted_fit(Y, tau, measured.astype(float), np.zeros(Y.shape[2]))
-        # Unit weights: the covariance takes its scale from the residuals, as the textbook does.
+        # With unit weights, the covariance is scaled by the residual variance, as in textbooks.
         variance = np.sum(fit.residuals[measured] ** 2) / (np.sum(measured) - Y.shape[2])
         validated, sd = fit.leave_one_out_residuals, np.sqrt(variance * np.diag(fit.covariance))
     else:
@@ -164,11 +165,11 @@ def identify_static(
 
 
 def usable_poses(recording: Recording, arm: Arm, averaged: bool = True) -> Recording:
-    """The poses in joint coordinates, `averaged` to one row a pose, where a static model can be had from them.
+    """Returns the poses in joint coordinates, with repeated poses averaged if `averaged`.
 
     Raises:
-        RecordingError: the recording does not fit the arm or has no efforts.
-        IdentificationError: too few poses, or a motion instead of poses.
+        RecordingError: The recording does not fit the arm or has no efforts.
+        IdentificationError: There are too few poses, or the recording is a motion.
     """
     recording.check_fits(arm)
     recording = recording.in_joint_coordinates(arm)
@@ -181,7 +182,7 @@ def usable_poses(recording: Recording, arm: Arm, averaged: bool = True) -> Recor
 
 
 def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:
-    """One row a pose: rows whose joints agree within `SAME_POSE` with the first of them are its samples."""
+    """Averages repeated poses to one row per pose. Joints of a repeated pose agree with its first row within `SAME_POSE`."""
     same = arm.per_joint(*SAME_POSE)
     groups: list[list[int]] = []
     for row, q in enumerate(recording.q):
@@ -223,7 +224,7 @@ def _check_poses(recording: Recording, arm: Arm) -> None:
 def _feedforward_scales(
     problem: StaticProblem, left_out: NDArray[np.float64], usable: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """(n,) scale of each joint's torque that leave-one-out supports: 1 unless it is no better than zero torque."""
+    """Returns the feedforward scale (n,) of each joint: 1 unless leave-one-out is no better than zero torque."""
     arm = problem.arm
     least_motion = MIN_MOTION * (arm.position_upper - arm.position_lower)
     feedforward_scale = np.ones(arm.num_joints)
@@ -259,7 +260,7 @@ def _segments_support(
 
 
 def _cross_validate(problem: StaticProblem, progress: Callable[[float], object]) -> NDArray[np.float64]:
-    """(m, n) residuals of ten-fold cross-validation, effects and feedforward_scale chosen anew in every fold."""
+    """Returns the residuals (m, n) of ten-fold cross-validation, with effects and feedforward scales estimated per fold."""
     poses = len(problem.q)
     folds = np.random.default_rng(0).permutation(poses) % min(FOLDS, poses)
     residuals = np.empty_like(problem.tau)
@@ -277,7 +278,7 @@ def _cross_validate(problem: StaticProblem, progress: Callable[[float], object])
 
 
 def _scaled(fit: LinearFit, tau: NDArray[np.float64], feedforward_scale: NDArray[np.float64]) -> LinearFit:
-    """The fit's residuals with each joint's prediction scaled by its feedforward_scale."""
+    """Returns the fit with residuals of the scaled predictions."""
     return LinearFit(
         fit.theta,
         fit.covariance,

@@ -1,4 +1,4 @@
-"""How well a model predicts the torques of a recording."""
+"""Validates the holding torques of a model on a recording."""
 
 from __future__ import annotations
 
@@ -23,12 +23,11 @@ from dvrk_drake.recordings.recording import Recording
 
 @dataclass(frozen=True)
 class JointError:
-    """One joint's error over a recording: RMS in N m (N if prismatic) in the coordinates that the recording is in.
+    """Error of one joint over a recording, RMS in N m (N if prismatic), in the coordinates of the recording.
 
-    `rms_torque` is what commanding zero torque would err by; `relative_error` = rms_error / rms_torque, None where
-    nothing was measured. `_included`
-    leaves out `num_excluded` measurements of poses that rest on a stop or exceed the effort limit. `verdict` judges what
-    is left, see `judge`.
+    `rms_torque` is the error of commanding zero torque. `relative_error` is rms_error / rms_torque, None if nothing was
+    measured. The fields `_included` omit `num_excluded` measurements of poses at a joint stop or beyond the effort
+    limit. `verdict` refers to the included measurements, see `judge`.
     """
 
     name: str
@@ -47,11 +46,11 @@ class StaticValidation(Validation):
     """Errors of a model on poses.
 
     Attributes:
-        joints: in the arm's order.
-        poses: their number.
+        joints: Errors of the joints, in the arm's order.
+        poses: Number of poses.
         residuals: (m, n) measured minus predicted efforts, in the recording's coordinates [N m; N].
-        excluded: measurements that the verdicts leave out, and why.
-        measured: (m, n) False where an effort is no holding torque.
+        excluded: Measurements that the verdicts omit, with reasons.
+        measured: (m, n) False where an effort is not a holding torque.
     """
 
     joints: list[JointError]
@@ -67,7 +66,7 @@ class StaticValidation(Validation):
 
     @property
     def relative_errors(self) -> dict[str, float | None]:
-        """RMS error / RMS effort of each joint, without outliers [1]; None where nothing was measured."""
+        """RMS error / RMS effort of each joint without excluded measurements [1]; None if nothing was measured."""
         return {joint.name: joint.relative_error_included for joint in self.joints}
 
     def as_dict(self) -> dict:
@@ -82,16 +81,16 @@ class StaticValidation(Validation):
 
 
 def predict_static(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
-    """Holding torques (m, n) at the recording's poses, in the recording's own coordinates.
+    """Predicts the holding torques (m, n) at the recording's poses, in the recording's coordinates.
 
     Raises:
-        RecordingError: the recording does not fit the model's arm.
+        RecordingError: The recording does not fit the model's arm.
     """
     arm = model.arm
     recording.check_fits(arm)
     tau = model.holding_torque(recording.in_joint_coordinates(arm).q)
     if recording.coordinates == "actuator":
-        # tau_joint = J' tau_actuator, so the inverse map pulls back from joints to actuators.
+        # tau_joint = J' tau_actuator, so the inverse map transforms efforts from joints to actuators.
         tau = arm.transmission.inverse.pull_back_effort(tau)
     return tau
 
@@ -99,15 +98,16 @@ def predict_static(model: IdentifiedModel, recording: Recording) -> NDArray[np.f
 def validate_static(
     model: IdentifiedModel, recording: Recording, measured_joints: NDArray[np.bool_] | None = None
 ) -> StaticValidation:
-    """Compares a model with a recording.
+    """Compares a model's holding torques with a recording.
 
     Args:
-        model: the model.
-        recording: in either coordinates.
-        measured_joints: (m, n) False where an effort is no holding torque, as `low_speed_segments` gives it; default: all are.
+        model: Identified model.
+        recording: Poses with efforts, in joint or actuator coordinates.
+        measured_joints: (m, n) False where an effort is not a holding torque, from `low_speed_segments`. By default all
+            are True.
 
     Raises:
-        RecordingError: the recording does not fit the model's arm, or has no efforts.
+        RecordingError: The recording does not fit the model's arm, or has no efforts.
     """
     arm = model.arm
     measured = recording.measured_effort()
@@ -120,7 +120,7 @@ def validate_static(
     excluded = find_excluded(in_joints, arm, measured_joints)
     usable = usable_measurements(measured.shape, excluded) & measured_joints
     if recording.coordinates == "actuator":
-        # A doubt about a joint touches every actuator that drives it.
+        # An excluded measurement of a joint excludes all actuators that drive the joint.
         usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
     commanded = np.any(predicted != 0, axis=0)
     errors = _joint_errors(arm, measured, residuals, measured_joints, usable, commanded)
