@@ -1,1 +1,1 @@
-"""Recordings to models: signals, check, identification, validation, payload, recalibration."""
+"""Analysis of recordings: signals, checks, identification, validation, payload and recalibration."""

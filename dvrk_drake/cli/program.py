@@ -10,6 +10,7 @@ import os
 import re
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 
 from cyclopts import (
@@ -36,18 +37,19 @@ COMMANDS = model, recordings, identify, export, simulate, demo, lcm, collect
 RENAMED = {
     "model": {"": "--arm", "--latex": "--format latex", "--python": "--format python", "--c": "--format c"},
     "view": {"": "--arm"},
-    "validate": {"": "--model"},
+    "validate": {"": "--model", "--slow-parts": "--low-speed-segments"},
     "predict": {"": "--model"},
     "recalibrate": {"": "--model"},
     "convert": {"": "--output", "--format": "--input-format"},
     "record": {"": "--output"},
     "key": {"": "--output"},
-    "identify": {"--tables": "--verbose"},
+    "identify": {"--tables": "--verbose", "--slow-parts": "--low-speed-segments"},
     "compare-gc": {"--plot": "--plots"},
     "demo": {"--output": "--folder"},
     "reproduce": {"--output": "--folder"},
     "teleop": {"--html": "--output"},
     "run": {"--friction": "--friction-model"},
+    "transparency": {"--real-arm": "--simulated-effects"},
 }
 
 
@@ -68,7 +70,8 @@ def run(arguments: Sequence[str] | None) -> int:
             gc.freeze()
             gc.enable()
             signal.signal(signal.SIGINT, signal.default_int_handler)
-        with folders_only_for_results():
+        with folders_only_for_results(), warnings.catch_warnings():
+            warnings.showwarning = _print_warning
             command(*bound.args, **bound.kwargs)
     except DvrkDrakeError as error:
         print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -84,6 +87,10 @@ def run(arguments: Sequence[str] | None) -> int:
         print("dvrk-drake: interrupted", file=sys.stderr)
         return 130
     return 0
+
+
+def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
+    print(f"dvrk-drake: warning: {message}", file=sys.stderr)
 
 
 def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:

@@ -49,7 +49,10 @@ _POSITIONS = within(-50.0, 50.0, "rad or m")
 
 @dataclass
 class BaseParameterEstimate:
-    """A base parameter [kg m, or kg of a mass]; `distinguishable`: its size exceeds two standard errors."""
+    """Estimate of a base parameter [kg m, or kg for a mass].
+
+    `distinguishable` is true if the absolute value exceeds two standard errors.
+    """
 
     name: str = ""
     value: float = field(default=0.0, metadata=ESTIMATES)
@@ -57,23 +60,38 @@ class BaseParameterEstimate:
     distinguishable: bool = False
 
 
+def _earlier(name: str) -> dict[str, object]:
+    """Returns the metadata of an RMS effort without excluded measurements, whose key ended in `_undoubted`."""
+    return RMS_EFFORTS | formerly(f"{name}_undoubted")
+
+
 @dataclass
 class JointStatistics:
-    """How one joint was fitted. Torques are RMS in N m (N if prismatic), angles in rad (m).
+    """Statistics of the fit of one joint. RMS torques are in N m (N for a prismatic joint), positions in rad (m).
 
-    `rms_zero_torque` is the error of commanding nothing: the RMS of the measured torque. `rms_leave_one_out` predicts
-    each pose from all others; `rms_cross_validation` chooses the effects anew as well (ten folds). `_included` leaves
-    out the measurements that were excluded (`num_excluded` of them). `feedforward_scale` scales the joint's torque: 1, or less where
-    the data do not support the model. `position_lower`, `position_upper`: the range that the poses covered;
-    `coverage`: its share of the arm's range.
+    Attributes:
+        name: Name of the joint.
+        rms_zero_torque: RMS of the measured torque, which is the error without a model.
+        rms_fit: RMS residual of the fit.
+        rms_leave_one_out: RMS error of leave-one-out predictions of each pose.
+        rms_zero_torque_included: `rms_zero_torque` without excluded measurements.
+        rms_fit_included: `rms_fit` without excluded measurements.
+        rms_leave_one_out_included: `rms_leave_one_out` without excluded measurements.
+        rms_cross_validation_included: RMS error of 10-fold cross-validation without excluded measurements. The effects
+            are selected anew in each fold.
+        num_excluded: Number of excluded measurements.
+        feedforward_scale: Factor of the joint's torque, 0 to 1; less than 1 if the data do not support the model.
+        position_lower: Lower end of the range covered by the poses.
+        position_upper: Upper end of the range covered by the poses.
+        coverage: Ratio of the covered range to the arm's range.
     """
 
     name: str = ""
     rms_zero_torque: float = field(default=0.0, metadata=RMS_EFFORTS)
     rms_fit: float = field(default=0.0, metadata=RMS_EFFORTS)
     rms_leave_one_out: float = field(default=0.0, metadata=RMS_EFFORTS)
-    rms_zero_torque_included: float = field(default=0.0, metadata=RMS_EFFORTS | formerly("rms_zero_torque_undoubted"))
-    rms_fit_included: float = field(default=0.0, metadata=RMS_EFFORTS | formerly("rms_fit_undoubted"))
+    rms_zero_torque_included: float = field(default=0.0, metadata=_earlier("rms_zero_torque"))
+    rms_fit_included: float = field(default=0.0, metadata=_earlier("rms_fit"))
     rms_leave_one_out_included: float = field(
         default=0.0, metadata=RMS_EFFORTS | formerly("rms_leave_one_out_undoubted")
     )
@@ -89,7 +107,10 @@ class JointStatistics:
 
 @dataclass
 class Provenance:
-    """Where a model came from; `sha256` is of the recording's bytes, `condition_number` inf without full rank."""
+    """Origin of a model.
+
+    `sha256` is the hash of the recording's bytes. `condition_number` is inf if the regressor does not have full rank.
+    """
 
     recording: str = ""
     sha256: str = ""
@@ -100,15 +121,15 @@ class Provenance:
     version: str = ""
 
 
-#: On a joint of a model, from the most to the least favourable; `off`: the model commands no torque.
+#: Verdicts on a joint of a model; `off` means that the model commands no torque.
 Verdict = Literal["off", "good", "usable", "not judged", "do not use"]
 
 
 @dataclass
 class ValidationSummary:
-    """Verdict on each joint by `validate` on a recording that the model was not identified from.
+    """Verdict of `validate` on each joint, for a recording that was not used for identification.
 
-    `sha256` is of the recording's bytes.
+    `sha256` is the hash of the recording's bytes.
     """
 
     recording: str = ""
@@ -118,7 +139,7 @@ class ValidationSummary:
 
 @dataclass(kw_only=True)
 class _Identified:
-    """Fields that a model file and an `IdentifiedModel` have in common."""
+    """Common fields of a model file and an `IdentifiedModel`."""
 
     base_parameters: list[BaseParameterEstimate] = field(default_factory=list)
     effects: list[DriveEffect] = field(default_factory=list)
@@ -133,9 +154,9 @@ class _Head:
     """The first lines of a model file.
 
     Attributes:
-        format: version of the file's keys.
-        arm: URL or name of an arm of this package, or the path of an arm's file, relative to the model file.
-        gravity: (3,) gravity vector in the arm's base frame [m/s^2].
+        format: Version of the file's keys.
+        arm: URL or name of an arm of this package, or path of an arm file relative to the model file.
+        gravity: Gravity vector (3,) in the arm's base frame [m/s^2].
     """
 
     format: str = ""
@@ -152,17 +173,18 @@ class ModelFile(_Identified, _Head):
 class IdentifiedModel(_Identified):
     """Identified parameters of an arm.
 
-    They give its holding torque tau = feedforward_scale o (Y(q) beta + effects(q)) [N m; N on a prismatic joint].
+    The holding torque is tau = feedforward_scale o (Y(q) beta + effects(q)) [N m; N for a prismatic joint].
 
     Attributes:
-        arm: the arm, mounted as it was when its base parameters were identified.
-        base_parameters: in the order of `gravity_parameters(arm).base`. Of a model identified from a motion, those of
-            the links in `dynamics`.
-        effects: of position alone, of a model identified from poses; a model with `dynamics` has all effects there.
-        joints: how each joint was fitted.
-        provenance: where the model came from.
-        dynamics: of a model identified from a motion.
-        validation: what `validate --save` stored.
+        arm: Arm with the mounting for which its base parameters were identified.
+        base_parameters: Base parameters in the order of `gravity_parameters(arm).base`. For a model identified from a
+            motion, they are computed from the links in `dynamics`.
+        effects: Position-dependent effects of a model identified from poses. Empty if the model has `dynamics`, which
+            contains all effects.
+        joints: Statistics of the fit of each joint.
+        provenance: Origin of the model.
+        dynamics: Full dynamics of a model identified from a motion.
+        validation: Result stored by `validate --save`.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -177,15 +199,16 @@ class IdentifiedModel(_Identified):
 
     @classmethod
     def from_arm(cls, arm: Arm, effects: Sequence[DriveEffect] = (), *, dynamics: bool = False) -> "IdentifiedModel":
-        """Returns the model that the arm's own files state, without identification.
+        """Returns the nominal model, with the parameters of the arm's files and without identification.
 
         Args:
-            arm: whose SDF states the inertias.
-            effects: of position, e.g. `arm.effects.cables + arm.effects.springs`; not with `dynamics`.
-            dynamics: state the dynamics in motion too: rotors, and the friction, cables and springs of `arm.effects`.
+            arm: Arm whose SDF specifies the inertias.
+            effects: Position-dependent effects, e.g. `arm.effects.cables + arm.effects.springs`. Not allowed together
+                with `dynamics`.
+            dynamics: True to include the full dynamics: rotors, and friction, cables and springs of `arm.effects`.
 
         Raises:
-            ModelError: `effects` beside `dynamics`.
+            ModelError: Both `effects` and `dynamics` are given.
         """
         if dynamics and effects:
             raise ModelError("a model with dynamics has all effects of the arm; give either effects or dynamics")
@@ -207,20 +230,22 @@ class IdentifiedModel(_Identified):
         """Reads a model file.
 
         Args:
-            path: the model file.
-            arm: refuse a model of an arm with another name; the model keeps the arm that its file names.
+            path: Path of the model file.
+            arm: Expected arm. A model of an arm with another name is rejected. The loaded model keeps the arm of its
+                file.
 
         Raises:
-            ModelError: no such file, not a model, or one that does not fit its arm or is not of `arm`.
+            ModelError: The file does not exist, is not a model file, does not match its arm, or is a model of another
+                arm than `arm`.
         """
         content = load_yaml(path, ModelError)
-        # Another version has other keys, which are not worth naming.
+        # Reject an unknown version before its keys are checked.
         version = content.get("format") if isinstance(content, dict) else None
         if version and version not in (FORMAT, *_EARLIER_FORMATS):
             raise ModelError(f'{path}: format is "{version}", this version reads "{FORMAT}", 3 and 2; identify anew')
         content = with_current_keys(ModelFile, content, str(path))
         file = typed_content(ModelFile, content, str(path), ModelError, "a model file")
-        # A number that is missing would be 0 without a word.
+        # A missing number would otherwise silently become 0.
         if key := missing_key(ModelFile, content):
             raise ModelError(f"{path}: {key} is missing")
         try:
@@ -236,17 +261,17 @@ class IdentifiedModel(_Identified):
         return model
 
     def save(self, path: str | Path) -> None:
-        """Writes the model file at once or not at all; an existing file is replaced.
+        """Writes the model file atomically and replaces an existing file.
 
         Raises:
-            ModelError: the model does not fit its arm, or holds numbers that are none.
+            ModelError: The model does not match its arm or contains values that are not finite.
         """
         self.check()
         with atomic_write(path) as stream:
             stream.write(yaml_dump_typed(self._file(_name_for(path, self.arm))))
 
     def to_yaml(self) -> str:
-        """Returns the text of a model file that names the arm by `Arm.source`."""
+        """Returns the text of a model file that refers to the arm by `Arm.source`."""
         return yaml_dump_typed(self._file(self.arm.source))
 
     def _file(self, arm: str) -> ModelFile:
@@ -254,7 +279,7 @@ class IdentifiedModel(_Identified):
         return ModelFile(format=FORMAT, arm=arm, gravity=self.arm.gravity.tolist(), **parts)
 
     def check(self) -> None:
-        """Raises ModelError unless the parameters fit the arm."""
+        """Raises ModelError unless the parameters match the arm."""
         if fault := schema_fault(ModelFile, asdict(self._file(self.arm.source)), "a model"):
             raise ModelError(fault)
         names = gravity_parameters(self.arm).base.names
@@ -277,62 +302,65 @@ class IdentifiedModel(_Identified):
 
     @property
     def holding_effects(self) -> list[DriveEffect]:
-        """The effects that act at rest as they do in motion (`DynamicModel.holding_effects`)."""
+        """Effects that act at rest as they do in motion (see `DynamicModel.holding_effects`)."""
         if self.dynamics is None:
             return self.effects
         return [self.dynamics.effects[i] for i in self.dynamic_model.holding_effects]
 
     @property
     def theta(self) -> NDArray[np.float64]:
-        """(b + e,) base parameters, then coefficients of `holding_effects`, as `StaticModel` wants them."""
+        """Parameters (b + e,) of `static_model`: base parameters, then coefficients of `holding_effects`."""
         return np.array([p.value for p in self.base_parameters] + [e.coefficient for e in self.holding_effects])
 
     @property
     def feedforward_scale(self) -> NDArray[np.float64]:
-        """(n,) factor of each joint's torque."""
+        """Factor (n,) of each joint's torque."""
         return np.array([joint.feedforward_scale for joint in self.joints])
 
     @cached_property
     def static_model(self) -> "StaticModel":
-        """The compiled structure that `theta` belongs to."""
-        from dvrk_drake.dynamics.static_model import compile_static_model  # sympy takes 0.3 s, and motions need none
+        """Compiled static model with the parameters `theta`."""
+        from dvrk_drake.dynamics.static_model import compile_static_model  # importing sympy takes 0.3 s
 
         return compile_static_model(self.arm, tuple(map(ActuatorEffect.of, self.holding_effects)))
 
     @cached_property
     def dynamic_model(self) -> DynamicModel:
-        """The arm in motion.
+        """Model of the arm's full dynamics.
 
         Raises:
-            ModelError: the model was identified from poses and has no `dynamics`.
+            ModelError: The model was identified from poses and has no `dynamics`.
         """
         if self.dynamics is None:
             raise ModelError("the model has no dynamics: it was identified from poses; identify a motion")
         return DynamicModel(self.arm, self.dynamics)
 
     def with_scaled_parameters(self, factors: ArrayLike) -> "IdentifiedModel":
-        """What a wrong identification might have left: base parameters times `factors` (b,). Its `dynamics` stay."""
+        """Returns a copy with base parameters multiplied by `factors` (b,), to simulate identification errors.
+
+        `dynamics` is not changed.
+        """
         scaled = zip(self.base_parameters, np.asarray(factors, float), strict=True)
         return replace(self, base_parameters=[replace(p, value=float(p.value * factor)) for p, factor in scaled])
 
     def holding_torque(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Torque [N m, N] on the joints that holds the arm: (n,) for q (n,), (m, n) for q (m, n)."""
+        """Returns the joint torque [N m, N] that holds the arm: (n,) for q (n,), (m, n) for q (m, n)."""
         return self.feedforward_scale * self.static_model.torque(q, self.theta)
 
 
 class ControlModel:
-    """Gravity effort and mass matrix of one arm, evaluated fast enough for each tick of a control loop."""
+    """Gravity effort and mass matrix of an arm, evaluated fast enough for a control loop."""
 
     def __init__(self, model: IdentifiedModel, *, with_gravity: bool = True) -> None:
         """Compiles the gravity effort of `model` and reads its inertial parameters.
 
         Args:
-            model: of the arm, mounted as it is. A model that was identified from poses has no inertias: those of the
-                arm's SDF are used then.
-            with_gravity: False for an arm that adds its own gravity compensation to all efforts: it needs none.
+            model: Model of the arm with its actual mounting. A model identified from poses has no inertias, so those
+                of the arm's SDF are used.
+            with_gravity: False for an arm whose own controller adds gravity compensation to all efforts.
 
         Raises:
-            ModelError: the model does not fit its arm.
+            ModelError: The model does not match its arm.
         """
         model.check()
         self._torque_into = model.static_model.torque_into
@@ -345,7 +373,10 @@ class ControlModel:
             self._regressor, self._parameters = model.dynamic_model.regressor, model.dynamic_model.parameters
 
     def gravity_effort(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the effort (n,) [N m, N] that holds the arm at q (n,) [rad, m], a C-contiguous array."""
+        """Returns the effort (n,) [N m, N] that holds the arm at q (n,) [rad, m].
+
+        `q` must be C-contiguous.
+        """
         effort = np.empty(len(q))
         self._torque_into(q, self._theta, effort)
         return effort * self._scale
@@ -370,7 +401,7 @@ def _named_from(path: str | Path, name: str) -> str:
 
 
 def _nominal_dynamics(arm: Arm) -> DynamicSection:
-    """What the arm's files state of its dynamics."""
+    """Returns the dynamics specified by the arm's files."""
     regressor = DynamicRegressor(arm)
     rotors = regressor.rotors[: arm.num_joints]
     drive = [*arm.effects.friction, *arm.effects.cables, *arm.effects.springs]

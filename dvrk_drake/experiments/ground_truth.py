@@ -1,4 +1,7 @@
-"""Ground-truth arms: simulated arms whose links and effects no controller knows, and static poses collected on arms."""
+"""Ground-truth arms and the collection of static poses on them.
+
+The links and effects of a ground-truth arm differ from the model of its controller.
+"""
 
 from __future__ import annotations
 
@@ -36,22 +39,22 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
-#: Highest joint speed between poses [rad/s], [m/s].
+#: Maximum joint speed between poses [rad/s], [m/s].
 TRAVEL_SPEED = 1.7, 0.2
-#: Least time on the way [s], time to settle [s], samples a pose.
+#: Minimum travel time [s], settling time [s], samples per pose.
 MIN_TRAVEL, SETTLE, SAMPLES = 0.8, 1.0, 10
-#: Between two samples of a pose [s].
+#: Time between two samples of a pose [s].
 SAMPLE_SPACING = 0.01
 
 
 def visiting_trajectory(arm: Arm, poses: NDArray[np.float64]) -> tuple[PiecewisePolynomial, NDArray[np.float64]]:
-    """A trajectory from poses[0] through all others, at rest at each for as long as settling and sampling take.
+    """Makes a trajectory through all poses that rests at each pose for the settling and sampling time.
 
-    Straight in joint space, so between poses inside linear limits it stays inside of them.
+    The trajectory is straight in joint space. It therefore satisfies all linear limits that the poses satisfy.
 
     Args:
-        arm: the arm, for how fast its joints may be.
-        poses: (m, n).
+        arm: Arm whose joint types determine the maximum speeds.
+        poses: Poses (m, n) in the order of the visit.
 
     Returns:
         The trajectory of q (n,), and the time (m,) at which each pose has settled.
@@ -81,18 +84,18 @@ def collect_static_poses(
     generator: np.random.Generator,
     progress: Callable[[float], object] = lambda share: None,
 ) -> Recording:
-    """Visits hand-picked poses under position control and records the holding effort of each (steps 4 to 6).
+    """Visits the given poses under position control and records the holding effort of each (steps 4 to 6).
 
     Args:
-        station: the simulated arm; it becomes part of a Diagram here and cannot be used in another.
-        model: what the controller believes; the integrator makes up for what is wrong with it.
-        poses: (m, n) inside the limits (steps 1 to 3).
-        effort_noise: standard deviation of one effort sample as a share of the effort limit.
-        generator: of the noise.
-        progress: called with the finished share, 0..1.
+        station: Simulated arm. It becomes part of a Diagram and cannot be used in another one.
+        model: Model used by the controller. The integrator compensates its errors.
+        poses: Poses (m, n) inside the limits (steps 1 to 3).
+        effort_noise: Standard deviation of one effort sample as a share of the effort limit.
+        generator: Random generator of the noise.
+        progress: Function called with the finished share, 0..1.
 
     Returns:
-        One row a pose: the mean of `SAMPLES` samples of position and effort.
+        One row per pose: the mean of `SAMPLES` samples of position and effort.
     """
     arm = station.arm
     name = arm.name.lower()
@@ -116,19 +119,19 @@ def collect_static_poses(
     return Recording(q=q, tau=tau, source="simulated poses")
 
 
-#: How much heavier or lighter than drawn a link is, where nothing better is known.
+#: Maximum relative change of a link's mass in a perturbed ground-truth arm.
 SPREAD = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """An arm with all effects of a real one, and what holds it.
+    """Ground-truth arm with all effects of a real arm, and its exact holding torque.
 
     Attributes:
-        arm: to simulate; its SDF is a file of the output folder, its `effects` are the real arm's.
-        model: the torque that holds it against gravity, cables and springs; for judging, never for a controller.
-        is_paper_arm: it is the arm that the paper's parameters are of.
-        origin: where it comes from, a sentence.
+        arm: Arm to simulate. Its SDF is a file of the output folder, its `effects` are those of the real arm.
+        model: Model of the torque against gravity, cables and springs. It serves for evaluation, never for control.
+        is_paper_arm: Whether the arm is the one that the paper's parameters were identified on.
+        origin: Origin of the arm, one sentence.
     """
 
     arm: Arm
@@ -138,15 +141,15 @@ class GroundTruth:
 
 
 def paper_arm(recording: Recording, folder: Path) -> GroundTruth:
-    """The paper's own MTM, as its recording shows it to a robust identification; writes its SDF into `folder`.
+    """Identifies the paper's MTM robustly from its recording and writes its SDF into `folder`.
 
-    Its links are the possible bodies nearest to our SDF's that have the identified gravity, its cables and springs are
-    the identified effects. Friction, stops, encoders, motors and delays are those of `mechanisms/mtm.yaml`: no
-    recording of this arm shows them. Friction that is larger towards one side leaves a constant torque in poses: where
-    the arm has such friction, an identified offset is not there a second time.
+    The links are physically consistent, have the identified gravity, and are as close as possible to those of our SDF.
+    The cables and springs are the identified effects. The recording does not determine friction, stops, encoders,
+    motors and delays. They are taken from `mechanisms/mtm.yaml`. Friction that is larger in one direction leaves a
+    constant torque in static poses. Therefore the identified offset is omitted for joints with such friction.
 
     Raises:
-        RecordingError, IdentificationError, ModelError: the recording is not of an MTM at rest.
+        RecordingError, IdentificationError, ModelError: The recording is not of an MTM at rest.
     """
     arm = load_arm(PAPER_ARM)
     model = identify_static(recording, arm).model
@@ -172,10 +175,10 @@ def _at_actuator(coordinate: str) -> str:
 
 
 def perturbed_ground_truth(name: str, folder: Path, seed: int) -> GroundTruth:
-    """An arm whose links are each up to `SPREAD` heavier or lighter than the SDF's; writes its SDF into `folder`.
+    """Makes an arm whose links are up to `SPREAD` heavier or lighter than those of the SDF; writes its SDF.
 
-    An MTM has no wrist spring then: the identified spring balances an identified wrist, which is heavier than the
-    SDF's, and would exceed the motor's torque at a sixth of all poses.
+    The perturbed MTM has no wrist spring. The identified spring balances an identified wrist that is heavier than the
+    wrist of the SDF. With the SDF's wrist it would exceed the motor torque at a sixth of all poses.
     """
     arm = load_arm(name)
     links = perturbed_links(arm, np.random.default_rng(seed))
@@ -194,14 +197,14 @@ def perturbed_ground_truth(name: str, folder: Path, seed: int) -> GroundTruth:
 
 
 def perturbed_links(arm: Arm, generator: np.random.Generator, shift: float = 0.0) -> list[LinkInertia]:
-    """The links of an arm, each up to `SPREAD` heavier or lighter, its centre of mass moved by up to `shift` [m]."""
+    """Returns the links of an arm with masses changed by up to `SPREAD` and centres of mass by up to `shift` [m]."""
     links = []
     for link in link_inertias(arm):
         parameters = link.parameters
         if shift:
             M = link.to_spatial_inertia()
             com = M.get_com() + generator.uniform(-shift, shift, 3)
-            # The inertia about the centre of mass stays: a physically consistent body.
+            # The inertia about the centre of mass is unchanged, so the body remains physically consistent.
             G = M.Shift(M.get_com()).get_unit_inertia().ShiftFromCenterOfMass(-com)
             shifted = SpatialInertia(M.get_mass(), com, UnitInertia(G))
             parameters = LinkInertia.from_spatial_inertia(link.link, shifted).parameters
@@ -210,7 +213,7 @@ def perturbed_links(arm: Arm, generator: np.random.Generator, shift: float = 0.0
 
 
 def with_links(arm: Arm, links: Sequence[LinkInertia], path: Path, origin: str) -> Arm:
-    """The arm with other links, in an SDF at `path` that is written here; `origin` of the links is its comment."""
+    """Returns the arm with other links; writes its SDF to `path` with the `origin` of the links as its comment."""
     with atomic_write(path) as stream:
         stream.write(to_text(with_inertias(arm, links), f"{arm.name}, inertial parameters of {origin}."))
     return dataclasses.replace(arm, sdf=(str(path.resolve()),))
@@ -219,7 +222,7 @@ def with_links(arm: Arm, links: Sequence[LinkInertia], path: Path, origin: str) 
 def damped_station(
     arm: Arm, ground_truth_arm: Arm, effects: ArmEffects, closure: Closure, meshcat: Meshcat | None = None
 ) -> ArmStation:
-    """A station that simulates a ground-truth arm with these effects, its joints damped in the place of friction."""
+    """Makes a station of a ground-truth arm with these effects and with joint damping instead of friction."""
     damping = arm.per_joint(0.03, 0.3) * arm.effort_limits
 
     def damp(plant: MultibodyPlant) -> None:
@@ -230,11 +233,11 @@ def damped_station(
     )
 
 
-#: From how far on either side a pose is approached, so that dry friction cancels [rad], [m].
+#: Distance from which a pose is approached from both sides, so that dry friction cancels [rad], [m].
 APPROACH = 0.2, 0.02
-#: Free at both ends of each range, as a share of it; and how far a handle is turned that turns more than twice [rad].
+#: Margin at both ends of each joint range, as a share of the range; maximum angle of multi-turn joints [rad].
 MARGIN, REACH = 0.05, 1.6
-#: Poses that are collected in one go.
+#: Number of poses that one worker collects at a time.
 _CHUNK = 10
 
 
@@ -246,10 +249,10 @@ def collect(
     executor: Executor,
     progress: Callable[[float], object] = lambda share: None,
 ) -> Recording:
-    """`count` poses of a true arm with all its effects, each approached from both sides and averaged.
+    """Collects `count` poses of a ground-truth arm with all its effects, averaged over both approach directions.
 
-    The controller that leads it knows what the SDF says. Chunks of poses run at once on the executor's workers, each
-    from a start of its own, with noise of its own; the result does not depend on the workers.
+    The controller uses the model of the SDF. Chunks of poses run in parallel on the workers of the executor. Each
+    chunk has its own start pose and its own noise. The result does not depend on the number of workers.
     """
     arm = load_arm(name)
     poses = arm.sample_poses(count, np.random.default_rng(seed), margin=MARGIN)
@@ -263,7 +266,7 @@ def collect(
 
 
 def _collect_chunk(name: str, ground_truth_arm: Arm, poses: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
-    """(m, 2n) means of q and tau over both sides."""
+    """Returns the means (m, 2n) of q and tau over both approach directions."""
     arm = load_arm(name)
     offset = arm.per_joint(*APPROACH)
     visited = np.concatenate([[beside(arm, q, -offset), q, beside(arm, q, offset), q] for q in poses])

@@ -1,4 +1,4 @@
-"""Scenarios: the schema of their files, what can be simulated, and their readers.
+"""Schema, validation and reader of scenario files.
 
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
@@ -25,24 +25,27 @@ from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.hand import Grip
 from dvrk_drake.systems.station_config import ArmConfig
 
-#: Longest simulation [s] and finest recording that are taken for meant.
+#: Maximum duration of a simulation [s] and minimum sample period of its recording [s].
 MAX_LENGTH, MIN_SAMPLE_PERIOD = 3600.0, 1e-3
-#: Positions; `check_pose` has the limits of the arm.
+#: Coarse bounds of positions; `check_pose` checks the limits of the arm.
 _POSITIONS = within(-1e4, 1e4, "rad or m")
 _GRIP = {grip.name: grip for grip in dataclasses.fields(Grip)}
 
 
 @dataclass
 class ControllerScenario:
-    """`mode` is "hold", "gravity" or "damped"; `model` the file of an identified model, or empty for
-    what the SDF states.
+    """Controller of the arm in a scenario.
 
-    `gains` replaces the arm's own (kp, kd, ki: one number a joint; in a file also the name of a file of gains).
-    `friction_ratio` is the share of the friction that the arm's files state which is compensated, and
-    `hysteresis_ratio` that of the part that springs back, see `check_ratios`; in mode "gravity" only.
-    `parameter_error` makes the model wrong: each of its base parameters is multiplied by a factor of its own from
-    1 - `parameter_error`..1 + `parameter_error`, drawn by the scenario's seed. `compensated_effects` names those of "cables" and
-    "springs" of the arm's own effects that the model has beside the SDF; not for a model from a file.
+    Attributes:
+        mode: "hold", "gravity" or "damped".
+        model: File of an identified model. If empty, the controller uses the model of the SDF.
+        compensated_effects: Effects of the arm, "cables" or "springs", that are added to the model of the SDF. Not
+            allowed with a model from a file.
+        gains: Gains kp, kd, ki, one number per joint, that replace those of the arm. A file can also name a gains file.
+        friction_ratio: Share of the arm's friction that is compensated, in mode "gravity" only; see `check_ratios`.
+        hysteresis_ratio: Share of the elastic part of the friction that is compensated, in mode "gravity" only.
+        parameter_error: Relative error of the model. Each base parameter is multiplied by a random factor between
+            1 - `parameter_error` and 1 + `parameter_error`, drawn with the seed of the scenario.
     """
 
     mode: str = "hold"
@@ -56,7 +59,7 @@ class ControllerScenario:
 
 @dataclass
 class Target:
-    """At `time` [s] the arm is wanted at rest at `pose` [rad, m], one number a joint."""
+    """Desired rest of the arm at `time` [s] in `pose` [rad, m], one number per joint."""
 
     time: float = field(default=0.0, metadata=within(0.0, MAX_LENGTH, "s"))
     pose: list[float] = field(default_factory=list, metadata=_POSITIONS)
@@ -64,11 +67,15 @@ class Target:
 
 @dataclass
 class HandScenario:
-    """A person who takes the arm at `frame` and pulls it about, as firmly as the numbers say: see `systems.hand`.
+    """Hand that grasps the arm at a frame and moves it along a path; see `systems.hand`.
 
-    The hand goes where the frame is while the joints pass the poses of `path` at their times; it holds on from the
-    first to the last. Empty: nobody touches the arm. `frame` is one of the arm's SDF: an MTM's handle is dh_7, a PSM's
-    instrument dh_6.
+    The hand follows the pose that `frame` has while the joints pass the poses of `path` at their times. It holds the
+    arm from the first to the last of these times. With an empty path no hand touches the arm.
+
+    Attributes:
+        path: Joint poses and their times.
+        frame: Frame of the arm's SDF. The handle of an MTM is dh_7, the instrument of a PSM is dh_6.
+        stiffness, damping, rotational_stiffness, rotational_damping, max_force, max_torque: Parameters of the `Grip`.
     """
 
     path: list[Target] = field(default_factory=list)
@@ -84,25 +91,25 @@ class HandScenario:
 
     @property
     def grip(self) -> Grip:
-        """How firmly it holds."""
+        """Stiffness, damping and limits of the grip."""
         return Grip(**{f.name: getattr(self, f.name) for f in dataclasses.fields(Grip)})
 
 
 @dataclass
 class Scenario(ArmConfig):
-    """Schema of a scenario file. One scenario gives one result, bit for bit.
+    """Schema of a scenario file. Simulations of one scenario are identical bit for bit.
 
-    The fields of `ArmConfig` state the arm; `seed` is that of the controller's parameter error as well.
+    The fields of `ArmConfig` describe the arm. `seed` is also the seed of the controller's parameter error.
 
     Attributes:
-        time_step: of the plant and period of the controller [s].
-        duration: of the simulation [s].
-        sample_period: of the recording [s].
-        controller: what drives the arm.
-        start: pose at the start, at rest; zero, or the nearest pose inside the limits, if left out.
-        targets: where the arm shall be when; before, between and after them it is at rest at each. Mode "hold" only.
-        hand: a person who moves the arm.
-        effort_noise: standard deviation of recorded efforts, as a share of the effort limits.
+        time_step: Time step of the plant and period of the controller [s].
+        duration: Duration of the simulation [s].
+        sample_period: Sample period of the recording [s].
+        controller: Controller of the arm.
+        start: Start pose, at rest. Default: zero, or the nearest pose inside the limits.
+        targets: Desired poses and their times, in mode "hold" only. The arm is at rest in each of them.
+        hand: Hand that moves the arm.
+        effort_noise: Standard deviation of recorded efforts, as a share of the effort limits.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -124,7 +131,7 @@ class Scenario(ArmConfig):
 
     @cached_property
     def model(self) -> IdentifiedModel:
-        """What the controller believes."""
+        """Model used by the controller."""
         file, error = self.controller.model, self.controller.parameter_error
         known = [
             effect for part in self.controller.compensated_effects for effect in getattr(self.mounted_arm.effects, part)
@@ -134,23 +141,23 @@ class Scenario(ArmConfig):
         )
         if error == 0.0:
             return model
-        # A stream of its own: the seed alone is the noise's.
+        # Use a separate random stream; the seed alone is used for the noise.
         generator = np.random.default_rng([self.seed, 1])
         return model.with_scaled_parameters(generator.uniform(1 - error, 1 + error, len(model.base_parameters)))
 
     def knots(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Times (m,) and poses (m, n) that the arm shall rest at: the start, then the targets."""
+        """Returns the times (m,) and poses (m, n) of desired rest: the start, then the targets."""
         arm = self.mounted_arm
         home = np.clip(0.0, arm.position_lower, arm.position_upper)
         poses = [home if self.start is None else self.start, *(target.pose for target in self.targets)]
         return np.array([0.0, *(target.time for target in self.targets)]), np.array(poses, float)
 
     def check(self) -> None:
-        """Refuses what cannot be simulated.
+        """Checks that the scenario can be simulated.
 
         Raises:
-            ScenarioError: names the field, its value, and what is allowed.
-            ArmError, ModelError: the arm or the controller's model cannot be loaded.
+            ScenarioError: A field is invalid. The message gives the field, its value, and the accepted values.
+            ArmError, ModelError: The arm or the controller's model cannot be loaded.
         """
         if fault := self.arm_fault():
             raise ScenarioError(fault)
@@ -176,7 +183,7 @@ class Scenario(ArmConfig):
                 raise ScenarioError(f'controller.{name} needs mode "gravity"; it is "{self.controller.mode}"')
         if self.targets and self.controller.mode != "hold":
             raise ScenarioError(f'targets need controller.mode "hold"; it is "{self.controller.mode}"')
-        _ = self.model  # refused here if it is of another arm
+        _ = self.model  # raises an error for a model of another arm
 
     def _check_targets(self, name: str, targets: list[Target], after: float) -> None:
         for i, target in enumerate(targets):
@@ -203,10 +210,10 @@ def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
 
 
 def check_pose(name: str, pose: list[float], arm: Arm) -> None:
-    """Refuses a pose that `arm` cannot take; `name` begins the message.
+    """Checks that a pose is inside the limits of `arm`; `name` begins the error message.
 
     Raises:
-        ScenarioError: not n finite numbers, or outside the limits.
+        ScenarioError: The pose does not have n finite numbers, or it is outside the limits.
     """
     n, q = arm.num_joints, np.array(pose, float)
     if len(q) != n:
@@ -224,14 +231,16 @@ def check_pose(name: str, pose: list[float], arm: Arm) -> None:
 
 
 def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
-    """Reads a scenario file, or makes the scenario of an arm that holds its home pose; changes it, and checks it.
+    """Reads a scenario, applies settings to it, and checks it.
+
+    For an arm instead of a scenario file, the scenario is that the arm holds its home pose.
 
     Args:
-        arm_or_file: path of a scenario's YAML file, or the name of an arm or the path of its YAML file.
-        settings: "key=value" in YAML; a dot goes into a group: "controller.mode=gravity", "targets=[...]".
+        arm_or_file: Path of a scenario's YAML file, or the name of an arm or the path of its YAML file.
+        settings: Settings "key=value" in YAML. A dot separates a group from its key: "controller.mode=gravity".
 
     Raises:
-        ScenarioError: the file cannot be read, has an unknown key, or asks for what makes no sense.
+        ScenarioError: The file cannot be read, has an unknown key, or has an invalid value.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -259,7 +268,7 @@ def load_scenario(arm_or_file: str, settings: Sequence[str] = ()) -> Scenario:
 
 
 def _load_gains_of(content: dict[str, Any]) -> None:
-    """Puts what is in a file of gains in the place of its name."""
+    """Replaces the name of a gains file by the contents of the file."""
     controller = content.get("controller")
     if isinstance(controller, dict) and isinstance(controller.get("gains"), str):
         controller["gains"] = dataclasses.asdict(load_gains(controller["gains"]))

@@ -1,4 +1,4 @@
-"""Simulation of an arm under control, with a recording of it; and samples of any simulation."""
+"""Simulation of a controlled arm with a recording, and sampling of simulations in general."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class Simulation:
     """Result of `simulate`.
 
     Attributes:
-        recording: t, q, qd, tau (m, n) as the arm measures them: exact without `simulated_effects`, but for the scenario's noise
-            on tau.
-        state_true: (m, 2n) q, then v as they are.
-        hand: (m, 6) torque [N m], then force [N] of the hand on the arm at the frame that it holds, in the base; zeros
-            without one.
-        desired: (m, n) where the arm was wanted; None but in "hold" mode.
+        recording: Measured t (m,) and q, qd, tau (m, n). Without `simulated_effects` they are exact, except for the
+            scenario's noise on tau.
+        state_true: True state (m, 2n): q, then v.
+        hand: Torque [N m], then force [N] (m, 6) of the hand on the arm at the grasped frame, expressed in the base
+            frame. Zero without a hand.
+        desired: Desired positions (m, n), or None in modes other than "hold".
     """
 
     recording: Recording
@@ -50,7 +50,7 @@ class Simulation:
 
     @property
     def time(self) -> NDArray[np.float64]:
-        """(m,) of the recording's samples [s]."""
+        """Times (m,) of the recording's samples [s]."""
         assert self.recording.t is not None
         return self.recording.t
 
@@ -68,31 +68,33 @@ def simulate(
     meshcat: Meshcat | None = None,
     progress: Progress | None = None,
 ) -> Simulation:
-    """Simulates an arm under control and records it; the same arguments give the same numbers, bit for bit.
+    """Simulates a controlled arm and records it. The same arguments give the same numbers, bit for bit.
 
-    Between two poses the arm is led along a cubic in time, straight in joint space, so it stays inside linear limits.
+    The desired motion between two poses is a cubic in time along a straight line in joint space. It therefore stays
+    inside linear limits.
 
     Args:
-        what: an arm that holds a pose or moves to `targets`; or a scenario, which states all of the following itself.
-        controller: model of a `GravityPidController`, by default what the arm's SDF states; or a System with an input
+        what: Arm that holds a pose or moves to `targets`, or a scenario. A scenario defines all settings below itself.
+        controller: Model for a `GravityPidController`, by default that of the arm's SDF; or a System with an input
             port `state_estimated` (2n) and an output port `effort` (n), e.g. a `GravityPidController`. It moves to
-            `targets` only if it has an input port `desired_state` (2n). A System can be used once.
-        effects: whether the simulated arm has the effects of a real one, friction, cables, stops, encoders and motors;
-            or the names of those that it has. Default: True.
-        duration: of the simulation [s]. Default: 5.
-        start: (n,) pose at the start, at rest [rad, m]. Default: zero, or the nearest pose inside the limits.
-        targets: times [s] and poses (n,) [rad, m] at which the arm shall be at rest.
-        sample_period: of the recording [s]. Default: 0.01.
-        seed: of the effects' noise. Default: 0.
-        meshcat: draws the arm there, in real time, and has the recording at the end.
-        progress: called with the step, "simulating", and its finished share 0..1.
+            `targets` only if it has an input port `desired_state` (2n). A System can be used only once.
+        effects: Whether the simulated arm has the effects of a real one (friction, cables, stops, encoders and motors),
+            or the names of the effects that it has. Default: True.
+        duration: Duration of the simulation [s]. Default: 5.
+        start: Start pose (n,), at rest [rad, m]. Default: zero, or the nearest pose inside the limits.
+        targets: Times [s] and poses (n,) [rad, m] of desired rest.
+        sample_period: Sample period of the recording [s]. Default: 0.01.
+        seed: Seed of the effects' noise. Default: 0.
+        meshcat: Meshcat that shows the arm in real time, and the recorded animation at the end.
+        progress: Function called with the step, "simulating", and its finished share 0..1.
 
     Returns:
-        Times, positions, velocities and efforts as measured in `recording`, the true state as `state_true`.
+        Measured times, positions, velocities and efforts in `recording`, and the true state in `state_true`.
 
     Raises:
-        ScenarioError: what cannot be simulated, e.g. a pose outside the limits, or an argument beside a scenario.
-        ArmError: an effect that does not exist.
+        ScenarioError: The simulation is not possible, e.g. because of a pose outside the limits or because an argument
+            was given together with a scenario.
+        ArmError: An effect does not exist.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -130,7 +132,7 @@ def simulate(
 def _simulate(
     scenario: Scenario, system: System | None, meshcat: Meshcat | None, progress: Progress | None
 ) -> Simulation:
-    """Simulates a scenario, with `system` instead of the controller that it states."""
+    """Simulates a scenario, with `system` instead of the scenario's controller if it is given."""
     report = step_progress(progress, "simulating")
     scenario.check()
     arm = scenario.mounted_arm
@@ -178,31 +180,31 @@ def _simulate(
 
 
 def sample_times(duration: float, period: float) -> NDArray[np.float64]:
-    """(m,) 0, period, ... up to `duration` [s], where a `LogVectorOutput` of this period has its samples."""
-    # Multiples, not sums: where rounding tells the time from that of a step, the step would count or not by chance.
+    """Returns the sample times (m,) 0, period, ... up to `duration` [s] of a `LogVectorOutput` with this period."""
+    # Use multiples, not sums. Accumulated rounding errors could shift a sample before or after a time step.
     return period * np.arange(1 + int(duration / period + 1e-9), dtype=np.float64)
 
 
 def advance(
     simulator: Simulator, times: NDArray[np.float64], progress: Callable[[float], object] = lambda share: None
 ) -> None:
-    """Advances a simulation to each of `times` (m,) [s]; `progress` is called with the finished share of the last."""
+    """Advances a simulation to each of `times` (m,) [s] and calls `progress` with the finished share of the total."""
     for t in times:
         if t > 0:
             simulator.AdvanceTo(t)
-        else:  # AdvanceTo(0) would make the plant's first step already
+        else:  # AdvanceTo(0) would already perform the first step of the plant
             simulator.Initialize()
         progress(t / times[-1])
 
 
 def samples(log: VectorLogSink, simulator: Simulator) -> NDArray[np.float64]:
-    """What a `LogVectorOutput` has of a simulation, a row per sample."""
+    """Returns the data of a `LogVectorOutput`, one row per sample."""
     return np.array(log.FindLog(simulator.get_context()).data().T)
 
 
 @contextmanager
 def recorded_in(meshcat: Meshcat | None, **options: Any) -> Iterator[None]:
-    """Records the animation of what is simulated in the block, with `options` of StartRecording; None: does nothing."""
+    """Records an animation of the simulation in the block with `options` of StartRecording, unless Meshcat is None."""
     if meshcat is not None:
         meshcat.StartRecording(**options)
     yield
@@ -214,7 +216,7 @@ def recorded_in(meshcat: Meshcat | None, **options: Any) -> Iterator[None]:
 def scenario_of_arm(
     arm: Arm, effects: bool | Sequence[str], start: ArrayLike | None, targets: Sequence[tuple[float, ArrayLike]]
 ) -> Scenario:
-    """Returns the scenario of `simulate` for an arm; arguments as there."""
+    """Returns the scenario of `simulate` for an arm; the arguments are those of `simulate`."""
     if isinstance(effects, bool):
         effects = ["all"] if effects else []
     return Scenario(
@@ -227,7 +229,7 @@ def scenario_of_arm(
 
 
 def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration: float) -> PiecewisePolynomial:
-    """At rest at each pose at its time, and at the last one until the end."""
+    """Returns a trajectory that rests at each pose at its time, and at the last pose until the end."""
     times, poses = np.append(times, max(duration, times[-1]) + 1.0), np.vstack([poses, poses[-1:]])
     return PiecewisePolynomial.CubicHermite(times, poses.T, np.zeros_like(poses.T))
 

@@ -1,4 +1,4 @@
-"""How much an operator feels of an arm: force and torque at the handle while a hand leads it along a path."""
+"""Transparency: interaction force and torque at the handle when an operator moves an arm along a path."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hand import Grip, Hand, PoseTrajectorySource
 
-#: Of what is recorded [s].
+#: Sample period of the recorded signals [s].
 SAMPLE_PERIOD = 5e-3
-#: Until the hand has taken hold of the arm; what it feels before does not count [s].
+#: Initial transient of the grasp, which is excluded from the evaluation [s].
 GRASP_TIME = 1.0
-#: A motion that leaves the limits further is not this arm's [rad, m].
+#: Maximum excess over the joint limits; a motion with a larger excess was not recorded on this arm [rad, m].
 MAX_LIMIT_EXCESS = 0.1
 
 
 @dataclass(frozen=True)
 class Compensation:
-    """What the motors do: nothing, or carry the arm's weight as `model` says, and maybe a share of its friction.
+    """Compensation by the motors: none, gravity, or gravity and a share of the friction.
 
     Attributes:
-        name: in tables and plots.
-        model: whose gravity torque; None for limp motors.
-        friction_ratio: share of the friction, as `safe_ratios` allows.
-        friction: which; that of the arm's files by default.
+        name: Name in tables and plots.
+        model: Model of the gravity torque, or None for unpowered motors.
+        friction_ratio: Compensated share of the friction, within `safe_ratios`.
+        friction: Friction model, by default that of the arm's files.
     """
 
     name: str
@@ -56,10 +56,10 @@ class OperatorForces:
     """Interaction force and torque between the hand of an operator and the handle along a path.
 
     Attributes:
-        name: of the compensation.
-        time: (m,) [s].
-        torque, force: (m, 3) of the hand on the arm at the handle, in the base frame [N m], [N].
-        deviation: (m,) of the handle from where the hand wanted it [m].
+        name: Name of the compensation.
+        time: Times (m,) [s].
+        torque, force: Torque and force (m, 3) of the hand on the arm at the handle, in the base frame [N m], [N].
+        deviation: Distance (m,) of the handle from its desired position [m].
     """
 
     name: str
@@ -70,16 +70,16 @@ class OperatorForces:
 
     @property
     def rms_force(self) -> float:
-        """[N] once the hand has taken hold."""
+        """RMS force after the initial transient of the grasp [N]."""
         return _rms(self.force[self.time >= GRASP_TIME])
 
     @property
     def rms_torque(self) -> float:
-        """[N m] once the hand has taken hold."""
+        """RMS torque after the initial transient of the grasp [N m]."""
         return _rms(self.torque[self.time >= GRASP_TIME])
 
     def peak(self) -> tuple[float, float]:
-        """The force [N] and torque [N m] that are exceeded in a twentieth of the time."""
+        """Returns the 95th percentiles of force [N] and torque [N m]."""
         late = self.time >= GRASP_TIME
         norms = (np.linalg.norm(x[late], axis=1) for x in (self.force, self.torque))
         force, torque = (float(np.percentile(norm, 95)) for norm in norms)
@@ -87,7 +87,7 @@ class OperatorForces:
 
 
 def random_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int = 0) -> PiecewisePolynomial:
-    """A smooth motion of the joints through random poses, as slow as a hand, for lack of a recorded one."""
+    """Makes a smooth joint motion through random poses at the speed of a hand; substitutes a recorded motion."""
     q = arm.sample_poses(poses, np.random.default_rng(seed), margin=0.25)
     times = seconds_each * np.arange(poses, dtype=float)
     return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
@@ -96,11 +96,12 @@ def random_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int =
 
 
 def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> PiecewisePolynomial:
-    """The motion of a recording, inside the arm's limits, `speed` times as fast.
+    """Returns the motion of a recording, clipped to the arm's limits and accelerated by the factor `speed`.
 
     Raises:
-        ScenarioError: no times, no positive speed, or a motion that leaves the limits by more than 0.1 rad or m.
-        RecordingError: another number of joints.
+        ScenarioError: The recording has no times, the speed is not positive, or the motion exceeds the limits by more
+            than 0.1 rad or m.
+        RecordingError: The recording has another number of joints.
     """
     recording = recording.in_joint_coordinates(arm)
     if recording.t is None:
@@ -134,17 +135,17 @@ def simulate_operator(
     seed: int = 0,
     progress: Callable[[float], object] = lambda share: None,
 ) -> OperatorForces:
-    """Lets a hand lead the handle of a simulated arm along the way that `path` takes it.
+    """Simulates an operator who moves the handle of an arm along a path.
 
     Args:
-        arm: which.
-        path: of its joints [rad, m] over time, from 0 [s]; the hand leads the pose of the handle that it means.
-        compensation: what the motors do.
-        effects: of the real arm that the simulation has, e.g. `arm.effects`; none by default.
-        grip: of the hand.
-        frame_name: of the handle; by default `handle_frame`.
-        seed: of the effects' noise.
-        progress: called with the finished share, 0..1.
+        arm: Arm to simulate.
+        path: Joint positions [rad, m] over time from 0 [s]. The hand follows the handle pose of these positions.
+        compensation: Compensation by the motors.
+        effects: Simulated effects of the real arm, e.g. `arm.effects`. Default: none.
+        grip: Grip of the hand.
+        frame_name: Frame of the handle, by default `handle_frame`.
+        seed: Seed of the effects' noise.
+        progress: Function called with the finished share, 0..1.
     """
     name, frame = arm.name.lower(), ArmFrame(arm, frame_name := frame_name or handle_frame(arm))
     knots = np.arange(path.start_time(), path.end_time(), 0.02)

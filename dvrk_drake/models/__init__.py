@@ -1,1 +1,1 @@
-"""Description of an arm: SDF, YAML schemas, plant, limits, loop closures, and the layout of its LCM messages."""
+"""Models of arms: SDF files, YAML schemas, Drake plant, limits, loop closures and LCM message layout."""

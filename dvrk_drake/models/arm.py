@@ -1,4 +1,4 @@
-"""What an arm is: its joints, limits, linkage and transmission, read from its YAML and SDF."""
+"""Defines `Arm`: joints, limits, linkage and transmission of an arm, read from its YAML and SDF files."""
 
 from __future__ import annotations
 
@@ -35,13 +35,14 @@ from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, co
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 _ARMS = MODELS_FOLDER / "arms"
-#: Length of the gravity vector, at most [m/s^2].
+#: Maximum length of the gravity vector [m/s^2].
 MAX_GRAVITY = 30.0
-#: A gain is too large if this position error [rad, m] demands the whole effort limit of the joint: kp at once, kd if
-#: the error arises within 0.1 s, ki if it lasts for 0.1 s.
+#: Position errors [rad, m] that define the maximum gains. A gain is too large if this error demands the whole effort
+#: limit of the joint: for kp immediately, for kd if the error arises within 0.1 s, for ki if it lasts for 0.1 s.
 _MIN_ERROR = (1e-4, 1e-5)
-#: A gain is too small if an error of the whole range of the joint demands less than this share of its effort limit: kp
-#: at once, kd if the error arises within 1 s, ki if it lasts for 1 s.
+#: Shares of the effort limit that define the minimum gains. A gain is too small if an error as large as the range of
+#: the joint demands less than this share: for kp immediately, for kd if the error arises within 1 s, for ki if it lasts
+#: for 1 s.
 _MIN_SHARE = {"kp": 1e-2, "kd": 1e-4, "ki": 1e-4}
 
 Part = TypeVar("Part", Mechanism, Instrument)
@@ -49,27 +50,31 @@ Part = TypeVar("Part", Mechanism, Instrument)
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """One arm of a dVRK. Vectors of n independent joints, in the dVRK's order; rad and N m, m and N if prismatic.
+    """One arm of a dVRK.
+
+    Vectors have n elements, one per independent joint, in the dVRK's order. Units are rad and N m for revolute joints,
+    m and N for prismatic joints.
 
     Attributes:
-        name: as the dVRK names it, e.g. "MTML".
-        source: what `load_arm` loads it by: "mtml", or the absolute path of its YAML file.
-        joint_names: the n independent joints.
-        tree_joint_names: the joints of the SDF tree, linkage included.
-        sdf: package URLs or paths of the model files: the arm's, then its instrument's if it has one.
-        mirrored_links: URL of `sdf` -> its links that this arm has as mirror images.
-        position_lower, position_upper: (n,) limits of this arm.
-        effort_limits: (n,) limits of the joint torques, from the SDF.
-        prismatic: (n,) True for a joint that slides [m, N], False for one that turns [rad, N m].
-        coupled_limits: limits of sums of joint positions.
-        linkage: q_tree = G q + c, from the SDF's `drake:mimic` tags.
-        transmission: a = J q, actuator from joint positions.
-        loop_closures: frames that must coincide.
-        gravity: (3,) gravity vector in the base frame [m/s^2].
-        gains: default gains of the controller.
-        friction_coordinates: name -> (n,) coefficients of the joints: where parts rub beside joints and actuators.
-        identification: settings for recordings of the arm, and bounds of its links.
-        effects: what the real arm has beside all that; only a simulation that asks for them has them.
+        name: Name of the arm in the dVRK, e.g. "MTML".
+        source: Argument with which `load_arm` loads the arm: "mtml", or the absolute path of its YAML file.
+        joint_names: Names of the n independent joints.
+        tree_joint_names: Names of all joints of the SDF tree, including the linkage.
+        sdf: Package URLs or paths of the model files: the arm, then its instrument if it has one.
+        mirrored_links: Mapping from a URL in `sdf` to the links of that file that are mirrored for this arm.
+        position_lower, position_upper: Position limits (n,) of this arm.
+        effort_limits: Limits (n,) of the joint torques, from the SDF.
+        prismatic: Array (n,), True for prismatic joints [m, N], False for revolute joints [rad, N m].
+        coupled_limits: Limits of sums of joint positions.
+        linkage: Map q_tree = G q + c, from the `drake:mimic` tags of the SDF.
+        transmission: Map a = J q from joint positions q to actuator positions a.
+        loop_closures: Pairs of frames whose origins must coincide.
+        gravity: Gravity vector (3,) in the base frame [m/s^2].
+        gains: Default gains of the controller.
+        friction_coordinates: Mapping from a name to the joint coefficients (n,) of an additional friction coordinate,
+            for friction that acts neither at a joint nor at an actuator.
+        identification: Settings for recordings of the arm, and bounds of its links.
+        effects: Friction, cable and sensor effects of the real arm. A simulation includes them only on request.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -109,21 +114,22 @@ class Arm:
         return f"<Arm {self.name}: {self.source}>"
 
     def check(self) -> None:
-        """Checks all numbers: finite, in the range of their field, in order, one per joint.
+        """Checks that all numbers are finite, within the range of their field, in order, and one per joint.
 
-        Arrays and gains can be changed afterwards, so the command guard and the controller check again.
+        Arrays and gains can be modified after loading, so the command guard and the controller repeat this check.
 
         Raises:
-            ArmError: names the first number that is refused, and what is allowed.
+            ArmError: A number is not accepted. The message names the first such number and the accepted values.
         """
         if fault := next(filter(None, self._faults()), ""):
             raise ArmError(fault)
 
     def gains_fault(self, gains: Gains) -> str:
-        """The first gain that is not for this arm, with what is allowed; or "".
+        """Returns a message on the first gain that is not accepted for this arm and the accepted values, or "".
 
-        A gain must be large enough to move its joint, and so small that the resolution of the position measurement does
-        not demand the whole effort limit, see `_MIN_SHARE` and `_MIN_ERROR`.
+        A gain must be large enough to move its joint. It must be so small that the resolution of the position
+        measurement
+        does not demand the whole effort limit. See `_MIN_SHARE` and `_MIN_ERROR`.
         """
         if fault := _count_fault("gains.", vars(gains), self.joint_names):
             return fault
@@ -164,15 +170,15 @@ class Arm:
         return len(self.joint_names)
 
     def per_joint(self, revolute: float, prismatic: float) -> NDArray[np.float64]:
-        """(n,) one number [rad, rad/s, ...] for the joints that turn, another [m, m/s, ...] for those that slide."""
+        """Returns an array (n,) with `revolute` [rad, rad/s, ...] or `prismatic` [m, m/s, ...] for each joint."""
         return np.where(self.prismatic, prismatic, revolute)
 
     @cached_property
     def effect_coordinates(self) -> dict[str, NDArray[np.float64]]:
-        """The coordinates that effects can act along: name -> row h (n,) with x = h a of the actuators' positions a.
+        """Coordinates along which effects can act: mapping from a name to a row h (n,).
 
-        "actuator.<name>", "joint.<name>" and the arm's own `friction_coordinates`. The actuators' efforts for an effort
-        f along x are h' f.
+        The coordinate is x = h a for actuator positions a. An effort f along x acts on the actuators as h' f. Names are
+        "actuator.<name>", "joint.<name>" and those of the arm's own `friction_coordinates`.
         """
         J_inverse = self.transmission.inverse.matrix
         rows = {f"actuator.{name}": unit for name, unit in zip(self.joint_names, np.eye(self.num_joints), strict=True)}
@@ -180,12 +186,12 @@ class Arm:
         return rows | {name: row @ J_inverse for name, row in self.friction_coordinates.items()}
 
     def encoder_counts(self) -> NDArray[np.float64]:
-        """(n,) size of one encoder count at each joint [rad, m]; 0 if the arm's effects state no encoder."""
+        """Size (n,) of one encoder count at each joint [rad, m]; 0 if the arm's effects specify no encoder."""
         resolution = self.effects.encoder.resolution if self.effects.encoder is not None else {}
         return np.abs(self.transmission.inverse.matrix) @ per_actuator(resolution, self.joint_names, 0.0)
 
     def dry_friction(self) -> NDArray[np.float64]:
-        """(n,) largest dry friction on each joint that the arm's effects state [N m, N]; 0 where they state none."""
+        """Largest dry friction (n,) on each joint, from the arm's effects [N m, N]; 0 where none is specified."""
         dry = np.zeros(self.num_joints)
         for effect in self.effects.friction:
             if effect.kind != "viscous":
@@ -194,7 +200,7 @@ class Arm:
         return dry
 
     def limit_matrix(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """All limits as lower <= A q <= upper: the joint box first, then the coupled limits."""
+        """Returns all limits as lower <= A q <= upper: joint limits first, then coupled limits."""
         rows = [[limit.coefficients.get(j, 0.0) for j in self.joint_names] for limit in self.coupled_limits]
         A = np.vstack([np.eye(self.num_joints), np.array(rows).reshape(-1, self.num_joints)])
         lower = np.concatenate([self.position_lower, [limit.lower for limit in self.coupled_limits]])
@@ -202,7 +208,10 @@ class Arm:
         return A, lower, upper
 
     def limit_violations(self, q: ArrayLike, tolerance: float = 0.0) -> list[str]:
-        """Readable violations of the limits by one pose q (n,) beyond `tolerance` [rad or m]; empty if none."""
+        """Returns messages on the limits that a pose q (n,) violates by more than `tolerance` [rad or m].
+
+        The list is empty if the pose is within all limits.
+        """
         A, lower, upper = self.limit_matrix()
         names = [*self.joint_names, *(limit.name for limit in self.coupled_limits)]
         value = A @ np.asarray(q, float)
@@ -210,15 +219,15 @@ class Arm:
         return [f"{names[i]} = {value[i]:.4g} is outside {lower[i]:.4g}..{upper[i]:.4g}" for i in bad]
 
     def sample_poses(self, count: int, generator: np.random.Generator, margin: float = 0.0) -> NDArray[np.float64]:
-        """`count` random poses (count, n), uniform in the joint box and inside the coupled limits.
+        """Returns `count` random poses (count, n), uniform within the joint limits and inside the coupled limits.
 
         Args:
-            count: number of poses.
-            generator: source of randomness.
-            margin: fraction of each range that is kept free at both of its ends, 0..0.5.
+            count: Number of poses.
+            generator: Random number generator.
+            margin: Fraction of each joint range that is excluded at both ends, 0..0.5.
 
         Raises:
-            ArmError: hardly any pose of the joint box meets the coupled limits.
+            ArmError: Almost no pose within the joint limits meets the coupled limits.
         """
         A, lower, upper = self.limit_matrix()
         inset = margin * (upper - lower)
@@ -236,17 +245,17 @@ class Arm:
         return poses[:count]
 
     def with_gravity(self, gravity: Sequence[float]) -> Arm:
-        """The same arm mounted so that gravity is `gravity` (3,) [m/s^2] in its base frame.
+        """Returns the same arm, mounted so that `gravity` (3,) [m/s^2] is the gravity vector in its base frame.
 
         Raises:
-            ArmError: not three numbers of a size up to 30 m/s^2.
+            ArmError: `gravity` is not three numbers, or its length exceeds 30 m/s^2.
         """
         return _mounted(self, tuple(_checked_gravity(gravity).tolist()))
 
 
 @cache
 def _mounted(arm: Arm, gravity: tuple[float, ...]) -> Arm:
-    """One Arm object a mounting, so that what is derived and compiled of it is so once."""
+    """Returns one shared Arm object per mounting, so that derived and compiled data are created only once."""
     if np.allclose(arm.gravity, gravity, rtol=0, atol=1e-12):
         return arm
     return dataclasses.replace(arm, gravity=np.array(gravity))
@@ -261,21 +270,21 @@ def _count_fault(key: str, values: Mapping[str, Sequence[float] | NDArray], join
 
 
 def known_arms() -> list[str]:
-    """Names that `load_arm` accepts."""
+    """Returns the names that `load_arm` accepts."""
     return sorted(path.stem for path in _ARMS.glob("*.yaml"))
 
 
 def load_arm(name: str | Path) -> Arm:
-    """Loads an arm. The same file gives the same Arm object until that file changes.
+    """Loads an arm. Repeated calls return the same Arm object until the file changes.
 
-    A change of the files that it names (mechanism, instrument, SDF) needs a new process.
+    Changes of the files that it refers to (mechanism, instrument, SDF) require a new process.
 
     Args:
-        name: of an arm of this package, e.g. "mtml" (case does not matter), or the path or package URL of an arm's YAML
+        name: Name of an arm of this package, e.g. "mtml" (not case-sensitive), or path or package URL of an arm's YAML
             file.
 
     Raises:
-        ArmError: no such arm, or its files contradict each other.
+        ArmError: The arm does not exist, or its files contradict each other.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -290,10 +299,10 @@ def load_arm(name: str | Path) -> Arm:
     if not name.endswith((".yaml", ".yml")):
         return _load_arm(name.lower())
     path = Path(os.path.realpath(local_path(name)))
-    # One Arm object an arm, whatever it is loaded by.
+    # Names and paths of the same arm give the same Arm object.
     if path.parent == _ARMS.resolve():
         return _load_arm(path.stem)
-    with suppress(OSError):  # of a file that does not exist `_load_arm` says so
+    with suppress(OSError):  # _load_arm reports a missing file
         status = path.stat()
         return _load_arm(str(path), (status.st_mtime_ns, status.st_size))
     return _load_arm(str(path))
@@ -301,7 +310,7 @@ def load_arm(name: str | Path) -> Arm:
 
 @cache
 def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
-    """Loads an arm by name or absolute path; `state` is that of its file."""
+    """Loads an arm by name or absolute path; `state` identifies the version of its file in the cache."""
     path = Path(name)
     if not path.is_absolute():
         if name not in known_arms():
@@ -316,7 +325,7 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
     try:
         arm = _build_arm(name, path, description, mechanism, instrument)
         if path.parent.parent != MODELS_FOLDER:
-            from dvrk_drake.models.plant import check_plant  # which imports this module
+            from dvrk_drake.models.plant import check_plant  # circular import
 
             check_plant(arm)
     except ArmError as error:
@@ -397,7 +406,7 @@ def _build_arm(
 
 
 def _identification_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -> IdentificationSettings:
-    """The mechanism's with the instrument's appended; what one of them does not state is 20 Hz and no delay."""
+    """Returns the settings of the mechanism, extended by those of the instrument. Defaults are 20 Hz and no delay."""
     both: dict[str, list[float]] = {}
     for which, default in (("acceleration_cut_off", 20.0), ("effort_delay", 0.0)):
         both[which] = []
@@ -455,7 +464,7 @@ def _effort_limits(path: Path, joints: list[str], facts: SdfFacts) -> NDArray[np
 
 
 def _transmission(path: Path, joints: list[str], mechanism: Mechanism, instrument: Instrument) -> NDArray[np.float64]:
-    """J with a = J q: the mechanism's rows, and the inverse of the instrument's coupling."""
+    """Returns J with a = J q from the rows of the mechanism and the inverse of the instrument's coupling."""
     J: NDArray[np.float64] = np.eye(len(joints))
     for joint, terms in instrument.joint_from_actuator.items():
         J[_index(path, "joint_from_actuator", joint, joints)] = _row(

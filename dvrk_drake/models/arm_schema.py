@@ -1,4 +1,4 @@
-"""Schemas of `arms/*.yaml`, `mechanisms/*.yaml` and `instruments/*.yaml`, for yaml_load_typed: a typo is an error."""
+"""Schemas of `arms/*.yaml`, `mechanisms/*.yaml` and `instruments/*.yaml`; unknown keys are errors."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -12,27 +12,27 @@ from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.schema_fault import Range, within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
-#: Position limits of a joint; an MTM's roll turns to -8.4 rad, that of a UR10e to 6.3 rad.
+#: Accepted position limits of a joint. The roll joint of an MTM reaches -8.4 rad, the joints of a UR10e 6.3 rad.
 ANGLES, TRAVELS = Range(-12.6, 12.6, "rad"), Range(-2.0, 2.0, "m")
-#: How far apart the two limits are.
+#: Accepted differences between the upper and the lower limit.
 ANGLE_WIDTHS, TRAVEL_WIDTHS = Range(0.01, 25.2, "rad"), Range(0.001, 2.0, "m")
-#: Efforts of a joint: 0.023 N m at an MTM's roll, 330 N m at the shoulder of a UR10e.
+#: Accepted efforts of a joint: 0.023 N m at the roll joint of an MTM, 330 N m at the shoulder of a UR10e.
 EFFORTS = Range(0.001, 2000.0, "N m or N")
-#: Positions of which the joint's kind is not known yet: the arm checks them with `ANGLES` or `TRAVELS`.
+#: Accepted positions if the joint type is not known yet. `Arm` checks them with `ANGLES` or `TRAVELS`.
 _POSITIONS = within(-1e4, 1e4, "rad or m")
-#: Of one joint or actuator in the position of another: 0.6..1.6 on a dVRK, 32..48 with the gears of a TX40.
+#: Accepted coefficients that relate joint and actuator positions: 0.6..1.6 on a dVRK, 32..48 with the gears of a TX40.
 COUPLINGS = within(0.001, 1000.0, also=(0.0,), either_sign=True)
-#: No position, speed or effort of an arm has this size, in whatever unit it may be by mistake [rad, m, rad/s, m/s, N m,
-#: N]; and products of smaller numbers with gains stay finite. Inputs and recordings beyond it are refused.
+#: Positions, velocities and efforts of this size or larger are refused [rad, m, rad/s, m/s, N m, N]. No arm reaches
+#: them in any unit, and products of smaller numbers with gains stay finite. The limit applies to inputs and recordings.
 IMPLAUSIBLE = 1e6
-#: 9.81 m/s^2 in any direction; `Arm` checks the length of the vector.
+#: Accepted components of the gravity vector, for 9.81 m/s^2 in any direction. `Arm` checks the length of the vector.
 GRAVITIES = within(-30.0, 30.0, "m/s^2")
 _CUT_OFFS = within(0.1, 1000.0, "Hz")
 
 
 @dataclass
 class CoupledLimit:
-    """lower <= sum of coefficient * joint position <= upper; `name` is what messages call it."""
+    """Limit lower <= sum of coefficient * joint position <= upper; `name` is used in messages."""
 
     name: str = ""
     coefficients: dict[str, float] = field(default_factory=dict, metadata=COUPLINGS)
@@ -42,7 +42,7 @@ class CoupledLimit:
 
 @dataclass
 class LoopClosure:
-    """Two frames of the SDF whose origins coincide at every pose that the linkage allows."""
+    """Two SDF frames whose origins coincide at every pose that the linkage permits."""
 
     frame_a: str = ""
     frame_b: str = ""
@@ -50,9 +50,9 @@ class LoopClosure:
 
 @dataclass
 class Gains:
-    """Diagonal PID gains per joint: kp [N m/rad], kd [N m s/rad], ki [N m/(rad s)]; N and m on a prismatic joint.
+    """Diagonal PID gains per joint: kp [N m/rad], kd [N m s/rad], ki [N m/(rad s)]; N and m for a prismatic joint.
 
-    The ranges here are of any arm; `Arm.gains_fault` has those of one arm.
+    The ranges here apply to all arms. `Arm.gains_fault` checks the ranges of one arm.
     """
 
     kp: list[float] = field(default_factory=list, metadata=within(1e-5, 1e7, "N m/rad or N/m"))
@@ -62,14 +62,16 @@ class Gains:
 
 @dataclass
 class MotionSettings:
-    """How the signals of a recorded motion are treated; per joint, in the order of the joints that the file has.
+    """Settings for processing a recorded motion; lists are in the order of the joints of the file.
 
-    `acceleration_cut_off` [Hz] of the low-pass for accelerations, `effort_delay` [s] by which the recorded effort is
-    later than the positions (negative: earlier). `known_effects` are what drives have beside friction: name of a
-    coordinate of the drive (`Arm.effect_coordinates`) -> "spring", "cable 1" (sine and cosine of one period a turn),
-    "cable 2" (of two), "asymmetric friction". Of a mechanism also `base_may_tilt`, whether the direction of gravity is
-    estimated from a motion, and `presliding_travels`, over which elasto-plastic elements give way, as shares of a
-    coordinate's standard deviation of position.
+    `acceleration_cut_off` is the cut-off frequency of the low-pass filter for accelerations [Hz]. `effort_delay` is the
+    delay of recorded efforts relative to the positions [s]; it is negative if efforts are early. `known_effects` maps
+    a drive coordinate (`Arm.effect_coordinates`) to its known effects besides friction: "spring", "cable 1" (sine and
+    cosine with one period per revolution), "cable 2" (two periods) and "asymmetric friction". A mechanism additionally
+    has two settings. `base_may_tilt` selects whether the direction of gravity is estimated from a motion.
+    `presliding_travels` are the breakaway displacements of elasto-plastic friction elements, as multiples of the
+    standard
+    deviation of the coordinate's position.
     """
 
     acceleration_cut_off: list[float] = field(default_factory=list, metadata=_CUT_OFFS)
@@ -83,7 +85,7 @@ class MotionSettings:
 
 @dataclass
 class BoxCorners:
-    """A box along the axes of a link's frame: its lower and upper corner [m]."""
+    """Box aligned with the axes of a link's frame: its lower and upper corner [m]."""
 
     lower: list[float] = field(default_factory=list, metadata=within(-5.0, 5.0, "m"))
     upper: list[float] = field(default_factory=list, metadata=within(-5.0, 5.0, "m"))
@@ -91,10 +93,11 @@ class BoxCorners:
 
 @dataclass
 class BoundingShapes:
-    """Where the mass of the links of one SDF file can be: in the box around a link's collision shapes, widened.
+    """Bounds of the mass distribution of the links of one SDF file: the box around a link's collision shapes, widened.
 
-    `margin` [m] on all sides is for what is not drawn: covers, screws, cables. `boxes` are those of links whose shapes
-    are not where their mass is, or that have none; no margin is added to them.
+    `margin` [m] is added on all sides for parts that are not drawn, such as covers, screws and cables. `boxes` replace
+    the collision shapes of links that have none, or whose shapes do not represent their mass. No margin is added to
+    `boxes`.
     """
 
     margin: float = field(default=0.04, metadata=within(0.0, 1.0, "m"))
@@ -106,8 +109,8 @@ class IdentificationSettings(MotionSettings):
     """Settings for recordings of an arm, and bounds of its links.
 
     Attributes:
-        effort_cut_off: of the low-pass behind which measured and modelled efforts are compared [Hz].
-        bounding_shapes: where the mass of the links of each of the arm's SDF files can be, see `bounding_boxes`.
+        effort_cut_off: Cut-off frequency of the low-pass filter for measured and modelled efforts [Hz].
+        bounding_shapes: Bounds of the mass distribution of the links, per SDF file of the arm; see `bounding_boxes`.
     """
 
     effort_cut_off: float = field(metadata=_CUT_OFFS)
@@ -116,10 +119,11 @@ class IdentificationSettings(MotionSettings):
 
 @dataclass
 class Mechanism:
-    """Schema of `mechanisms/*.yaml`: what all arms of one kind have in common.
+    """Schema of `mechanisms/*.yaml`: properties that all arms of one type share.
 
-    `effort_cut_off` [Hz] is that of the low-pass behind which measured and modelled efforts are compared. `effects` are
-    what a real arm has beside all that, for its simulation.
+    `effort_cut_off` is the cut-off frequency of the low-pass filter for measured and modelled efforts [Hz]. `effects`
+    are
+    the friction, cable and sensor effects of the real arm, for its simulation.
     """
 
     sdf: str = ""
@@ -136,10 +140,10 @@ class Mechanism:
 
 @dataclass
 class Instrument:
-    """Schema of `instruments/*.yaml`: what hangs on an arm and can be swapped; its joints follow the arm's.
+    """Schema of `instruments/*.yaml`: an exchangeable instrument, whose joints follow those of the arm.
 
-    `joint_from_actuator` is the disc coupling as the dVRK states it: joint = sum of coefficient * actuator.
-    `friction_coordinates` are where parts rub on each other beside the joints and the actuators: name -> sum of
+    `joint_from_actuator` is the disc coupling as defined by the dVRK: joint = sum of coefficient * actuator.
+    `friction_coordinates` are additional coordinates of friction besides joints and actuators: name -> sum of
     coefficient * joint.
     """
 
@@ -158,11 +162,11 @@ class Instrument:
 class ArmDescription:
     """Schema of `arms/*.yaml`.
 
-    `mechanism` and `instrument` are names of files in their folders, or paths of YAML files from the arm's own folder;
-    the `sdf` of such a file is a path from the folder that it is in. `gravity` is the gravity vector [m/s^2] in the
-    arm's base frame. `mirrored_links` names, by SDF file, links of which this arm has the mirror image (x to -x in the
-    link's frame); another SDF, such as one that was exported of this arm, is taken as it is. `coupled_limits` replaces
-    [lower, upper] of the mechanism's coupled limits by name, for an arm whose stops were calibrated.
+    `mechanism` and `instrument` are names of files in their folders, or paths of YAML files relative to the arm's own
+    folder. `sdf` in such a file is a path relative to the folder of that file. `gravity` is the gravity vector in the
+    arm's base frame [m/s^2]. `mirrored_links` lists, per SDF file, the links that are mirrored for this arm (x to -x in
+    the link's frame). Any other SDF, such as one exported from this arm, is used unchanged. `coupled_limits` replaces
+    [lower, upper] of the mechanism's coupled limits by name, for an arm with calibrated joint stops.
     """
 
     name: str = ""
@@ -175,10 +179,10 @@ class ArmDescription:
 
 
 def load_gains(path: str | Path) -> Gains:
-    """Reads kp, kd and ki, one number a joint each; whether they fit an arm is the controller's to say.
+    """Reads kp, kd and ki with one number per joint. The controller checks whether they are valid for an arm.
 
     Raises:
-        ControllerError: no such file, not one of gains, or a gain outside the range of `Gains`.
+        ControllerError: The file does not exist, is not a file of gains, or has a gain outside the range of `Gains`.
     """
     gains = load_typed_yaml(Gains, path, ControllerError, "a file of gains")
     for name, values in dataclasses.asdict(gains).items():
@@ -188,10 +192,10 @@ def load_gains(path: str | Path) -> Gains:
 
 
 def save_gains(gains: Gains, path: str | Path, remark: str) -> None:
-    """Writes a file of gains with a remark of one line at its top.
+    """Writes a file of gains that begins with a remark of one line.
 
     Raises:
-        DvrkDrakeError: it cannot be written.
+        DvrkDrakeError: The file cannot be written.
     """
     with atomic_write(path) as stream:
         stream.write(f"# {remark}\n# N m/rad, N m s/rad, N m/(rad s); N and m on a joint that slides.\n")

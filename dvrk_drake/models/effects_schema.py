@@ -1,6 +1,6 @@
-"""Schema of `effects:` in an arm's YAML files: what a real arm has beside links, joints and a linkage.
+"""Schema of `effects:` in an arm's YAML files: friction, cables, stops and sensors of the real arm.
 
-No postponed annotations here: yaml_load_typed reads the types at run time.
+Postponed annotations are not used here because yaml_load_typed reads the types at run time.
 """
 
 import dataclasses
@@ -14,20 +14,21 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.schema_fault import formerly, number_fault, within
 
-#: Steps and noise of efforts: one bit of a dVRK's wrist motor is 1e-5 N m.
+#: Accepted quantization steps and noise of efforts. One bit of a dVRK wrist motor is 1e-5 N m.
 _EFFORT_STEPS = within(1e-9, 100.0, "N m or N")
 
 
 @dataclass
 class DriveEffect:
-    """One effect along a coordinate of the drive: what an arm's file states, and what an identification finds.
+    """One effect along a coordinate of the drive, specified in an arm's file or identified.
 
     Attributes:
         coordinate: "actuator.<name>", "joint.<name>", or one of the arm's `friction_coordinates`.
-        kind: see `dvrk_drake.dynamics.actuator_effects.EFFECT_KINDS`.
-        scale: of the kind: width of the smoothed sign [rad/s, m/s], travel until it slips [rad, m], periods in a turn.
-        coefficient: [N m; N m s/rad, ...; N and m of a coordinate that slides].
-        standard_error: of the coefficient, in its unit; 0 where it was not identified.
+        kind: Kind of effect, see `dvrk_drake.dynamics.actuator_effects.EFFECT_KINDS`.
+        scale: Shape parameter of the kind: width of the smoothed sign function [rad/s, m/s], breakaway displacement
+            [rad, m], or periods per revolution.
+        coefficient: Size of the effect [N m; N m s/rad, ...; N and m for a prismatic coordinate].
+        standard_error: Standard error of the coefficient, in its unit; 0 if it was not identified.
     """
 
     coordinate: str = ""
@@ -38,17 +39,17 @@ class DriveEffect:
 
     @property
     def distinguishable(self) -> bool:
-        """Whether the size of the coefficient exceeds two standard errors."""
+        """Whether the absolute value of the coefficient exceeds two standard errors."""
         return abs(self.coefficient) > 2 * self.standard_error
 
 
 @dataclass
 class FrictionEffect(DriveEffect):
-    """One effect of friction, see `dvrk_drake.systems.arm_effects.dry_friction.add_friction`.
+    """One friction effect, see `dvrk_drake.systems.arm_effects.dry_friction.add_friction`.
 
     Attributes:
-        fall_speed: of "presliding": the speed at which it holds 1/e of what it holds at rest, Stribeck's effect
-            [rad/s, m/s]; 0: it holds the same at all speeds.
+        fall_speed: Stribeck velocity of "presliding" [rad/s, m/s], at which the friction is 1/e of its static value.
+            With 0, friction does not depend on the speed.
     """
 
     fall_speed: float = field(default=0.0, metadata=within(1e-6, 100.0, "rad/s or m/s", also=(0.0,)))
@@ -56,7 +57,10 @@ class FrictionEffect(DriveEffect):
 
 @dataclass
 class Cable:
-    """Between the motor and the joint of an actuator that turns this joint alone: [N m/rad], damping [N m s/rad]."""
+    """Elastic cable between the motor and the joint of an actuator that drives only this joint.
+
+    The stiffness is in N m/rad, the damping in N m s/rad.
+    """
 
     stiffness: float = field(default=0.0, metadata=within(1e-3, 1e6, "N m/rad or N/m"))
     damping: float = field(default=0.0, metadata=within(0.0, 1000.0, "N m s/rad or N s/m"))
@@ -64,8 +68,12 @@ class Cable:
 
 @dataclass
 class EncoderEffect:
-    """`resolution`: actuator -> one count [rad, m]; one that is not named is exact. `velocity_cut_off` [Hz] of the
-    first-order low-pass behind the difference of two readings."""
+    """Quantization of positions and filtering of velocities.
+
+    `resolution` maps an actuator to the size of one count [rad, m]; actuators without an entry are exact.
+    `velocity_cut_off` [Hz] is the cut-off frequency of the first-order low-pass filter for the difference of two
+    readings.
+    """
 
     resolution: dict[str, float] = field(default_factory=dict, metadata=within(1e-9, 0.1, "rad or m"))
     velocity_cut_off: float = field(default=30.0, metadata=within(0.1, 1e4, "Hz"))
@@ -73,10 +81,12 @@ class EncoderEffect:
 
 @dataclass
 class EffortEffect:
-    """Of the motor currents, as efforts of the actuators [N m, N]: actuator -> value; one that is not named is exact.
+    """Quantization and noise of the motor currents, as efforts of the actuators [N m, N].
 
-    `command_resolution` is a step of what is commanded, `measured_resolution` of what is measured, `noise` the standard
-    deviation of what is measured.
+    Each table maps an actuator to a value; actuators without an entry are exact. `command_resolution` is the
+    quantization
+    step of commanded efforts, `measured_resolution` that of measured efforts. `noise` is the standard deviation of
+    measured efforts.
     """
 
     command_resolution: dict[str, float] = field(default_factory=dict, metadata=_EFFORT_STEPS)
@@ -86,7 +96,7 @@ class EffortEffect:
 
 @dataclass
 class DelayEffect:
-    """In time steps of the plant: from the arm to what is measured, and from what is commanded to the motors."""
+    """Delays in time steps of the plant: from the arm to the measurement, and from the command to the motors."""
 
     measurement: int = field(default=0, metadata=within(0, 100, "time steps"))
     command: int = field(default=0, metadata=within(0, 100, "time steps"))
@@ -94,19 +104,22 @@ class DelayEffect:
 
 @dataclass
 class ArmEffects:
-    """Each field is a part that can be switched, and its name the name of the part.
+    """Effects of a real arm. Each field is an effect group that can be switched on or off by its name.
 
     Attributes:
-        friction: as elements of the plant's own solver.
-        cables: torques of cables that depend on position.
-        springs: the same of springs.
-        stops: the arm's coupled limits are hard stops.
-        stretch: actuator -> the cable that it pulls, behind which are motor, encoder and the actuator's own friction;
-            one that is not named is stiff.
-        saturation: actuator -> largest effort of its motor [N m, N]; one that is not named has none.
-        encoder: positions are counts, velocities are estimated from them.
-        effort: steps and noise of the motor currents.
-        delay: of measurement and command.
+        friction: Dry and viscous friction, as elements of the plant's own solver.
+        cables: Torques of cables that depend on the position.
+        springs: Torques of springs that depend on the position.
+        stops: Whether the arm's coupled limits are hard stops.
+        stretch: Mapping from an actuator to its elastic cable. Motor, encoder and the actuator's own friction are on
+            the
+            motor side of the cable. Actuators without an entry are stiff.
+        saturation: Mapping from an actuator to the largest effort of its motor [N m, N]. Actuators without an entry do
+            not
+            saturate.
+        encoder: Quantization of positions, and estimation of velocities from the quantized positions.
+        effort: Quantization and noise of the motor currents.
+        delay: Delays of measurement and command.
     """
 
     friction: list[FrictionEffect] = field(default_factory=list)
@@ -120,10 +133,10 @@ class ArmEffects:
     delay: DelayEffect | None = None
 
     def only(self, names: Sequence[str]) -> "ArmEffects":
-        """These parts alone; "all" is every part.
+        """Returns the effects with only the named groups; "all" selects all groups.
 
         Raises:
-            ArmError: a name that is no part.
+            ArmError: A name is not an effect group.
         """
         if unknown := sorted(set(names) - {*EFFECT_NAMES, "all"}):
             raise ArmError(f"unknown effect {', '.join(unknown)}; allowed: all, {', '.join(EFFECT_NAMES)}")
@@ -132,23 +145,24 @@ class ArmEffects:
         return ArmEffects(**{name: getattr(self, name) for name in names})
 
     def without(self, name: str) -> "ArmEffects":
-        """All parts but one.
+        """Returns the effects without the named group.
 
         Raises:
-            ArmError: a name that is no part.
+            ArmError: The name is not an effect group.
         """
         self.only([name])
         return self.only([other for other in EFFECT_NAMES if other != name])
 
     def joined(self, other: "ArmEffects") -> "ArmEffects":
-        """With what `other` (an instrument's) adds to lists and tables; a single number stays this one's."""
+        """Returns the effects with lists and tables extended by those of an instrument. Scalars are unchanged."""
         return ArmEffects(**{name: _joined(getattr(self, name), getattr(other, name)) for name in EFFECT_NAMES})
 
     def check(self, joint_names: Sequence[str]) -> None:
-        """Refuses numbers that no arm has, and actuators that this one has not.
+        """Checks the range of all numbers and the names of all actuators.
 
         Raises:
-            ArmError: names the field, its value, and what is allowed.
+            ArmError: A number or an actuator is not accepted. The message names the field, its value and the accepted
+                values.
         """
         if fault := number_fault(self):
             raise ArmError(fault)
@@ -175,16 +189,16 @@ class ArmEffects:
                 raise ArmError(f'cables, springs: kind "{law.kind}"; allowed: {", ".join(POSITION_KINDS)}')
 
 
-#: What `friction` can hold: what a solver can take at the end of a step and what never gives energy.
+#: Kinds that `friction` accepts: dissipative effects that a solver can apply at the end of a step.
 FRICTION_KINDS = ("presliding", "presliding forward", "coulomb", "viscous")
-#: What `cables` and `springs` can hold: each has a potential.
+#: Kinds that `cables` and `springs` accept: effects that have a potential.
 POSITION_KINDS = ("offset", "spring", "cable sine", "cable cosine")
-#: The parts that can be switched.
+#: Names of all effect groups.
 EFFECT_NAMES = tuple(f.name for f in dataclasses.fields(ArmEffects))
 
 
 def per_actuator(values: dict[str, float], joint_names: Sequence[str], otherwise: float) -> NDArray[np.float64]:
-    """(n,) of a table actuator -> value, `otherwise` where it names none."""
+    """Returns an array (n,) from a table actuator -> value, with `otherwise` for actuators without an entry."""
     return np.array([values.get(name, otherwise) for name in joint_names])
 
 

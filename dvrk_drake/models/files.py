@@ -1,4 +1,4 @@
-"""Input files opened with clear errors, and output files written at once or not at all."""
+"""Opens input files with clear errors, and writes output files atomically."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from typing import IO, Any
 
 from dvrk_drake.errors import DvrkDrakeError
 
-#: Largest settings or model file [bytes]; a model of a PSM with dynamics has 60 kB.
+#: Maximum size of a settings or model file [bytes]. A PSM model with dynamics has 60 kB.
 MAX_TEXT = 4_000_000
-#: Largest file that is read as a whole in any other format [bytes].
+#: Maximum size of a file in any other format that is read as a whole [bytes].
 MAX_BINARY = 256_000_000
 
 _KINDS = {
@@ -32,18 +32,20 @@ _KINDS = {
 def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | None = None) -> FileIO:
     """Opens a regular file for reading, unbuffered.
 
-    A FIFO or a device is refused without waiting for it.
+    A FIFO or a device is refused immediately.
 
     Args:
-        path: the file, or a link to it.
-        error: the type of error to raise.
-        largest: largest size that is accepted [bytes]; None for any size.
+        path: Path of the file, or of a link to it.
+        error: Type of error to raise.
+        largest: Maximum accepted size [bytes]; None for any size.
 
     Raises:
-        DvrkDrakeError: of the type `error`; no such file, no regular file, too large, or it cannot be read.
+        DvrkDrakeError: Error of type `error`: the file does not exist, is not a regular file, is too large, or cannot
+            be
+            read.
     """
     try:
-        # Without O_NONBLOCK, opening a FIFO would wait for its writer.
+        # Without O_NONBLOCK, opening a FIFO would block until a writer opens it.
         file = open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb", buffering=0)  # noqa: SIM115
     except FileNotFoundError as cause:
         raise error(f"{path}: no such file") from cause
@@ -51,7 +53,7 @@ def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | Non
         raise error(f"{path}: is not a file but a folder") from cause
     except OSError as cause:
         raise error(f"{path}: cannot be read: {cause.strerror}") from cause
-    except ValueError as cause:  # a null character
+    except ValueError as cause:  # null character in the path
         raise error(f"{str(path)!r}: is not the name of a file: {cause}") from cause
     status = os.fstat(file.fileno())
     if not stat.S_ISREG(status.st_mode):
@@ -68,23 +70,23 @@ def read_input(path: str | Path, error: type[DvrkDrakeError], largest: int = MAX
     """Returns the content of a file.
 
     Raises:
-        DvrkDrakeError: as `open_input`.
+        DvrkDrakeError: See `open_input`.
     """
     with open_input(path, error, largest) as file:
         try:
             content = file.read(largest + 1)
         except OSError as cause:
             raise error(f"{path}: cannot be read: {cause.strerror}") from cause
-    if len(content) > largest:  # it grew, or its size is not known before
+    if len(content) > largest:  # file grew after opening, or its size was unknown
         raise error(f"{path}: is larger than {largest / 1e6:g} MB, which is the most that is allowed")
     return content
 
 
 def read_text_input(path: str | Path, error: type[DvrkDrakeError], largest: int = MAX_TEXT) -> str:
-    """Returns the text of a file in UTF-8, with or without a byte-order mark.
+    """Returns the text of a UTF-8 file, with or without a byte-order mark.
 
     Raises:
-        DvrkDrakeError: as `open_input`, or it is no such text.
+        DvrkDrakeError: See `open_input`; additionally if the content is not UTF-8 text.
     """
     content = read_input(path, error, largest)
     try:
@@ -97,7 +99,7 @@ def read_json_input(path: str | Path, error: type[DvrkDrakeError], largest: int 
     """Returns the content of a JSON file.
 
     Raises:
-        DvrkDrakeError: as `read_text_input`, or it is not JSON.
+        DvrkDrakeError: See `read_text_input`; additionally if the text is not JSON.
     """
     try:
         return json.loads(read_text_input(path, error, largest))
@@ -107,28 +109,28 @@ def read_json_input(path: str | Path, error: type[DvrkDrakeError], largest: int 
         raise error(f"{path}: not JSON: {cause}") from cause
 
 
-#: What the disk, not the caller's own code, may answer to a write.
+#: Error codes of write operations that are caused by the disk and not by the caller's code.
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 def refuse_existing(path: str | Path, overwrite: bool) -> None:
-    """Raises DvrkDrakeError if a file exists at `path`, unless it may be replaced."""
+    """Raises DvrkDrakeError if a file exists at `path` and `overwrite` is False."""
     if os.path.exists(path) and not overwrite:
         raise DvrkDrakeError(f"{path}: exists already; name another file, or replace it with overwrite=True")
 
 
 @contextmanager
 def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO]:
-    """A stream into a temporary file that replaces `path` if the block ends well, and vanishes if not.
+    """Opens a temporary file that replaces `path` if the block succeeds, and is deleted otherwise.
 
-    A link stays a link: what it points to is replaced. An existing file keeps its permissions.
+    If `path` is a link, its target is replaced. An existing file keeps its permissions.
 
     Args:
-        path: the file to be.
+        path: Path of the output file.
         mode: "w" for text in UTF-8 without newline translation, or "wb".
 
     Raises:
-        DvrkDrakeError: no such folder, the file cannot be written, or it is no regular file (/dev/null).
+        DvrkDrakeError: The folder does not exist, the file cannot be written, or it is not a regular file (/dev/null).
     """
     target = Path(os.path.realpath(path))
     exists = os.path.exists(target)

@@ -78,12 +78,12 @@ class Range:
 
 def within(
     low: float, high: float, unit: str = "", *, also: tuple[float, ...] = (), either_sign: bool = False
-) -> dict[str, Range]:
+) -> dict[str, object]:
     """Metadata of a field whose numbers must be in a range, see `Range`."""
     return {RANGE: Range(low, high, unit, also, either_sign)}
 
 
-def formerly(name: str) -> dict[str, str]:
+def formerly(name: str) -> dict[str, object]:
     """Metadata of a field that files of earlier versions call `name`; `with_current_keys` renames it."""
     return {FORMERLY: name}
 

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import cast, get_args
 
+import yaml
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.geometry import Meshcat
 from pydrake.lcm import DrakeLcmInterface
@@ -20,7 +21,8 @@ from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import ArmEffects, Cable, DriveEffect
 from dvrk_drake.models.loop_closure import Closure
-from dvrk_drake.models.schema_fault import formerly, number_fault, within
+from dvrk_drake.models.schema_fault import formerly, number_fault, with_current_keys, within
+from dvrk_drake.models.typed_yaml import load_yaml
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, plant_config_fault
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
@@ -125,8 +127,9 @@ def load_station_config(path: str | Path) -> StationConfig:
         StationError: The file cannot be read, or has an unknown key or a value that is not allowed.
         ArmError: The arm cannot be loaded.
     """
+    content = with_current_keys(StationConfig, load_yaml(path, StationError), str(path))
     try:
-        config: StationConfig = yaml_load_typed(schema=StationConfig, filename=str(path))
+        config: StationConfig = yaml_load_typed(schema=StationConfig, data=yaml.safe_dump(content))
         config.check()
     except ArmError as error:
         raise ArmError(f"{path}: {error}") from error

@@ -28,6 +28,7 @@ REQUIRED = {
     "reproduce": [],
     "teleop": [],
     "run": ["--arm", "mtml"],
+    "transparency": ["--arm", "mtml"],
 }
 
 

@@ -395,9 +395,9 @@ def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
     )
     write_recording(Recording(q=recording.q + 1.5 * np.eye(7)[5], tau=recording.tau), bad)
     assert "wrist_yaw (q6)" in fails(capsys, "validate", bad, "--model", model)
-    (tmp_path / "m.yaml").write_text(model.read_text().replace("feedforward_scale", "thrust"))
+    (tmp_path / "m.yaml").write_text(model.read_text().replace("feedforward_scale", "feedforward_scal"))
     assert (
-        'm.yaml: joints[0]: key "thrust" is unknown; did you mean "feedforward_scale"? allowed in joints: name'
+        'm.yaml: joints[0]: key "feedforward_scal" is unknown; did you mean "feedforward_scale"? allowed in joints: name'
         in fails(capsys, "validate", poses, "--model", tmp_path / "m.yaml")
     )
     assert not out.exists()

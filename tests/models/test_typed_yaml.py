@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 import pytest
 from pydrake.common.yaml import yaml_load_typed
 
-from dvrk_drake.errors import ArmError
+from dvrk_drake.errors import ArmError, ScenarioError
+from dvrk_drake.experiments.scenario import load_scenario
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.models.schema_fault import schema_fault
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
@@ -139,3 +140,26 @@ def test_files_that_are_no_text_or_not_there_are_refused(tmp_path):
     ):
         with pytest.raises(ArmError, match=f"{where}: {message}"):
             load_typed_yaml(Outer, where, ArmError, "a test")
+
+
+def test_keys_of_earlier_versions_are_read_with_a_warning(tmp_path):
+    (tmp_path / "scenario.yaml").write_text(
+        "arm: mtml\nreal_arm: [stops]\ncontroller: {mode: gravity, knows: [cables]}\n"
+        "effects: [{coordinate: joint.wrist_pitch, kind: offset, value: 0.1}]\n"
+    )
+    with pytest.warns(FutureWarning) as warned:
+        scenario = load_scenario(str(tmp_path / "scenario.yaml"), [])
+    assert scenario.simulated_effects == ["stops"]
+    assert scenario.controller.compensated_effects == ["cables"]
+    assert scenario.effects[0].coefficient == 0.1
+    assert [str(warning.message).partition(": ")[2] for warning in warned] == [
+        'key "real_arm" is now "simulated_effects"',
+        'key "knows" is now "compensated_effects"',
+        'key "value" is now "coefficient"',
+    ]
+
+
+def test_an_earlier_key_beside_its_new_one_is_refused(tmp_path):
+    (tmp_path / "scenario.yaml").write_text("arm: mtml\nreal_arm: [stops]\nsimulated_effects: [stops]\n")
+    with pytest.raises(ScenarioError, match='key "real_arm" is unknown'):
+        load_scenario(str(tmp_path / "scenario.yaml"), [])

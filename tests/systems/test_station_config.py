@@ -120,3 +120,9 @@ def test_the_example_of_the_documentation_runs(monkeypatch):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(StationError, match=r"nowhere\.yaml: "):
         load_station_config(tmp_path / "nowhere.yaml")
+
+
+def test_a_key_of_an_earlier_version_is_read_with_a_warning(path):
+    path.write_text(path.read_text().replace("simulated_effects:", "real_arm:"))
+    with pytest.warns(FutureWarning, match='station.yaml: key "real_arm" is now "simulated_effects"'):
+        assert load_station_config(path).simulated_effects == ["friction"]

@@ -1,1 +1,1 @@
-"""What is wrong with a recording, before anything is identified from it."""
+"""Checks of a recording before identification."""

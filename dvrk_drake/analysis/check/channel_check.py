@@ -16,52 +16,58 @@ from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
 
-#: A hypothesis is accepted if it raises the log-likelihood by this much. On the public motions as recorded no exchange
-#: gains anything; on damaged ones the right one gains 25 or more, in most cases hundreds.
+#: Smallest gain in log-likelihood at which a hypothesis is accepted. On the unmodified public motions no exchange of
+#: channels gains anything. On damaged motions the correct hypothesis gains at least 25, and in most cases hundreds.
 MIN_GAIN = 20.0
-#: An arm is nearly its own mirror image: inverted channels are accepted only from here on. On the public motions as
-#: recorded they gain up to 46.
+#: Smallest gain at which inverted channels are accepted. An arm is almost symmetric under reflection, so inverted
+#: channels gain up to 46 on the unmodified public motions.
 MIN_MIRROR_GAIN = 100.0
-#: Friction disturbs efforts at rest: there, exchanged ones are accepted from the first on, inverted or scaled ones from
-#: the second. On the public poses as recorded they gain up to 10, 31 and 19.
+#: Smallest gains for poses at rest, where friction disturbs the efforts. The first applies to exchanged channels, the
+#: second to inverted or scaled efforts. On the unmodified public poses these gain up to 10, 31 and 19.
 MIN_GAIN_AT_REST, MIN_EFFORT_GAIN_AT_REST = 30.0, 40.0
-#: Hypotheses whose gain is less than this below the largest are named too.
+#: Hypotheses whose gain is less than this below the largest gain are reported as alternatives.
 SIMILAR_GAIN = 10.0
-#: Multiples of the recorded effort that are tried.
+#: Multiples of the recorded effort that are tested.
 SCALES = (0.5, 2.0)
-#: Friction dissipates the power that the arm's file states within this factor. The public recordings of one PSM on two
-#: days lie between 0.96 and 1.54.
+#: Largest factor between the power that friction dissipates and the power stated in the arm file. The public
+#: recordings of one PSM on two days have factors between 0.96 and 1.54.
 FRICTION_FACTOR = 1.7
-#: A position offset is reported from this size on [rad], [m], and from this number of standard errors on.
+#: Smallest reported position offset [rad], [m], and its smallest ratio to its standard error.
 MIN_OFFSET, OFFSET_ERRORS = (0.06, 0.006), 3.3
-#: The zero of a joint is judged only if an offset of this size would be significant [rad], [m].
+#: The zero of a joint is checked only if an offset of this size would be significant [rad], [m].
 MAX_UNDETECTED_OFFSET = 0.1, 0.01
-#: A longer motion is checked in equal parts of at most this duration [s], which bounds the memory that a fit takes.
+#: Largest duration of a segment [s]. Longer motions are divided into equal segments, which bounds the memory of a fit.
 MAX_SEGMENT_DURATION = 120.0
-#: Exchanged channels may exceed the arm's limits by this much more than the recorded ones [rad], [m].
+#: Additional excess beyond the arm's limits that exchanged channels may have [rad], [m].
 LIMIT_MARGIN = 0.02, 0.002
 
 
 def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
-    """Refits a recording under hypotheses about its channels and reports the ones that fit clearly better.
+    """Refits a recording under hypotheses about its channels and reports those that fit clearly better.
 
-    The hypotheses are: the efforts of two channels are exchanged; all signals of two channels are exchanged; the
-    effort of a channel, or all its signals, are inverted; the effort of an actuator is a multiple of the true one; the
-    position of a channel has an offset. Each is a maximum-a-posteriori fit of `ChannelFit`, compared by its
-    log-likelihood. In a motion, a wrong scale shows in the power that friction dissipates. Poses at rest do not show
-    offsets and inverted positions. A long motion is fitted in parts: their log-likelihoods are added, and a
-    warning needs at least half of them.
+    The hypotheses are:
+
+    - The efforts of two channels are exchanged.
+    - All signals of two channels are exchanged.
+    - The effort of a channel, or all its signals, are inverted.
+    - The effort of an actuator is a multiple of the true effort.
+    - The position of a channel has an offset.
+
+    Each hypothesis is a maximum-a-posteriori fit of `ChannelFit`. The fits are compared by their log-likelihood. In a
+    motion, a wrong scale is detected from the power that friction dissipates. Offsets and inverted positions are not
+    detected in poses at rest. A long motion is fitted in segments, and their log-likelihoods are added. A warning
+    requires at least half of the segments.
 
     Args:
-        recording: a motion, or poses at rest, with efforts, in either coordinates; channels are those of its columns.
-        arm: the arm that was recorded.
+        recording: Motion or poses at rest, with efforts, in joint or actuator coordinates. Channels are its columns.
+        arm: Arm that was recorded.
 
     Returns:
-        One refusal for exchanged or inverted channels; otherwise warnings for scales and offsets, and a note that names
-        the joints whose position offset the recording cannot show.
+        One refusal for exchanged or inverted channels. Otherwise, warnings for scales and offsets, and a note that
+        lists the joints whose position offset is not identifiable from the recording.
 
     Raises:
-        RecordingError: the recording does not fit the arm, or is a motion that is too short or too coarse.
+        RecordingError: The recording does not match the arm, or is a motion that is too short or sampled too coarsely.
     """
     if not recording.motion(arm):
         poses = _poses_in_order(recording, arm)
@@ -69,7 +75,7 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
             return []
         fit = ChannelFit(poses, arm)
         found = _likeliest([[*_hypotheses(fit), *_scales_at_rest(fit)]], at_rest=True)
-        # A cable's spring may exceed the weight of a light wrist, and then its effort is opposite to gravity.
+        # The spring torque of a cable may exceed the gravity torque of a light wrist. The effort then opposes gravity.
         return [replace(f, severity="warning") if f.kind == "effort sign" else f for f in found]
     hypotheses, others = [], []
     for part in _parts(recording):
@@ -81,7 +87,7 @@ def check_channels(recording: Recording, arm: Arm) -> list[Finding]:
 
 
 def _parts(recording: Recording) -> list[Recording]:
-    """Equal parts of a motion, none longer than `MAX_SEGMENT_DURATION`."""
+    """Returns equal segments of a motion, none longer than `MAX_SEGMENT_DURATION`."""
     t, qd = recording.t, recording.qd
     if t is None or t[-1] - t[0] <= MAX_SEGMENT_DURATION:
         return [recording]
@@ -96,13 +102,13 @@ def _parts(recording: Recording) -> list[Recording]:
 
 
 def _hypotheses(fit: ChannelFit) -> list[Finding]:
-    """Exchanged and inverted channels, each with its gain of the log-likelihood as its size."""
+    """Returns hypotheses of exchanged and inverted channels. The size of each is its gain in log-likelihood."""
     findings = [*_effort_exchanges(fit), *_full_exchanges(fit), *_inversions(fit)]
     return [*findings, *_full_inversions(fit)] if fit.moves else findings
 
 
 def _likeliest(parts: list[list[Finding]], *, at_rest: bool = False) -> list[Finding]:
-    """The hypothesis with the largest gain over all parts, if that is large enough; it also names those alike."""
+    """Returns the hypothesis with the largest total gain if it is large enough, and lists similar hypotheses in it."""
     gains: dict[tuple, list[Finding]] = {}
     for finding in chain(*parts):
         gains.setdefault((finding.kind, finding.joints, finding.what), []).append(finding)
@@ -118,7 +124,10 @@ def _likeliest(parts: list[list[Finding]], *, at_rest: bool = False) -> list[Fin
 
 
 def _merged(parts: list[list[Finding]], arm: Arm) -> list[Finding]:
-    """Warnings that at least half of the parts have, each once, and the joints whose offset no part shows."""
+    """Merges the warnings that occur in at least half of the segments.
+
+    The joints whose offset is not identifiable in any segment are added as a note.
+    """
     found: dict[tuple, list[Finding]] = {}
     for finding in chain(*parts):
         if finding.severity == "warning":
@@ -134,9 +143,9 @@ def _merged(parts: list[list[Finding]], arm: Arm) -> list[Finding]:
 
 
 def _poses_in_order(recording: Recording, arm: Arm) -> Recording:
-    """The distinct poses, in joint coordinates, that do not press on a stop.
+    """Returns the distinct poses in joint coordinates, without those at a joint stop.
 
-    Efforts beyond a limit stay: they may be those of another joint.
+    Efforts beyond a limit are kept because they may belong to another joint.
     """
     poses = average_repeated_poses(recording.in_joint_coordinates(arm), arm)
     at_stop = [measurement.row for measurement in find_excluded(replace(poses, tau=np.zeros_like(poses.q)), arm)]
@@ -154,7 +163,7 @@ def _effort_exchanges(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _full_exchanges(fit: ChannelFit) -> Iterator[Finding]:
-    """Exchanges of all signals of two channels that keep the arm within its limits."""
+    """Yields exchanges of all signals of two channels that keep the arm within its limits."""
     recording, arm = fit.recording, fit.arm
     allowed = _limit_excess(recording, arm) + _limit_margin(arm)
     for i, j in combinations(map(int, fit.used), 2):
@@ -172,7 +181,7 @@ def _exchanged(n: int, i: int, j: int) -> NDArray[np.int_]:
 
 
 def _limit_excess(recording: Recording, arm: Arm) -> NDArray[np.float64]:
-    """Largest excess of each limit of the joints [rad, m], 0 where there is none."""
+    """Returns the largest excess beyond each joint limit [rad, m], 0 where there is none."""
     A, lower, upper = arm.limit_matrix()
     values = recording.in_joint_coordinates(arm).q @ A.T
     return np.asarray(np.max(np.maximum(np.maximum(lower - values, values - upper), 0.0), axis=0))
@@ -197,7 +206,7 @@ def _inversions(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
-    """Channels all of whose signals have the other sign, where that keeps the arm within its limits."""
+    """Yields channels whose signals may all be inverted while the arm stays within its limits."""
     recording, arm = fit.recording, fit.arm
     allowed = _limit_excess(recording, arm) + _limit_margin(arm)
     for i in map(int, fit.used):
@@ -213,7 +222,7 @@ def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
 def _gain_of(other: Recording, fit: ChannelFit) -> float:
     """Returns the gain in log-likelihood of a recording with exchanged, inverted or shifted channels.
 
-    In the actuators' coordinates the clock of `fit` is used again.
+    In actuator coordinates the clock of `fit` is reused.
     """
     clock = fit.clock if fit.recording.coordinates == "actuator" else None
     return ChannelFit(other, fit.arm, clock).log_likelihood - fit.log_likelihood
@@ -224,9 +233,10 @@ def _limit_margin(arm: Arm) -> NDArray[np.float64]:
 
 
 def _scales(fit: ChannelFit) -> Iterator[Finding]:
-    """Efforts of actuators at a wrong scale, by the power of friction, or by the fit if the arm's file states none.
+    """Yields warnings for actuators whose effort has a wrong scale.
 
-    A note names the actuators whose friction allows a wrong scale of 0.5 or 2 as well.
+    The scale is estimated from the friction power, or from the fit if the arm file states no friction. A note lists
+    the actuators whose friction is also consistent with a scale of 0.5 or 2.
     """
     power, allowed, uncertain = fit.dissipation(), _friction_factors(fit), []
     for i in map(int, fit.used):
@@ -252,7 +262,7 @@ def _scales(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _scales_at_rest(fit: ChannelFit) -> Iterator[Finding]:
-    """Efforts of poses at a wrong scale, each with its gain of the log-likelihood as its size."""
+    """Yields wrong scales of the efforts of poses. The size of each is its gain in log-likelihood."""
     for i in map(int, fit.used):
         scale, gain = _best_scale(fit, i)
         what = f"tau{i + 1} is about {1 / scale:g} times what the arm's weight needs"
@@ -261,7 +271,7 @@ def _scales_at_rest(fit: ChannelFit) -> Iterator[Finding]:
 
 
 def _best_scale(fit: ChannelFit, channel: int) -> tuple[float, float]:
-    """The scale out of `SCALES` that an effort needs most, and its gain."""
+    """Returns the scale from `SCALES` with the largest gain for an effort, and that gain."""
     gains = {
         s: fit.gain(fit.in_actuators(np.diag(np.where(np.arange(fit.arm.num_joints) == channel, s, 1.0))))
         for s in SCALES
@@ -278,10 +288,11 @@ def _uncertain_scale(arm: Arm, joints: list[int]) -> Iterator[Finding]:
 
 
 def _friction_factors(fit: ChannelFit) -> NDArray[np.float64]:
-    """(n,) allowed factors of the friction power.
+    """Returns the allowed factors (n,) of the friction power.
 
-    In joint coordinates the gear ratio between an actuator and the only joint that it moves is allowed for: the
-    friction of the PSM's roll in the arm's file is from a recording whose roll may be the disc's or the joint's.
+    In joint coordinates the factor includes the gear ratio between an actuator and the only joint that it moves. The
+    friction of the PSM's roll in the arm file was identified from a recording in which the roll may be that of the disc
+    or that of the joint.
     """
     if fit.recording.coordinates == "actuator":
         return np.full(fit.arm.num_joints, FRICTION_FACTOR)
@@ -291,9 +302,9 @@ def _friction_factors(fit: ChannelFit) -> NDArray[np.float64]:
 
 
 def _offsets(fit: ChannelFit) -> Iterator[Finding]:
-    """The likeliest position offset of the joints whose zero the recording shows; a note names the joints it does not.
+    """Yields the most likely position offset, and a note with the joints whose offset is not identifiable.
 
-    Offsets of joints with parallel axes look alike, so the warning also names the other candidates.
+    Offsets of joints with parallel axes have similar effects, so the warning also lists the other candidates.
     """
     arm, hidden, found = fit.arm, [], {}
     least, tolerated = arm.per_joint(*MIN_OFFSET), arm.per_joint(*MAX_UNDETECTED_OFFSET)
@@ -318,7 +329,8 @@ def _offsets(fit: ChannelFit) -> Iterator[Finding]:
 
 def _undetectable(arm: Arm, joints: list[int]) -> Iterator[Finding]:
     if joints:
-        what = f"an offset of {MAX_UNDETECTED_OFFSET[0]} rad ({MAX_UNDETECTED_OFFSET[1]} m) in their positions would not show"
+        angle, length = MAX_UNDETECTED_OFFSET
+        what = f"an offset of {angle} rad ({length} m) in their positions would not show"
         advice = "this recording cannot tell it from the links' centres of mass; check the zeros of these encoders"
         names = ", ".join(arm.joint_names[i] for i in joints)
         yield Finding("note", "undetectable offset", names, what, advice, tuple(joints))

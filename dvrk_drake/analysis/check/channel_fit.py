@@ -1,4 +1,4 @@
-"""Maximum-a-posteriori fit of an arm's dynamics to a recording, to compare hypotheses about its channels."""
+"""Maximum-a-posteriori fit of an arm's dynamics to a recording, used to compare hypotheses about its channels."""
 
 from __future__ import annotations
 
@@ -22,50 +22,57 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
-#: Prior standard deviations. Of links' parameters, and of the effects that the arm's file states: as shares of their
-#: size. Of simple friction, and of offsets, springs and cables of unknown size: as shares of the RMS effort.
+#: Prior standard deviations. The first two apply to link parameters and to the effects stated in the arm file, as shares
+#: of their size. The third applies to simple friction, the fourth to offsets, springs and cables of unknown size. Both
+#: are shares of the RMS effort.
 LINK_DEVIATION, EFFECT_DEVIATION, FRICTION_DEVIATION, POSITION_DEVIATION = 0.3, 0.5, 0.1, 1.0
-#: Of the base's tilt [rad], and of a position offset [rad], [m]; the least of a rotor's inertia [kg m^2; kg].
+#: Prior standard deviations of the base tilt [rad] and of a position offset [rad], [m], and smallest prior standard
+#: deviation of a rotor inertia [kg m^2; kg].
 TILT_DEVIATION, OFFSET_DEVIATION, MIN_ROTOR_DEVIATION = 0.05, (0.1, 0.01), 3e-6
-#: Final samples in a period of the effort's cut-off frequency; time left out at each end, where filters swing in [s].
+#: Final samples per period of the effort's cut-off frequency, and time excluded at each end because of filter
+#: transients [s].
 OVERSAMPLING, ENDS = 2.5, 1.0
-#: Independent measurements of an effort that count at most: errors of the model do not average out.
+#: Largest number of independent measurements assumed for an effort, because model errors do not average out.
 MAX_INDEPENDENT = 220.0
-#: The error of an actuator is not taken for less than this share of its effort.
+#: Smallest assumed error of an actuator as a share of its effort.
 MIN_ERROR = 0.02
-#: A joint that covers less over poses at rest is left out [rad], [m].
+#: Smallest range of a joint over poses at rest for the joint to be included [rad], [m].
 MIN_RANGE = 0.1, 0.01
-#: Directions of the rigid body's parameters are left out where a prior deviation along them changes the efforts by less
-#: than this share, squared.
+#: Smallest squared relative change of the efforts for one prior deviation along a direction of the rigid-body
+#: parameters. Directions with a smaller change are excluded.
 MIN_INFORMATION = 1e-6
-#: Step of the derivative with respect to a position [rad, m].
+#: Step of the numerical derivative with respect to a position [rad, m].
 _STEP = 1e-3
 
 
 class ChannelFit:
-    """Linear model of a recording's efforts with priors: rigid bodies, base tilt and drive effects of the arm's files.
+    """Linear model of a recording's efforts with priors for rigid bodies, base tilt and drive effects of the arm file.
 
-    Everything is in actuator coordinates. A motion is low-passed at the arm's `effort_cut_off` and sampled as coarsely
-    as that allows, so that a fit takes milliseconds. Gravity, springs, cables and offsets explain poses at rest.
+    All quantities are in actuator coordinates. A motion is low-pass filtered at the arm's `effort_cut_off` and sampled
+    as coarsely as that allows, so that a fit takes milliseconds. Poses at rest are explained by gravity, springs, cables
+    and offsets.
 
     Attributes:
-        recording, arm: what is fitted.
-        clock: times of a motion's rows.
-        moves: whether it is a motion.
-        used: (k,) indices of the actuators that move and have an effort; the model explains these.
-        resting: (l,) indices of those with an effort that do not move: a constant explains it.
-        log_likelihood: of the recording as it is, up to a constant.
+        recording: Recording that is fitted.
+        arm: Arm that was recorded.
+        clock: Times of a motion's rows.
+        moves: True for a motion, False for poses at rest.
+        used: Indices (k,) of the actuators that move and have an effort. The model explains these efforts.
+        resting: Indices (l,) of the actuators that have an effort and do not move. A constant explains these efforts.
+        log_likelihood: Log-likelihood of the unmodified recording, up to a constant.
     """
 
     def __init__(self, recording: Recording, arm: Arm, clock: TrueTime | None = None) -> None:
-        """Prepares the columns and fits them.
+        """Computes the columns of the model and fits them.
 
         Args:
-            recording, arm: what to fit.
-            clock: `true_time` of the recording in actuator coordinates, if it is known.
+            recording: Recording to fit.
+            arm: Arm that was recorded.
+            clock: Result of `true_time` for the recording in actuator coordinates, if available.
 
         Raises:
-            RecordingError: the recording does not fit the arm, or is a motion that is too short or too coarse.
+            RecordingError: The recording does not match the arm, or is a motion that is too short or sampled too
+                coarsely.
         """
         self.recording, self.arm, self.clock = recording, arm, clock
         self._to_joint = arm.transmission.inverse
@@ -98,27 +105,28 @@ class ChannelFit:
             self.log_likelihood, self._x, _ = self._fit(self._tau)
 
     def in_actuators(self, transform: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, n) transform of the actuators' efforts for one of the recording's effort channels."""
+        """Returns the transform (n, n) of actuator efforts that equals a transform of the recorded effort channels."""
         if self.recording.coordinates == "actuator":
             return transform
         J = self.arm.transmission.matrix
         return np.asarray(np.linalg.inv(J.T) @ transform @ J.T)
 
     def gain(self, transform: NDArray[np.float64]) -> float:
-        """Increase of the log-likelihood if the actuators' true efforts are `transform` (n, n) times the recorded."""
+        """Returns the gain in log-likelihood if the true actuator efforts are `transform` (n, n) times the recorded."""
         volume = self._independent * float(np.log(abs(np.linalg.det(transform))))
         return self._fit(self._tau @ transform.T)[0] + volume - self.log_likelihood
 
     def position_offset(self, channel: int) -> tuple[float, float]:
-        """Estimated offset of a position channel of the recording and its standard error [rad, m]."""
+        """Returns the estimated offset of a position channel of the recording and its standard error [rad, m]."""
         deviation = float(self.arm.per_joint(*OFFSET_DEVIATION)[channel])
         _, x, precision = self._fit(self._tau, deviation * self._offset_column(channel))
         return deviation * float(x[-1]), deviation * float(np.sqrt(np.linalg.inv(precision)[-1, -1]))
 
     def dissipation(self) -> NDArray[np.float64]:
-        """(n,) power that actuators dissipate over that of the friction in the arm's file; nan where it states none.
+        """Returns the ratio (n,) of the dissipated power to the power of the friction in the arm file.
 
-        What the fitted links, springs and cables carry is subtracted first: their power over a motion is not zero.
+        The power of the fitted links, springs and cables is subtracted first because its mean over a motion is not
+        zero. The ratio is nan for actuators without friction in the arm file.
         """
         v = self._sampled(self.arm.transmission.velocity(self._v))
         friction = np.array([effect.kind not in POSITION_KINDS for effect in self._drive.effects])
@@ -134,7 +142,7 @@ class ChannelFit:
 
     def _sampled_efforts(self, grid: MotionGrid) -> NDArray[np.float64]:
         tau = self.recording.in_actuator_coordinates(self.arm).measured_effort()
-        # Rows that repeat the one before have its time.
+        # Repeated rows have the time of the row before them.
         times, rows = np.unique(grid.row_times, return_index=True)
         return self._sampled(resample(times, low_pass(tau, grid.rate, self._cut_off)[rows], grid.t))
 
@@ -183,7 +191,7 @@ class ChannelFit:
     def _fit(
         self, tau: NDArray[np.float64], column: NDArray[np.float64] | None = None
     ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-        """Fits efforts tau (r, n), with one more `column` (r, n) of deviation 1 if given.
+        """Fits efforts tau (r, n), optionally with an additional `column` (r, n) whose prior deviation is 1.
 
         Returns:
             The log-likelihood, the unknowns x (k,) and their precision (k, k).
@@ -198,7 +206,7 @@ class ChannelFit:
                 for i, (own, X) in zip(self.used, columns, strict=True)
             ]
         total = NormalEquations.of(columns, size, (tau - self._nominal)[:, self.used]).total
-        # The priors' means are one more measurement of all unknowns.
+        # The prior means are an additional measurement of all unknowns.
         prior = np.zeros((size + 1, size + 1))
         prior[:-1, -1] = prior[-1, :-1] = precision * mean
         efforts = np.sum(tau[:, self.used] ** 2, axis=0)
@@ -215,7 +223,7 @@ class ChannelFit:
         return likelihood, x, total.weighted(weights)[:-1, :-1] + np.diag(precision)
 
     def _offset_column(self, channel: int) -> NDArray[np.float64]:
-        """(r, n) change of the fitted efforts per unit by which a position channel is too large."""
+        """Returns the change (r, n) of the fitted efforts per unit of position offset of a channel."""
         step = _STEP * np.eye(self.arm.num_joints)[channel]
         if self.recording.coordinates == "actuator":
             step = self._to_joint.velocity(step)
@@ -236,7 +244,7 @@ class ChannelFit:
         return np.asarray(change / _STEP)
 
     def _weights_of_unit_gravity(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(r, n, 2) holding efforts under a gravity of 1 m/s^2 along the base's x and y."""
+        """Returns the holding efforts (r, n, 2) under a gravity of 1 m/s^2 along the x- and y-axis of the base."""
         weights, rest = [], np.zeros_like(q)
         for regressor in self._tilted:
             torque = regressor.torque(q, rest, rest, regressor.values)
@@ -244,11 +252,11 @@ class ChannelFit:
         return np.stack(weights, axis=2)
 
     def _sampled(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """x on the motion's grid at the final samples."""
+        """Returns x at the final samples, interpolated from the motion's grid."""
         return self._inner(x[:: self._half_step]) if self.moves else x
 
     def _filtered(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """x (m, ...) at twice the rate of the final samples, low-passed, at the final samples."""
+        """Filters x (m, ...), given at twice the rate of the final samples, and returns it at the final samples."""
         if not self.moves:
             return x
         flat = low_pass(x.reshape(len(x), -1), GRID_RATE / self._half_step, self._cut_off)
@@ -261,20 +269,20 @@ class ChannelFit:
 
 @cache
 def _regressors(arm: Arm) -> tuple[DynamicRegressor, list[DynamicRegressor], BaseColumns]:
-    """The arm's regressor, those under a gravity of 1 m/s^2 along the base's x and y, and its base columns."""
+    """Returns the arm's regressor, those under 1 m/s^2 of gravity along the base's x and y, and its base columns."""
     regressor = DynamicRegressor(arm)
     lying = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
     return regressor, lying, base_columns([regressor])
 
 
 class _DriveEffects(NamedTuple):
-    """Effects of the drives with priors of their coefficients.
+    """Drive effects with priors of their coefficients.
 
     Attributes:
-        effects: the e effects.
-        mean: (e,) expected coefficients.
-        deviation: (e,) their standard deviation, 0 where `share` states it.
-        share: (e,) the same as a share of the RMS effort that the effect acts on.
+        effects: Tuple of e effects.
+        mean: Prior means (e,) of the coefficients.
+        deviation: Prior standard deviations (e,) of the coefficients, 0 where `share` applies.
+        share: Prior standard deviations (e,) as shares of the RMS effort of the actuator that the effect acts on.
     """
 
     effects: list[ActuatorEffect]
@@ -284,9 +292,9 @@ class _DriveEffects(NamedTuple):
 
 
 def _drive_effects(arm: Arm, q: NDArray[np.float64], v: NDArray[np.float64], moves: bool) -> _DriveEffects:
-    """Effects that the arm's file states, springs and cables that it names without a size, and simple friction.
+    """Returns the effects stated in the arm file, its springs and cables of unknown size, and simple friction.
 
-    Without friction if the arm is at rest.
+    Friction is omitted if the arm is at rest.
     """
     stated: list[DriveEffect] = [*(arm.effects.friction if moves else ()), *arm.effects.cables, *arm.effects.springs]
     sized = {effect.coordinate for effect in stated if effect.kind in POSITION_KINDS}

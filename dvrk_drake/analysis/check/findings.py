@@ -1,4 +1,4 @@
-"""What a check of a recording found: findings with their severity, and numbers of each joint."""
+"""Results of a check of a recording: findings with their severity, and statistics of each joint."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ Severity = Literal["note", "warning", "refusal"]
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that a user must know of a recording.
+    """Finding about a recording.
 
     Attributes:
-        severity: "note": it is handled, or only to be known; "warning": results suffer; "refusal": they would be wrong.
-        kind: a short name that does not change, e.g. "repeated rows".
-        where: the joints, channels or rows.
-        what: the finding with its numbers.
-        advice: what to do, or what is done about it.
-        joints: which joints, counted from 0.
-        size: the number that measures it, in SI; nan if none does.
+        severity: "note" for information, "warning" if results will be less accurate, "refusal" if they would be wrong.
+        kind: Short, stable name of the finding, e.g. "repeated rows".
+        where: Joints, channels or rows that are affected.
+        what: Description with numbers.
+        advice: Recommended action, or the action that the software takes.
+        joints: Indices of the affected joints, starting at 0.
+        size: Numerical value of the finding in SI units, nan if there is none.
     """
 
     severity: Severity
@@ -38,21 +38,23 @@ class Finding:
 
 @dataclass(frozen=True)
 class JointSignals:
-    """Numbers of one joint (its actuator, where a motor or its sensor is meant); None where they do not apply.
+    """Statistics of the signals of one joint, or of its actuator for motor and sensor quantities.
+
+    Attributes are None where they do not apply.
 
     Attributes:
-        name: of the joint.
-        range: that its positions cover [rad, m].
-        coverage: the same as a share of its limits' range [1].
-        speed: RMS of the velocity [rad/s, m/s].
-        acceleration: RMS, below the velocity's cut-off [rad/s^2, m/s^2].
-        effort: RMS [N m, N].
-        peak_effort: largest effort over the joint's effort limit [1].
-        velocity_gain, velocity_lag: of qd against dq/dt [1], [s].
-        effort_lag: of tau behind the motion [s], None if it is not determined.
-        work: mean of tau v over rms(tau) rms(v) [1]; friction makes it positive.
-        effort_cut_off, velocity_cut_off: above which the signal is under its noise [Hz].
-        floor: repeatability floor of the effort [1].
+        name: Name of the joint.
+        range: Range of the positions [rad, m].
+        coverage: Range of the positions as a share of the range between the limits [1].
+        speed: RMS velocity [rad/s, m/s].
+        acceleration: RMS acceleration below the velocity's cut-off frequency [rad/s^2, m/s^2].
+        effort: RMS effort [N m, N].
+        peak_effort: Largest effort divided by the joint's effort limit [1].
+        velocity_gain, velocity_lag: Gain [1] and lag [s] of qd relative to dq/dt.
+        effort_lag: Lag of tau relative to the motion [s], None if it is not identifiable.
+        work: Mean of tau v divided by rms(tau) rms(v) [1]. Friction makes it positive.
+        effort_cut_off, velocity_cut_off: Frequency above which noise exceeds the signal [Hz].
+        floor: Repeatability floor of the effort [1].
     """
 
     name: str
@@ -73,21 +75,21 @@ class JointSignals:
 
 @dataclass(frozen=True)
 class RecordingReport:
-    """What `check_recording` found.
+    """Result of `check_recording`.
 
     Attributes:
-        source: of the recording.
-        arm: name of the arm.
-        kind: "poses", or "motion" where rows follow each other closely in time.
-        rows: of the recording.
-        joints: their numbers, in the arm's order.
-        findings: refusals first, then warnings, then notes.
-        rate: median rows a second of a motion [Hz].
-        duration: of a motion [s].
-        jitter: deviation of the true from the recorded intervals, over their mean [1].
-        repeated: share of the rows that repeat the one before [1].
-        period: of a motion that repeats [s].
-        floor_cut_off: of the low-pass behind which `floor` is taken [Hz].
+        source: Source of the recording.
+        arm: Name of the arm.
+        kind: "motion" if the rows are closely spaced in time, otherwise "poses".
+        rows: Number of rows of the recording.
+        joints: Statistics of the joints, in the arm's order.
+        findings: Refusals first, then warnings, then notes.
+        rate: Median sampling rate of a motion [Hz].
+        duration: Duration of a motion [s].
+        jitter: Deviation of the true from the recorded intervals, divided by the mean interval [1].
+        repeated: Share of rows that repeat the previous row [1].
+        period: Period of a repeating motion [s].
+        floor_cut_off: Cut-off frequency of the low-pass filter for `floor` [Hz].
     """
 
     source: str
@@ -105,17 +107,17 @@ class RecordingReport:
 
     @property
     def refusals(self) -> tuple[Finding, ...]:
-        """The findings with which nothing should be identified."""
+        """Findings that exclude the recording from identification."""
         return tuple(finding for finding in self.findings if finding.severity == "refusal")
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
-        """The findings that make results worse."""
+        """Findings that make results less accurate."""
         return tuple(finding for finding in self.findings if finding.severity == "warning")
 
     @property
     def refusal(self) -> str:
-        """The first refusal in one line, with the number of all; "" without any."""
+        """First refusal in one line, with the number of all refusals. Empty without refusals."""
         if not self.refusals:
             return ""
         first, *others = self.refusals
@@ -124,7 +126,7 @@ class RecordingReport:
         return f"{self.source}: {reasons}{where}{first.what}; {first.advice}"
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: what does not apply is null."""
+        """Returns the report for JSON. Values that do not apply are None."""
         return _without_nan(asdict(self))
 
 

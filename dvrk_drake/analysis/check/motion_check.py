@@ -1,4 +1,4 @@
-"""Checks a motion: its clock, its channels against each other, its noise, and whether it repeats."""
+"""Checks the clock, noise and repetition of a motion, and the consistency of its channels."""
 
 from __future__ import annotations
 
@@ -24,25 +24,29 @@ from dvrk_drake.analysis.signals.true_time import (
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MAX_PERIOD, REST_SPEED, Recording
 
-#: Below this share, repeated rows are chance.
+#: Repeated rows below this share are attributed to chance.
 MIN_REPEATED = 0.005
-#: A block of channels that repeats itself in so much more rows comes from a slower topic.
+#: Additional share of repeated rows at which a block of channels is attributed to a slower topic.
 MIN_EXTRA = 0.05
-#: A gap: an interval of so many median ones, and at least this long [s].
+#: Smallest gap between two rows in median intervals, and in [s].
 GAP, MIN_GAP = 5.0, MAX_PERIOD
-#: A clock that is off by more than this share of an interval is worth a line.
+#: Smallest reported jitter as a share of an interval.
 MIN_JITTER = 0.05
-#: A sign is wrong if Coulomb friction is so many standard errors below 0; or if the motor's work is below minus this
-#: share, and Coulomb friction below 0 as far as it can be told.
+#: An effort has a wrong sign if Coulomb friction is this many standard errors below 0. It is also wrong if the motor's
+#: work is below minus the second value and the estimated Coulomb friction is negative.
 MIN_GAIN, OPPOSITE = 5.0, 0.05
-#: Joints whose speeds correlate more can hardly be told apart.
+#: Joints are hardly identifiable separately if the correlation of their speeds exceeds this value.
 MIN_CORRELATION = 0.95
-#: Shorter motions are too short to judge lags, signs and noise [s].
+#: Smallest duration of a motion for the estimation of lags, signs and noise [s].
 MIN_DURATION = 10.0
 
 
 def check_motion(report: RecordingReport, recording: Recording, arm: Arm) -> tuple[RecordingReport, list[Finding]]:
-    """The report with the motion's numbers, and what was found. t increases, and q, qd and t are in one system."""
+    """Checks a motion with increasing t whose q, qd and tau are in one coordinate system.
+
+    Returns:
+        The report with the statistics of the motion, and the findings.
+    """
     interval = float(np.median(np.diff(np.asarray(recording.t))))
     gaps = _gaps(np.asarray(recording.t), interval)
     actuators = _longest_piece(recording.in_actuator_coordinates(arm), gaps)
@@ -100,7 +104,7 @@ def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
         advice = "a slower topic was polled: they are left out, and true times are made; record each message once"
         findings.append(Finding("warning", "repeated rows", "rows", what, advice, size=whole))
     for name, share in blocks.items():
-        # What never changes is said elsewhere.
+        # Constant channels are reported by another check.
         if whole + MIN_EXTRA < share < 1 - 2 / len(actuators):
             what = f"{share:.1%} of the rows repeat {name} but not the rest"
             advice = "it comes from a slower topic than the rest, and is up to one of its intervals late"
@@ -113,7 +117,7 @@ def _rows(actuators: Recording, clock: TrueTime) -> list[Finding]:
 
 
 def _gaps(t: NDArray[np.float64], interval: float) -> NDArray[np.int_]:
-    """Rows before a gap."""
+    """Returns the indices of the rows before a gap."""
     return np.flatnonzero(np.diff(t) > max(GAP * interval, MIN_GAP))
 
 
@@ -195,7 +199,7 @@ def _together(signals: MotionSignals, moving: NDArray[np.bool_], names: tuple[st
 
 
 def _work(signals: MotionSignals) -> NDArray[np.float64]:
-    """(n,) mean power of each actuator over rms(tau) rms(v); nan where either is 0."""
+    """Returns the mean power (n,) of each actuator divided by rms(tau) rms(v), nan where either is 0."""
     size = np.sqrt(np.mean(signals.tau**2, axis=0) * np.mean(signals.v**2, axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.mean(signals.tau * signals.v, axis=0) / size)
@@ -204,7 +208,7 @@ def _work(signals: MotionSignals) -> NDArray[np.float64]:
 def _signs(work: NDArray[np.float64], lags: EffortLag, names: tuple[str, ...]) -> list[Finding]:
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = lags.coulomb / lags.coulomb_error
-    # Work alone does not tell: gravity and inertia may give it through the other joints.
+    # Work alone is not sufficient: gravity and inertia may transfer it from other joints.
     wrong = (errors < -MIN_GAIN) | ((work < -OPPOSITE) & (errors < 0))
     findings = []
     for j in np.flatnonzero(wrong):

@@ -1,4 +1,4 @@
-"""Checks poses at rest: how many, which press on a stop, and whether their efforts carry the arm."""
+"""Checks the number of poses at rest, poses at a joint stop, and the signs of the efforts."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.recordings.recording import Recording
 
-#: Poses at which the SDF's gravity is compared.
+#: Largest number of poses at which efforts are compared with the gravity of the SDF model.
 MAX_COMPARED = 500
-#: A sign is told by gravity alone where the model file's is so large [N m], [N] (cables hold less), and this share of
-#: the effort; it is wrong where the effort goes against it by so many standard errors, correlating by less than minus
-#: this.
+#: Smallest gravity effort of the model file [N m], [N] and its smallest share of the effort for a check of the sign.
+#: Smaller gravity may be exceeded by cables. A sign is wrong if the effort opposes gravity by the given number of
+#: standard errors, and if their correlation is below minus the last value.
 MIN_GRAVITY, GRAVITY_SHARE, MIN_GAIN, OPPOSITE = (0.1, 1.0), 0.5, 5.0, 0.7
 
 
 def check_poses(recording: Recording, arm: Arm) -> list[Finding]:
-    """What must be said of poses in either coordinates, with efforts."""
+    """Checks poses in joint or actuator coordinates, with efforts."""
     findings = []
     joints = recording.in_joint_coordinates(arm)
     distinct = len(average_repeated_poses(joints, arm))
@@ -41,7 +41,11 @@ def check_poses(recording: Recording, arm: Arm) -> list[Finding]:
 
 
 def _wrong_sign(recording: Recording, joints: Recording, usable: NDArray[np.bool_], arm: Arm) -> list[Finding]:
-    """In the recording's own coordinates, where a sign is one effort's; `usable` (m, n): no stop carries it."""
+    """Reports efforts of wrong sign.
+
+    The check uses the coordinates of the recording, in which each sign belongs to one effort. Measurements at a joint
+    stop are excluded by `usable` (m, n).
+    """
     rows = np.linspace(0, len(joints) - 1, min(len(joints), MAX_COMPARED)).astype(int)
     gravity, tau = holding_torques(arm, joints.q[rows]), recording.measured_effort()[rows]
     if recording.coordinates == "actuator":
@@ -59,7 +63,10 @@ def _wrong_sign(recording: Recording, joints: Recording, usable: NDArray[np.bool
 
 
 def _sure_correlation(gravity: NDArray[np.float64], tau: NDArray[np.float64]) -> float:
-    """Of the efforts (m,) with gravity's (m,); 0 where gravity is a small part of them, or an offset may explain it."""
+    """Returns the correlation of the efforts (m,) with gravity (m,).
+
+    The result is 0 if gravity is a small part of the efforts or if an offset may explain the correlation.
+    """
     sizes = float(np.linalg.norm(gravity)), float(np.linalg.norm(tau))
     if sizes[0] < GRAVITY_SHARE * sizes[1] or sizes[1] == 0:
         return 0.0

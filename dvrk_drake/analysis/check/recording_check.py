@@ -1,4 +1,4 @@
-"""Checks a recording before anything is identified from it: what is wrong, where, and what to do."""
+"""Checks a recording before identification and reports each problem with its place and advice."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import MIN_ROWS, REST_SPEED, Recording
 
-#: A joint that moves less has never moved [rad], [m].
+#: A joint with a smaller range has not moved [rad], [m].
 MIN_RANGE = 0.02, 0.002
-#: A joint that covers less than this share of its limits hardly tells its parameters.
+#: Smallest share of the range between the limits for a joint's parameters to be well identifiable.
 MIN_COVERAGE = 0.1
-#: Beyond its limits by more than this, a pose is worth a line [rad], [m].
+#: Smallest reported excess of a pose beyond a limit [rad], [m].
 LIMIT_MARGIN = 0.005, 0.0005
-#: A motion's effort beyond its limit by this factor is a spike of the measurement, whatever the limit's own error.
+#: Ratio of a motion's effort to its limit above which the effort is a measurement error, even if the limit is inexact.
 IMPOSSIBLE_EFFORT = 5.0
-#: Nor does it go so far beyond the stops of its linkage [rad].
+#: Excess beyond the joint stops above which a position is a measurement error [rad].
 IMPOSSIBLE_EXCESS = 0.3
-#: Fewest rows in a flat top, and share of all rows that make it one: an effort that stays at its extreme is clipped.
+#: Smallest number of consecutive rows at the extreme effort, and smallest share of all rows, for a clipped effort.
 FLAT_ROWS, FLAT_SHARE = 5, 0.002
-#: Times that q and qd contradict by more than this factor are in another unit or at another rate.
+#: Largest relative deviation of the times from those implied by q and qd. A larger one indicates a wrong unit or rate.
 TIME_TOLERANCE = 0.05
-#: Rows between two positions that are compared.
+#: Number of rows between two compared positions.
 BLOCK = 20
 _ORDER: dict[Severity, int] = {"refusal": 0, "warning": 1, "note": 2}
 
 
 def check_recording(recording: Recording, arm: Arm) -> RecordingReport:
-    """Checks poses or a motion, from CSV or LCM log, in either coordinates. Never raises for what a recording says.
+    """Checks poses or a motion from a CSV file or an LCM log, in joint or actuator coordinates.
 
-    Everything is looked at in both coordinates where it matters: limits are the joints', sensors, motors and friction
-    are the actuators'.
+    Limits are checked in joint coordinates. Sensors, motors and friction are checked in actuator coordinates. Problems
+    of the recording are returned as findings and never raised.
 
     Args:
-        recording: as read.
-        arm: which was recorded.
+        recording: Recording without preprocessing.
+        arm: Arm that was recorded.
     """
     source = recording.source or "recording"
     report = RecordingReport(source, arm.name, "motion" if recording.is_motion else "poses", len(recording))
@@ -141,13 +141,13 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str
             advice = "such peaks may be clipped or spikes of the current's measurement"
             severity: Severity = "note"
             if kind == "motion" and most > IMPOSSIBLE_EFFORT:
-                # A pose may press on a stop, and is excluded later; in a motion a few such rows spoil the whole fit.
+                # A pose may be at a joint stop and is excluded later. In a motion a few such rows spoil the whole fit.
                 severity = "refusal"
                 advice = (
                     "no motor of this arm does that; mend or remove the spikes, or correct the limit in the arm's file"
                 )
             findings.append(Finding(severity, "above effort limit", name, what, advice, (j,), most))
-        # A joint that stands needs a constant effort: that is no saturation.
+        # A joint at rest needs a constant effort, which is not saturation.
         if np.ptp(actuators.q[:, j]) < least_range[j]:
             continue
         measured = actuators.measured_effort()[:, j]
@@ -162,7 +162,7 @@ def _efforts(actuators: Recording, tau: NDArray[np.float64], arm: Arm, kind: str
 
 
 def _flat_share(values: NDArray[np.float64], extreme: float) -> float:
-    """Share of the rows in runs of `FLAT_ROWS` or more at an extreme."""
+    """Returns the share of the rows in runs of at least `FLAT_ROWS` rows at an extreme."""
     at = np.abs(values - extreme) <= 1e-6 * max(abs(extreme), float(np.ptp(values)))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]]).astype(int)))
     lengths = np.diff(edges.reshape(-1, 2), axis=1).ravel()
@@ -170,7 +170,7 @@ def _flat_share(values: NDArray[np.float64], extreme: float) -> float:
 
 
 def _time(recording: Recording, kind: str) -> list[Finding]:
-    """What is wrong with t: it goes back, or q and qd need another unit of it."""
+    """Reports times that decrease, and times whose unit disagrees with q and qd."""
     t, qd = recording.t, recording.qd
     if t is None:
         if qd is not None and np.max(np.sqrt(np.mean(qd**2, axis=0))) > REST_SPEED[0]:
@@ -197,11 +197,14 @@ def _time(recording: Recording, kind: str) -> list[Finding]:
 
 
 def _time_factor(recording: Recording) -> float | None:
-    """Recorded over true time, where most joints that move agree on it within 10 %; None where they do not tell."""
+    """Returns the ratio of recorded to true time.
+
+    Most joints that move must agree on it within 10 %. Otherwise the result is None.
+    """
     t, q, qd = recording.t, recording.q, recording.qd
     if t is None or qd is None or len(t) < MIN_ROWS:
         return None
-    # Over several rows, jitter and repeated rows cancel.
+    # Differences over several rows cancel jitter and repeated rows.
     way = np.diff(
         np.vstack([q[:1] * 0, np.cumsum((qd[1:] + qd[:-1]) / 2 * np.diff(t)[:, None], axis=0)])[::BLOCK], axis=0
     )
@@ -222,19 +225,20 @@ def _without_source(message: str, source: str) -> str:
 
 
 def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -> RecordingReport:
-    """Looks for faults of a recording before anything is identified from it: what `dvrk-drake check` does.
+    """Checks a recording for faults before identification, like `dvrk-drake check`.
 
-    Faults are, among others: units, signs, exchanged channels, efforts at their limit, times that go back, late or
-    repeated signals, joints that never move. Nothing is raised for a fault; it becomes a finding of the report.
+    Faults are, for example, wrong units or signs, exchanged channels, efforts at their limit, decreasing times, late or
+    repeated signals, and joints that do not move. Faults are not raised but returned as findings of the report.
 
     Args:
-        recording: poses or a motion with efforts (m, n), in joint or actuator coordinates, as read.
-        arm: which was recorded.
-        progress: called with the step, "checking the recording", and its finished share 0..1.
+        recording: Poses or motion with efforts (m, n), in joint or actuator coordinates, without preprocessing.
+        arm: Arm that was recorded.
+        progress: Function that is called with the step, "checking the recording", and its completed share 0..1.
 
     Returns:
-        `findings` with severity, place, advice and size, of which `refusals` and `warnings`; numbers of each joint as
-        `joints`; `as_dict` for JSON. `identify` refuses a recording that has refusals.
+        Report with `findings`, each with severity, place, advice and size. Its `refusals` and `warnings` are subsets of
+        them, `joints` has statistics of each joint, and `as_dict` returns the report for JSON. `identify` rejects a
+        recording that has refusals.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -252,7 +256,7 @@ def check(recording: Recording, arm: Arm, *, progress: Progress | None = None) -
     if report.refusals:
         return report
     refusals = _refusals_of_identify(recording, arm)
-    # What a refusal says again, and with what is needed.
+    # Findings repeated by a refusal, together with the required action.
     others = [finding for finding in report.findings if not (refusals and finding.kind == "few poses")]
     return replace(report, findings=(*refusals, *others))
 
@@ -265,19 +269,21 @@ def require_usable(
     channels: bool = False,
     apart_from: str = "",
 ) -> RecordingReport:
-    """Checks a recording before it is used.
+    """Checks a recording and raises an error if it is not usable.
 
     Args:
-        recording, arm: as of `check_recording`.
-        progress: called with the step, "checking the recording", and its finished share 0..1.
-        channels: check them too, see `check_with_channels`.
-        apart_from: kind of findings that do not matter.
+        recording: Recording, see `check_recording`.
+        arm: Arm that was recorded.
+        progress: Function that is called with the step, "checking the recording", and its completed share 0..1.
+        channels: Also checks the channels, see `check_with_channels`.
+        apart_from: Kind of findings that are ignored.
 
     Returns:
         The report, without refusals.
 
     Raises:
-        RecordingError: the first refusal; refusals and warnings are its `findings`.
+        RecordingError: The recording has a refusal. The message is the first one, and the refusals and warnings are
+            the `findings` of the error.
     """
     report_share = step_progress(progress, "checking the recording")
     report_share(0.0)
@@ -293,9 +299,10 @@ def require_usable(
 
 
 def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
-    """As `check_recording`, with the findings of `check_channels` for a recording that has no other refusals.
+    """Checks a recording like `check_recording`, and its channels with `check_channels` if there are no other refusals.
 
-    Exchanged channels look like efforts of a wrong sign: that refusal is replaced by the one that names the cause.
+    Exchanged channels resemble efforts of a wrong sign. A refusal for wrong signs is therefore replaced by the refusal
+    that names the exchanged channels.
     """
     report = check_recording(recording, arm)
     others = [finding for finding in report.refusals if finding.kind != "effort sign"]
@@ -304,7 +311,7 @@ def check_with_channels(recording: Recording, arm: Arm) -> RecordingReport:
     try:
         found = check_channels(recording, arm)
     except RecordingError:
-        return report  # too short or too coarse to be fitted: identify refuses it with that reason
+        return report  # The motion is too short or too coarse for a fit. identify rejects it for that reason.
     if any(finding.severity == "refusal" for finding in found):
         kept = [finding for finding in report.findings if finding.severity != "refusal"]
         return replace(report, findings=(*found, *kept))
@@ -324,5 +331,5 @@ def _refusals_of_identify(recording: Recording, arm: Arm) -> tuple[Finding, ...]
     except (RecordingError, IdentificationError) as error:
         what, _, advice = str(error).removeprefix(f"{recording.source or 'recording'}: ").partition("; ")
         return (Finding("refusal", "identify refuses", "identify", f"will refuse it: {what}", advice),)
-    # Of a motion with rests, they alone are identified from.
+    # For a motion with static segments, only those are used for identification.
     return () if found.recording is recording else check_recording(found.recording, arm).refusals

@@ -1,1 +1,1 @@
-"""Identification of the full dynamics from motions, and how good it is."""
+"""Identification and validation of full dynamic models from motions."""

@@ -1,4 +1,4 @@
-"""What explains an arm's efforts in a motion, column by column, behind the filter that the efforts are behind."""
+"""Builds the low-pass filtered regressor columns of a motion: rigid-body parameters and joint effects."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 
-#: Widths of the smoothed sign, as shares of the coordinate's standard deviation of speed.
+#: Widths of the smoothed sign function, as shares of the standard deviation of the coordinate's speed.
 COULOMB_WIDTHS = (0.03, 0.1, 0.4)
-#: The same width for friction that differs by direction or is more at low speeds.
+#: Width of the smoothed sign function for asymmetric and Stribeck friction.
 DIRECTION_WIDTH = 0.1
 ASYMMETRIC = "asymmetric friction"
-#: What an arm's file can say of a drive -> periods a turn of a sine and a cosine.
+#: Effect names that an arm file accepts, with the periods per turn of their sine and cosine.
 NAMED_EFFECTS = {"spring": 0.0, "cable 1": 1.0, "cable 2": 2.0, ASYMMETRIC: 0.0}
 
 
 @dataclass(frozen=True, eq=False)
 class DynamicColumns:
-    """tau ~ rigid (base phi) + effects c, at r rows behind the filter, actuator by actuator.
+    """Columns of the linear model tau ~ rigid (base phi) + effects c, at r filtered rows, per actuator.
 
     Attributes:
         tau: (r, n) measured efforts of the actuators.
-        base: (b, p) base parameters of the rigid bodies, whatever gravity's direction, from all p of them: links first,
-            then one rotor an actuator.
-        rigid: (r, n, b) of the base parameters.
-        tilts: (2, r, n, b) derivative of `rigid` by the x and y component of gravity [s^2/m].
-        effects: the candidate effects, in the order of the columns.
-        shapes: (r, e) of each effect along its coordinate, for each actuator that it acts on.
-        rows: (e, n) coordinate of each effect: its column of actuator i is shapes[i] * rows[:, i].
+        base: (b, p) matrix that maps all p rigid-body parameters to the base parameters for any gravity direction.
+            The links come first, then one rotor per actuator.
+        rigid: (r, n, b) columns of the base parameters.
+        tilts: (2, r, n, b) derivatives of `rigid` with respect to the x and y components of gravity [s^2/m].
+        effects: Candidate effects, in the order of the columns.
+        shapes: For each actuator, (r, e) shape functions of the effects along their coordinates.
+        rows: (e, n) coordinate of each effect. The columns of actuator i are shapes[i] * rows[:, i].
     """
 
     tau: NDArray[np.float64]
@@ -58,12 +58,13 @@ class DynamicColumns:
 
 
 def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """What every drive has, and what the arm's file says that its drives have (`motion.known_effects`).
+    """Returns the effects that are always in the model.
 
-    Every actuator has an offset; every coordinate viscous, Coulomb and presliding friction.
+    Every actuator has an offset. Every coordinate has viscous, Coulomb and presliding friction. The effects of the arm
+    file (`motion.known_effects`) are added.
 
     Raises:
-        ArmError: the file names a coordinate or a kind that there is not.
+        ArmError: The file names an unknown coordinate or an unknown effect.
     """
     known = arm.identification.known_effects
     if unknown := set(known) - set(distinct_coordinates(arm)):
@@ -84,7 +85,7 @@ def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
 
 
 def named_effects(arm: Arm, q: NDArray[np.float64]) -> list[ActuatorEffect]:
-    """Springs and cables that the arm's file names (`motion.known_effects`), over positions q (m, n) of the joints."""
+    """Returns the springs and cables of the arm file (`motion.known_effects`) for joint positions q (m, n)."""
     effects = []
     for name, kinds in arm.identification.known_effects.items():
         x = position_along(arm, name, q)
@@ -93,7 +94,7 @@ def named_effects(arm: Arm, q: NDArray[np.float64]) -> list[ActuatorEffect]:
 
 
 def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
-    """What a motion may show beside: what an arm's file can name, friction that grows at low speeds or with load."""
+    """Returns the candidate effects: springs, cables and asymmetric, Stribeck and load-dependent friction."""
     effects = []
     for name, x, v in _coordinates(arm, grid):
         if v.std() == 0:
@@ -102,7 +103,8 @@ def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
         effects += [ActuatorEffect(name, kind, _rounded(DIRECTION_WIDTH * v.std())) for kind in kinds]
         known = arm.identification.known_effects.get(name, [])
         for which in NAMED_EFFECTS:
-            # Beside known torques by position, others say the same between the poses of a motion, and run apart beyond.
+            # Next to known position-dependent torques, others are redundant within the range of the motion. Outside of
+            # that range they diverge.
             by_position = which != ASYMMETRIC
             if which in known or (by_position and set(known) - {ASYMMETRIC}):
                 continue
@@ -114,7 +116,7 @@ def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
 def _named(
     arm: Arm, coordinate: str, which: str, x: NDArray[np.float64], v: NDArray[np.float64]
 ) -> list[ActuatorEffect]:
-    """What an arm's file calls `which`."""
+    """Returns the effects that the arm file names `which`."""
     where = f"{arm.source}: motion.known_effects.{coordinate}"
     if which not in NAMED_EFFECTS:
         raise ArmError(f'{where}: unknown "{which}"; known: {", ".join(NAMED_EFFECTS)}')
@@ -131,16 +133,16 @@ def _named(
 def dynamic_columns(
     grid: MotionGrid, tau: NDArray[np.float64], regressor: DynamicRegressor, effects: Sequence[ActuatorEffect]
 ) -> DynamicColumns:
-    """Columns of all parameters and effects.
+    """Computes the columns of all parameters and effects.
 
     Args:
-        grid: the motion.
+        grid: Motion, resampled.
         tau: (rows, n) recorded efforts of the actuators.
-        regressor: of the arm, mounted as expected.
-        effects: to make columns of.
+        regressor: Regressor of the arm with its nominal mounting.
+        effects: Effects to compute columns for.
     """
     arm = grid.arm
-    # Efforts are linear in gravity: those at rest under a gravity of one are the derivative.
+    # Efforts are linear in gravity. The efforts at rest under unit gravity are therefore the derivative.
     lying = [regressor.with_gravity(axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]) if arm.identification.base_may_tilt]
     columns = base_columns([regressor, *lying])
     rigid = _filtered(grid, regressor.regressor(grid.q, grid.v, grid.vd), columns)
@@ -168,11 +170,12 @@ def dynamic_columns(
 
 
 class BaseColumns(NamedTuple):
-    """Columns of an arm's regressors that the others depend on, see `independent_columns`.
+    """Linearly independent columns of an arm's regressor, see `independent_columns`.
 
     Attributes:
-        independent, base: (b,) and (b, p), as `independent_columns` returns them.
-        moves: (n, b) where a column is not 0 for a joint.
+        independent: (b,) indices of the independent columns.
+        base: (b, p) matrix that maps all parameters to the base parameters.
+        moves: (n, b) mask of the columns that are not 0 for a joint.
     """
 
     independent: NDArray[np.int_]
@@ -182,9 +185,11 @@ class BaseColumns(NamedTuple):
     def of_actuator(
         self, Y: NDArray[np.float64], drives: NDArray[np.float64]
     ) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
-        """Which of the b columns an actuator has, and these (m, c), from a regressor (m, n, p) of the joints.
+        """Returns the indices (c,) and values (m, c) of the nonzero columns of one actuator.
 
-        `drives` (n,): by how much each joint moves per unit of the actuator.
+        Args:
+            Y: (m, n, p) regressor of the joints.
+            drives: (n,) motion of each joint per unit of the actuator.
         """
         joints = np.flatnonzero(drives)
         own = np.flatnonzero(np.any(self.moves[joints], axis=0))
@@ -192,7 +197,7 @@ class BaseColumns(NamedTuple):
 
 
 def base_columns(regressors: Sequence[DynamicRegressor]) -> BaseColumns:
-    """Finds columns that suffice for one arm under all given gravities, without coupled rotors (`rotor_inertias`)."""
+    """Finds the independent columns of one arm for all given gravities, without coupled rotors (`rotor_inertias`)."""
     arm, p = regressors[0].arm, len(regressors[0].values)
     generator = np.random.default_rng(0)
     q, v, vd = generator.normal(0, 2, (3, p // 2, arm.num_joints))
@@ -203,7 +208,7 @@ def base_columns(regressors: Sequence[DynamicRegressor]) -> BaseColumns:
 
 
 def _filtered(grid: MotionGrid, Y: NDArray[np.float64], columns: BaseColumns) -> NDArray[np.float64]:
-    """(r, n, b) independent columns of the actuators behind the filter, from a regressor (m, n, p) of the joints."""
+    """Returns the filtered independent columns (r, n, b) of the actuators for a joint regressor (m, n, p)."""
     out = np.zeros((len(range(*grid.inner.indices(len(grid.row_times)))), Y.shape[1], len(columns.independent)))
     for i, drives in enumerate(grid.arm.transmission.inverse.matrix.T):
         own, of_actuator = columns.of_actuator(Y, drives)
@@ -212,12 +217,12 @@ def _filtered(grid: MotionGrid, Y: NDArray[np.float64], columns: BaseColumns) ->
 
 
 def _coordinates(arm: Arm, grid: MotionGrid) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
-    """(name, x, v) of every coordinate of the drive."""
+    """Returns name, position and velocity of every coordinate of the drives."""
     rows, a_dot = arm.effect_coordinates, arm.transmission.velocity(grid.v)
     names = distinct_coordinates(arm)
     return [(name, position_along(arm, name, grid.q), a_dot @ rows[name]) for name in names]
 
 
 def _rounded(x: float) -> float:
-    """To three digits: a scale is a choice, not a measurement."""
+    """Rounds a scale to three significant digits, because a scale is chosen and not measured."""
     return float(f"{x:.3g}")

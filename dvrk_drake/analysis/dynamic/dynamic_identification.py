@@ -1,4 +1,4 @@
-"""An arm's full dynamics from one recorded motion: links that can exist, rotors, and the effects in the drive."""
+"""Identifies the full dynamics of an arm from one recorded motion: consistent links, rotors and drive effects."""
 
 from __future__ import annotations
 
@@ -29,20 +29,21 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
-#: An effect whose effort is below this share of the actuators' is left out of the model.
+#: Effects below this share of the actuators' RMS effort are omitted from the model.
 MIN_EFFECT = 1e-4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class DynamicIdentification(Identification):
-    """A model identified from a motion; it has `dynamics`, and its base parameters are those of the links there.
+    """Model identified from a motion. It has `dynamics`, and its base parameters are computed from those links.
 
     Attributes:
-        grid: the motion.
-        period: after which the motion repeats [s], or None.
-        measured, predicted: (r, n) efforts of the actuators behind the filter, ends left out [N m, N].
-        dry_friction: coordinate -> Coulomb and presliding friction together and its standard error [N m, N].
-        nominal_mass: of all links as the SDF has them [kg].
+        grid: Motion, resampled.
+        period: Period of the motion [s], or None.
+        measured: (r, n) measured efforts of the actuators after low-pass filtering, without the ends [N m, N].
+        predicted: (r, n) predicted efforts, processed in the same way [N m, N].
+        dry_friction: Sum of Coulomb and presliding friction per coordinate, with its standard error [N m, N].
+        nominal_mass: Total mass of the links in the SDF [kg].
     """
 
     grid: MotionGrid
@@ -58,23 +59,24 @@ def identify_dynamic(
 ) -> DynamicIdentification:
     """Identifies the dynamics of `arm` from a motion.
 
-    Efforts and all that explains them are compared behind the same low-pass. Every drive gets an offset, and viscous,
-    smoothed Coulomb and presliding friction at its actuators and at the joints that actuators share; springs, cables
-    and friction that differs by direction are there where the arm's files know of them, others are chosen by
-    cross-validation over the phases of the motion. The links' parameters are those nearest to the recording that bodies
-    can have, the SDF's where it says nothing (`consistent_parameters`). The direction of gravity is found along where
-    the arm's file says that its base may tilt. The cross-validated errors are of models that know nothing of the phases
-    they predict (`cross_validate`).
+    Measured efforts and regressor columns pass the same low-pass filter. Every actuator has an offset. Actuators, and
+    joints that share actuators, have viscous, smoothed Coulomb and presliding friction. Springs, cables and asymmetric
+    friction are included if the arm file lists them. Further effects are chosen by cross-validation over the phase of
+    the motion.
+
+    The link parameters are physically consistent. They fit the recording, and stay at the values of the SDF where the
+    recording is not informative (`consistent_parameters`). The direction of gravity is estimated if the arm file allows
+    a base tilt. The cross-validated errors are prediction errors on held-out phases (`cross_validate`).
 
     Args:
-        recording: a motion with t and tau, in either coordinates.
-        arm: which was recorded.
-        progress: called with the finished share, 0..1.
+        recording: Motion with t and tau, in actuator or joint coordinates.
+        arm: Arm that was recorded.
+        progress: Callback that receives the finished share, 0 to 1.
 
     Raises:
-        RecordingError: the recording does not fit the arm, or is no motion.
-        IdentificationError: the program for consistent parameters did not converge, or the model predicts the effort of
-            an actuator that moves worse than zero torque does.
+        RecordingError: The recording does not fit the arm, or is not a motion.
+        IdentificationError: The program for consistent parameters did not converge, or the prediction for a moving
+            actuator is worse than zero torque.
     """
     grid = motion_grid(recording, arm, default_settings(arm))
     tau = recording.in_actuator_coordinates(arm).measured_effort()
@@ -111,7 +113,7 @@ def identify_dynamic(
 
 
 def _refuse_worse_than_zero(recording: Recording, grid: MotionGrid, errors: NDArray[np.float64]) -> None:
-    """Raises IdentificationError if a cross-validated relative error (n,) of an actuator that moves exceeds 1."""
+    """Raises IdentificationError if the cross-validated relative error (n,) of a moving actuator exceeds 1."""
     arm = grid.arm
     moves = np.sqrt(np.mean(arm.transmission.velocity(grid.v) ** 2, axis=0)) > arm.per_joint(*REST_SPEED)
     if len(bad := np.flatnonzero(moves & (errors > 1))):
@@ -125,23 +127,28 @@ def _refuse_worse_than_zero(recording: Recording, grid: MotionGrid, errors: NDAr
 def motion_problem(
     grid: MotionGrid, tau: NDArray[np.float64], period: float | None, effects: Sequence[ActuatorEffect] | None = None
 ) -> DynamicProblem:
-    """The least squares of a motion; tau (m, n): the actuators' measured efforts, a row of the recording each.
+    """Returns the least-squares problem of a motion.
 
-    `effects`: the only ones, where they are known.
+    Args:
+        grid: Motion, resampled.
+        tau: (m, n) measured efforts of the actuators, one row per row of the recording.
+        period: Period of the motion [s], or None.
+        effects: Effects of the model. By default they are the drive effects and the optional effects.
     """
     always = effects if effects is not None else drive_effects(grid.arm, grid)
     candidates = [] if effects is not None else optional_effects(grid.arm, grid)
     regressor = DynamicRegressor(grid.arm)
     columns = dynamic_columns(grid, tau, regressor, [*always, *candidates])
     fold, edge = phase_folds(grid, period)
-    # A low-passed effort has two independent values a period of the cut-off; repetitions say the same again.
+    # A low-pass filtered effort has two independent values per period of the cut-off frequency. Repetitions of the
+    # motion add none.
     duration = len(columns.tau) / grid.rate
     independent = 2 * grid.settings.effort_cut_off * min(duration, period or duration)
     return DynamicProblem(columns, regressor, fold, edge, min(independent, len(columns.tau)), len(always))
 
 
 def residuals(problem: DynamicProblem, chosen: NDArray[np.int_], fit: ConsistentFit) -> NDArray[np.float64]:
-    """(r, n) what a fit with these effects leaves of the efforts, on the rows of `problem`."""
+    """Returns the effort residuals (r, n) of a fit with these effects, on the rows of `problem`."""
     columns, p = problem.columns, problem.num_rigid
     drive = np.column_stack(
         [columns.shapes[i][:, chosen] @ (columns.rows[chosen, i] * fit.x[p:]) for i in range(columns.tau.shape[1])]

@@ -1,4 +1,4 @@
-"""The parameters that an identification found, with standard errors and correlations from its fit."""
+"""Identified parameters with standard errors and correlations."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.dynamics.physical_consistency import reached_bounds
 from dvrk_drake.models.arm import Arm
 
-#: Above this size of their correlation the data tell the sum or difference of two parameters, hardly each of them.
+#: Above this absolute correlation two parameters are not identifiable separately, only their sum or difference is.
 STRONG_CORRELATION = 0.95
 
 
 @dataclass(frozen=True)
 class StrongCorrelation:
-    """Two parameters that the data hardly tell apart; `correlation` of their estimates, -1..1."""
+    """Two parameters that are not identifiable separately, with the correlation of their estimates, -1 to 1."""
 
     first: str
     second: str
@@ -45,12 +45,12 @@ class StrongCorrelation:
 
 @dataclass(frozen=True, eq=False)
 class ParameterUncertainty:
-    """Of the estimates of b parameters.
+    """Standard errors and correlations of the estimates of b parameters.
 
     Attributes:
-        names: (b,).
-        standard_errors: (b,) in the parameters' units.
-        correlation: (b, b) of the estimates.
+        names: (b,) names of the parameters.
+        standard_errors: (b,) standard errors in the units of the parameters.
+        correlation: (b, b) correlations of the estimates.
     """
 
     names: tuple[str, ...]
@@ -59,22 +59,22 @@ class ParameterUncertainty:
 
     @classmethod
     def of_covariance(cls, names: Sequence[str], covariance: NDArray[np.float64]) -> ParameterUncertainty:
-        """From the covariance (b, b) of the estimates."""
+        """Constructs the uncertainty from the covariance (b, b) of the estimates."""
         spread = np.sqrt(np.diag(covariance))
         return cls(tuple(names), spread, covariance / np.outer(spread, spread))
 
     def strong_correlations(self, limit: float = STRONG_CORRELATION) -> list[StrongCorrelation]:
-        """Pairs whose correlation exceeds `limit` in size, the strongest first."""
+        """Returns the pairs whose absolute correlation exceeds `limit`, in descending order."""
         size = np.abs(np.triu(self.correlation, 1))
         pairs = sorted(np.argwhere(size > limit).tolist(), key=lambda pair: -size[tuple(pair)])
         return [StrongCorrelation(self.names[i], self.names[k], float(self.correlation[i, k])) for i, k in pairs]
 
 
-#: Errors of an effort further apart than this have nothing to do with each other, but for whole periods [s].
+#: Longest time lag at which effort errors are assumed correlated, apart from whole periods [s].
 MEMORY = 1.0
-#: Rows are taken this many times as often as the cut-off of the low-pass needs.
+#: Sampling rate of the rows, relative to the rate that the cut-off of the low-pass filter requires.
 _OVERSAMPLING = 2.0
-#: Two passes that overlap by less than this share of the motion do not tell what repeats.
+#: Least overlap of two passes, as a share of the motion, for estimating the error that repeats.
 _MIN_OVERLAP = 0.2
 
 
@@ -86,25 +86,27 @@ def parameter_covariance(
     cut_off: float,
     period: float | None,
 ) -> NDArray[np.float64]:
-    """(p + e, p + e) covariance of `fit.x`, given the effects; inequalities are not counted as knowledge.
+    """Returns the covariance (p + e, p + e) of `fit.x` for the given effects.
 
-    With A = (X'WX + P)^-1, the inverse of the second derivative of the cost,
+    Inequality constraints are not treated as information. With A = (X'WX + P)^-1, the inverse Hessian of the cost,
 
         covariance = A (sum_i w_i^2 X_i' Omega_i X_i + P) A,
 
-    P being what the priors know and Omega_i the covariance of actuator i's error over time, as the residuals show it:
-    errors that last (friction that is not modelled quite right) count as few measurements, and those that come again
-    in every period of the motion count once, whatever the number of periods. Residuals of a fit are smaller than the
-    errors where it could bend to them, those of phases that it has not seen are larger by as much: with H the hat
-    matrix, (1 - H) e and e / (1 - H). The products of one with the other are neither (MacKinnon and White, "Some
+    where P is the precision of the priors and Omega_i is the covariance of the error of actuator i over time. Omega_i
+    is estimated from the residuals. Slowly varying errors, such as those of the friction model, therefore count as few
+    measurements. Errors that repeat in every period of the motion count once, whatever the number of periods.
+
+    Residuals of a fit, (1 - H) e with the hat matrix H, are smaller than the errors. Residuals of held-out phases,
+    e / (1 - H), are larger by the same factor. Their products are unbiased (MacKinnon and White, "Some
     heteroskedasticity-consistent covariance matrix estimators", 1985: HC2).
 
     Args:
-        problem, fit: as solved.
-        residuals: (r, n) what the fit leaves of the efforts.
-        rate: of the rows [Hz].
-        cut_off: of the low-pass that they are behind [Hz].
-        period: after which the motion repeats [s], or None.
+        problem: Problem that was solved.
+        fit: Its solution.
+        residuals: (r, n) effort residuals of the fit.
+        rate: Rate of the rows [Hz].
+        cut_off: Cut-off of the low-pass filter of the efforts [Hz].
+        period: Period of the motion [s], or None.
     """
     step = max(1, int(rate / (2 * cut_off * _OVERSAMPLING)))
     rows = slice(None, None, step)
@@ -126,7 +128,10 @@ def _unseen_residuals(
     columns: Sequence[OwnColumns],
     to_base: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """(r, n) what is left of each fold by the fit to the others: one step of Newton's, exact but for inequalities."""
+    """Returns the residuals (r, n) of each fold for a fit to the other folds.
+
+    One Newton step gives the exact fit, except for changes of active inequality constraints.
+    """
     unseen = residuals.copy()
     free = np.flatnonzero(fit.x > fit.lower)
     to_free = to_base[:, free]
@@ -143,12 +148,16 @@ def _unseen_residuals(
 def error_covariance(
     seen: NDArray[np.float64], unseen: NDArray[np.float64], rate: float, period: float | None
 ) -> NDArray[np.float64]:
-    """(r,) covariance of an actuator's error with itself, by how many rows later.
+    """Returns the autocovariance (r,) of an actuator's error, by lag in rows.
 
-    `seen` and `unseen` (r,) are its residuals when the fit knew these rows and when it did not.
+    Up to a lag of `MEMORY` it is the covariance of the error, tapered with a Parzen window. At whole periods it is the
+    covariance of the repeating part of the error, estimated from the first repetition.
 
-    Up to `MEMORY` it is the error's own, tapered (Parzen's window); whole periods later that of the part of it that
-    repeats, which is what the first repetition shows.
+    Args:
+        seen: (r,) residuals of a fit to all rows.
+        unseen: (r,) residuals of fits without these rows.
+        rate: Rate of the rows [Hz].
+        period: Period of the motion [s], or None.
     """
     count = len(seen)
     both = correlation(seen, unseen)
@@ -173,7 +182,7 @@ def _parzen(u: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _nearest_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Estimates of covariances can have negative spectra, which no error has."""
+    """Returns the nearest covariance with a nonnegative spectrum, because estimates can have negative spectra."""
     circulant = np.concatenate([covariance, covariance[-1:0:-1]])
     spectrum = np.maximum(np.fft.rfft(circulant).real, 0.0)
     return np.asarray(np.fft.irfft(spectrum, len(circulant))[: len(covariance)], dtype=np.float64)
@@ -184,23 +193,23 @@ def _inverse(H: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale), dtype=np.float64)
 
 
-#: A base parameter of which the motion took away less than this share of the prior's variance is not told by it.
+#: Least share of the prior variance that the motion must remove for a base parameter to count as identifiable.
 MIN_IDENTIFIABILITY = 0.5
-#: What rubs at any speed: `dry_friction` sums these up.
+#: Effect kinds that `dry_friction` sums.
 DRY_KINDS = ("coulomb", "presliding")
 
 
 class DynamicEstimates:
-    """The estimates of one fit."""
+    """Parameter estimates of one fit."""
 
     def __init__(self, problem: DynamicProblem, fit: ConsistentFit, covariance: NDArray[np.float64]) -> None:
-        """covariance: (p + e, p + e) of `fit.x`, see `parameter_covariance`."""
+        """Stores the fit and the covariance (p + e, p + e) of `fit.x`, see `parameter_covariance`."""
         self._problem, self._fit, self._covariance = problem, fit, covariance
         self._prior = np.linalg.inv(fit.prior_precision)
         self._effects = [problem.columns.effects[k] for k in fit.chosen]
 
     def links(self) -> list[LinkEstimate]:
-        """Of every link."""
+        """Returns the estimates of every link."""
         estimates = []
         for k, link in enumerate(self._problem.regressor.links):
             chosen = slice(10 * k, 10 * k + 10)
@@ -218,13 +227,13 @@ class DynamicEstimates:
         return estimates
 
     def base_parameters(self) -> tuple[list[MotionParameterEstimate], list[CorrelatedEstimates]]:
-        """Of the base parameters, and which of them are hardly told apart from each other or from an effect."""
+        """Returns the base parameters, and the strong correlations between them and with effects."""
         problem, p = self._problem, self._problem.num_rigid
         base = derive_base_parameters(problem.regressor, coupled_rotors=False)
         B = base.combination
         values = B @ self._fit.x[:p]
         before = np.einsum("bp,pq,bq->b", B, self._prior[:p, :p], B)
-        # Of the effects those that are there: beside their bound, 0, they tell nothing.
+        # Effects at their lower bound, 0, are not included.
         there = p + np.flatnonzero(self._fit.x[p:] != 0)
         to_all = np.zeros((len(B) + len(there), len(self._fit.x)))
         to_all[: len(B), :p] = B
@@ -244,7 +253,7 @@ class DynamicEstimates:
         ]
 
     def dry_friction(self) -> dict[str, tuple[float, float]]:
-        """Coordinate -> size of the dry friction in both directions, Coulomb and presliding, and its standard error."""
+        """Returns the dry friction (Coulomb and presliding) of each coordinate with its standard error."""
         p = self._problem.num_rigid
         friction = {}
         for name in dict.fromkeys(effect.coordinate for effect in self._effects):
@@ -266,12 +275,12 @@ def _identifiability(variance: float, before: float) -> float:
 def base_parameter_estimates(
     arm: Arm, section: DynamicSection, covariance: NDArray[np.float64]
 ) -> list[BaseParameterEstimate]:
-    """Base parameters of the section's links, with standard errors.
+    """Returns the base parameters of the section's links with standard errors.
 
     Args:
-        arm: mounted as the section says.
-        section: the identified dynamics.
-        covariance: of the links' parameters, which come first.
+        arm: Arm, mounted as in the section.
+        section: Identified dynamics.
+        covariance: Covariance of the parameters. The link parameters come first.
     """
     gravity = gravity_parameters(arm)
     B = gravity.combination_of([link.link for link in section.links])

@@ -1,4 +1,4 @@
-"""Least squares over many parts of a motion at once: sums of squares and products, fold by fold, and what they give."""
+"""Normal equations of a motion, accumulated per fold, and non-negative least squares on them."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-#: Exchanges of unknowns between positive and 0 that are tried.
+#: Largest number of exchanges of unknowns between the positive set and the zero set.
 MAX_EXCHANGES = 10
-#: Indices of an actuator's own columns among all, and these (r, c); the others are 0 for it.
+#: Indices of the nonzero columns of an actuator, and these columns (r, c).
 OwnColumns = tuple[NDArray[np.int_], NDArray[np.float64]]
 
 
 @dataclass(frozen=True, eq=False)
 class SquareSums:
-    """[X tau]'[X tau] of every actuator over some rows.
+    """Products [X tau]'[X tau] of every actuator, summed over some rows.
 
     Attributes:
-        size: k + 1, of all columns and the measured effort, which is the last.
-        own: (n) indices of each actuator's own columns, with that of the effort.
-        blocks: (n) their (c, c) sums of products.
+        size: k + 1, the number of columns with the measured effort, which is the last.
+        own: (n) indices of the nonzero columns of each actuator, with that of the effort.
+        blocks: (n) sums of products (c, c) of these columns.
     """
 
     size: int
@@ -33,33 +33,34 @@ class SquareSums:
     blocks: tuple[NDArray[np.float64], ...]
 
     def weighted(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(k + 1, k + 1) sum over the actuators, each times its weight."""
+        """Returns the sum (k + 1, k + 1) over the actuators, each multiplied by its weight."""
         sums = np.zeros((self.size, self.size))
         for weight, own, block in zip(weights, self.own, self.blocks, strict=True):
             sums[own[:, None], own] += weight * block
         return sums
 
     def squares(self, combination: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n,) sum of squares of a combination (k + 1,) of the columns and the effort."""
+        """Returns the sum of squares (n,) of a linear combination (k + 1,) of the columns and the effort."""
         parts = [combination[own] for own in self.own]
         return np.array([max(x @ block @ x, 0.0) for x, block in zip(parts, self.blocks, strict=True)])
 
     def squared_errors(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n,) sum of squares that x (k,) leaves of the efforts."""
+        """Returns the sum of squared residuals (n,) for x (k,)."""
         return self.squares(np.append(-x, 1.0))
 
     def dense(self) -> NDArray[np.float64]:
-        """(n, k + 1, k + 1)."""
+        """Returns the products (n, k + 1, k + 1) as a dense array."""
         return np.array([self.weighted(unit) for unit in np.eye(len(self.own))])
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """[X tau]'[X tau] of every actuator over every part of a motion.
+    """Products [X tau]'[X tau] of every actuator, for every fold of a motion.
 
     Attributes:
-        size, own: as of `SquareSums`.
-        products: (n) of (folds, 3, c, c); the three parts of a fold are its start, its middle and its end.
+        size: As in `SquareSums`.
+        own: As in `SquareSums`.
+        products: (n) products (folds, 3, c, c). The three parts of a fold are its start, its middle and its end.
     """
 
     size: int
@@ -75,14 +76,14 @@ class NormalEquations:
         fold: NDArray[np.int_] | None = None,
         edge: NDArray[np.bool_] | None = None,
     ) -> NormalEquations:
-        """Sums up.
+        """Accumulates the products.
 
         Args:
-            columns: of each of the n actuators.
-            size: k, number of all columns.
-            tau: (r, n).
-            fold: (r,) of each row; by default there is one.
-            edge: (r, 2) whether it is at the start, at the end of its fold.
+            columns: Columns of each of the n actuators.
+            size: k, the number of all columns.
+            tau: (r, n) measured efforts.
+            fold: (r,) fold of each row. By default there is one fold.
+            edge: (r, 2) masks of the rows at the start and at the end of their fold.
         """
         fold = np.zeros(len(tau), dtype=int) if fold is None else fold
         edge = np.zeros((len(tau), 2), dtype=bool) if edge is None else edge
@@ -104,11 +105,11 @@ class NormalEquations:
         return self.products[0].shape[0]
 
     def others(self, first: int, count: int) -> NDArray[np.int_]:
-        """(folds - count,) which folds come after `count` from `first` on, in their circle."""
+        """Returns the indices (folds - count,) of the folds that follow `count` folds from `first` on, cyclically."""
         return np.arange(first + count, first + self.folds) % self.folds
 
     def without(self, first: int, count: int) -> NormalEquations:
-        """Of the other folds, without the edges that touch those."""
+        """Returns the products of the other folds, without the edges that adjoin the removed folds."""
         products = tuple(p[self.others(first, count)] for p in self.products)
         for p in products:
             p[0, 0] = 0.0
@@ -117,16 +118,16 @@ class NormalEquations:
 
     @cached_property
     def total(self) -> SquareSums:
-        """Over the whole motion."""
+        """Sums over the whole motion."""
         return self._sums(p.sum(axis=(0, 1)) for p in self.products)
 
     def of_fold(self, fold: int, count: int = 1) -> SquareSums:
-        """Over `count` folds from one on."""
+        """Returns the sums over `count` folds from `fold` on."""
         chosen = np.arange(fold, fold + count) % self.folds
         return self._sums(p[chosen].sum(axis=(0, 1)) for p in self.products)
 
     def without_fold(self, fold: int, count: int = 1) -> SquareSums:
-        """Over all rows but those of `count` folds from one on and those of neighbours that touch."""
+        """Returns the sums over all rows except those of `count` folds and the adjoining edges of their neighbours."""
         before, after = (fold - 1) % self.folds, (fold + count) % self.folds
         out = self.of_fold(fold, count).blocks
         blocks = zip(self.total.blocks, out, self.products, strict=True)
@@ -137,11 +138,11 @@ class NormalEquations:
 
 
 class NonNegativeFit:
-    """x (k,) that minimises a weighted sum of squares, some of it not negative, for one choice of unknowns or one more.
+    """Weighted non-negative least squares for one set of unknowns, or for this set and one more.
 
-    |y|^2 - 2 y' X x + x' (X' X + diag(precision)) x is least at x. What may have any sign is eliminated first, which
-    leaves the Schur complement of the others; one more unknown is a row more of it, or one more step of elimination.
-    What remains is a small problem of non-negative least squares.
+    The solution x (k,) minimises |y|^2 - 2 y' X x + x' (X' X + diag(precision)) x. Unknowns without a sign constraint
+    are eliminated first, which leaves the Schur complement of the others. One more unknown adds one row to it, or one
+    step of elimination. The rest is a small non-negative least-squares problem.
     """
 
     def __init__(
@@ -152,14 +153,14 @@ class NonNegativeFit:
         used: NDArray[np.int_],
         others: NDArray[np.int_] | None = None,
     ) -> None:
-        """Eliminates.
+        """Eliminates the unknowns without a sign constraint.
 
         Args:
             sums: (k + 1, k + 1) weighted sums of squares and products, the measured effort last.
-            precision: (k,) one over the variance of each unknown about 0, before the recording; positive.
-            non_negative: (k,).
-            used: indices of the unknowns; the others are 0.
-            others: indices of those that `solve` may add.
+            precision: (k,) reciprocal prior variance of each unknown about 0, positive.
+            non_negative: (k,) mask of the unknowns that must not be negative.
+            used: Indices of the unknowns. All others are 0.
+            others: Indices of the unknowns that `solve` may add.
         """
         self._scale = np.append(1 / np.sqrt(np.diag(sums)[:-1] + precision), 1.0)
         self._free, bound = used[~non_negative[used]], used[non_negative[used]]
@@ -180,7 +181,7 @@ class NonNegativeFit:
         self._positive = self._minimum(self._schur, self._bound) > 0
 
     def solve(self, added: int | None = None) -> NDArray[np.float64]:
-        """x (k,), with one of `others` if given."""
+        """Returns x (k,), optionally with one of `others` added."""
         S, bound = self._schur, self._bound
         y = np.zeros(len(self._rest))
         if added is not None:
@@ -201,10 +202,10 @@ class NonNegativeFit:
         return (x * self._scale)[:-1]
 
     def _minimum(self, S: NDArray[np.float64], bound: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Returns y >= 0 that minimises y' S y / 2 - b' y, from the unknowns that are positive without the new one.
+        """Returns y >= 0 that minimises y' S y / 2 - b' y, starting from the current positive set.
 
-        All unknowns whose sign, or whose slope at 0, is wrong change sides at once (Portugal, Judice and Vicente,
-        1994), which takes a few solutions; should it cycle, Lawson and Hanson's method follows.
+        All unknowns with a wrong sign, or with a wrong slope at 0, change sets at once (Portugal, Judice and Vicente,
+        1994). This takes a few solutions. If it cycles, the method of Lawson and Hanson is used.
         """
         H, b = S[bound[:, None], bound], S[bound, -1]
         positive = np.append(self._positive, np.ones(len(b) - len(self._positive), dtype=bool))

@@ -1,4 +1,4 @@
-"""The identification of an arm's dynamics as least squares: unknowns, what is known of them before, and their fit."""
+"""Least-squares problem of dynamic identification: unknowns, their priors, and the fit."""
 
 from __future__ import annotations
 
@@ -23,34 +23,36 @@ from dvrk_drake.dynamics.physical_consistency import (
     log_det_curvature,
 )
 
-#: Deviation of an inertial parameter from the SDF's, as a share of the link's own size; chosen by cross-validation.
+#: Prior deviation of an inertial parameter from the SDF, as a share of the link's scale. Chosen by cross-validation.
 LINK_DEVIATION = 0.3
-#: Least deviation of a rotor's inertia, and its least value as a share of the SDF's [kg m^2].
+#: Least prior deviation of a rotor inertia [kg m^2], and its least value as a share of the value in the SDF.
 MIN_ROTOR_DEVIATION, MIN_ROTOR_SHARE = 3e-6, 0.1
-#: Deviation of an effect about 0, as a share of the RMS efforts it acts on: of friction, of which there are many shapes
-#: that add up; of torques by position that a drive is known to have, which gravity may balance; of all others.
+#: Prior deviations of an effect about 0, as shares of the RMS effort that it acts on. The first is for friction, where
+#: several shapes add up. The second is for known position-dependent torques, which may balance gravity. The third is
+#: for all other effects.
 FRICTION_DEVIATION, KNOWN_DEVIATION, EFFECT_DEVIATION = 0.1, 1.0, 0.3
-#: Deviation of gravity's direction [rad]: how level a base stands.
+#: Prior deviation of the direction of gravity [rad], from the accuracy of levelling a base.
 TILT_DEVIATION = 0.05
-#: The SDF says all about directions of the rigid body's parameters that the recording knows this much less of.
+#: Directions in parameter space with less information than this, relative to the prior, keep the values of the SDF.
 _NEGLIGIBLE = 1e-2
-#: A rotor that the SDF models as a link is balanced: this share of the deviations of other links' first moments.
+#: Deviation of the first moments of rotors that the SDF models as links, relative to other links. Rotors are balanced.
 _BALANCE = 1e-6
-#: Relative error that weighs the efforts before anything is fitted.
+#: Relative error for weighting the efforts before the first fit.
 _FIRST_ERROR = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class DynamicProblem:
-    """One motion's columns with the prior of all unknowns.
+    """Columns of one motion with the prior of all unknowns.
 
     Attributes:
-        columns: candidate effects and the rigid body's parameters, behind the filter.
-        regressor: whose SDF the prior is around.
-        tilt: (2,) change of gravity's x and y [m/s^2] that the columns are made for.
-        fold, edge: see `phase_folds`.
-        independent: how many rows are independent measurements of an effort; the others repeat them.
-        num_always: so many effects, the first ones, are in every model; the others are candidates.
+        columns: Filtered columns of the rigid-body parameters and the candidate effects.
+        regressor: Regressor of the arm. The prior is centred on its SDF.
+        tilt: (2,) change of the x and y components of gravity that is included in the columns [m/s^2].
+        fold: Fold of each row, see `phase_folds`.
+        edge: Edges of the folds, see `phase_folds`.
+        independent: Number of rows that are independent measurements of an effort.
+        num_always: Number of effects, the first ones, that are in every model. The others are candidates.
     """
 
     columns: DynamicColumns
@@ -63,7 +65,7 @@ class DynamicProblem:
 
     @property
     def num_rigid(self) -> int:
-        """Number of the rigid body's parameters, one rotor an actuator included."""
+        """Number of rigid-body parameters, including one rotor per actuator."""
         return self.columns.base.shape[1]
 
     @property
@@ -73,28 +75,28 @@ class DynamicProblem:
 
     @property
     def candidates(self) -> NDArray[np.int_]:
-        """Indices of the effects that are chosen only if they help."""
+        """Indices of the effects that are included only if they reduce the error."""
         return np.arange(self.num_always, self.num_effects)
 
     @cached_property
     def efforts(self) -> NDArray[np.float64]:
-        """(n,) sum of squares of the measured efforts."""
+        """Sums of squares (n,) of the measured efforts."""
         return np.asarray(np.sum(self.columns.tau**2, axis=0))
 
     @cached_property
     def rigid(self) -> NDArray[np.float64]:
-        """(r, n, b) columns of the rigid body's base parameters, tilted."""
+        """Columns (r, n, b) of the rigid-body base parameters, with the tilt."""
         tilts = self.columns.tilts
         return self.columns.rigid + np.tensordot(self.tilt[: len(tilts)], tilts, axes=(0, 0))
 
     @cached_property
     def prior(self) -> NDArray[np.float64]:
-        """(p,) what the SDF states."""
+        """Prior mean (p,) of the rigid-body parameters, from the SDF."""
         return self.regressor.values[: self.num_rigid]
 
     @cached_property
     def deviation(self) -> NDArray[np.float64]:
-        """(p,) by which the truth may differ from it."""
+        """Prior standard deviations (p,) of the rigid-body parameters."""
         balanced = rotor_links(self.regressor.arm)
         links = [LINK_DEVIATION * LinkScale.of(link).deviations for link in self.regressor.links]
         for link, deviation in zip(self.regressor.links, links, strict=True):
@@ -105,12 +107,12 @@ class DynamicProblem:
 
     @cached_property
     def boxes(self) -> dict[str, BoundingBox]:
-        """Link -> where its mass can be."""
+        """Bounding box of the mass of each link."""
         return bounding_boxes(self.regressor.arm)
 
     @cached_property
     def effect_precision(self) -> NDArray[np.float64]:
-        """(e,) one over the variance of each effect's coefficient about 0."""
+        """Reciprocal prior variances (e,) of the effect coefficients about 0."""
         size = sum(
             np.mean((self.columns.shapes[i] * self.columns.rows[:, i]) ** 2, axis=0) / (self.efforts[i] / self.num_rows)
             for i in range(len(self.efforts))
@@ -129,12 +131,12 @@ class DynamicProblem:
         return len(self.columns.tau)
 
     def selection(self, phi: NDArray[np.float64] | None = None, *, folds: bool = True) -> StepwiseSelection:
-        """The choice of effects, with the rigid body reduced to what the recording can tell.
+        """Returns the stepwise selection of effects, with the rigid body reduced to its identifiable directions.
 
         Args:
-            phi: (p,) the parameters about which the tilt is linearised: if the arm's base may tilt, it is two unknowns
-                more, which follow the effects'. By default the tilt stays as it is.
-            folds: False: for fits to the whole motion only.
+            phi: (p,) parameters about which the tilt is linearised. If given and the arm's base may tilt, the tilt adds
+                two unknowns after the effects. By default the tilt is constant.
+            folds: False uses a single fold, for fits to the whole motion only.
         """
         base, tilts = self.columns.base, len(self.columns.tilts) if phi is not None else 0
         left = self.columns.tau - self.rigid @ (base @ self.prior)
@@ -162,7 +164,7 @@ class DynamicProblem:
     def _own_columns(
         self, i: int, rigid: NDArray[np.float64], chosen: NDArray[np.int_], leaning: NDArray[np.float64]
     ) -> OwnColumns:
-        """Columns of one actuator: of the rigid body (r, k), of the chosen effects on it, and by tilts (2, r, n)."""
+        """Returns the columns of one actuator for the rigid body (r, k), the chosen effects and the tilts (t, r, n)."""
         moved = np.flatnonzero(np.any(rigid, axis=0))
         acting = np.flatnonzero(self.columns.rows[chosen, i])
         effects = self.columns.shapes[i][:, chosen[acting]] * self.columns.rows[chosen[acting], i]
@@ -173,25 +175,25 @@ class DynamicProblem:
     def chosen_columns(
         self, i: int, chosen: NDArray[np.int_], leaning: NDArray[np.float64] | None = None
     ) -> OwnColumns:
-        """Columns of one actuator among b + e: of the rigid body's base parameters, then of the chosen effects.
+        """Returns the columns of one actuator: rigid-body base parameters, then chosen effects, b + e in all.
 
-        With `leaning` (t, r, n), what the tilts change per unit, these are t more.
+        With `leaning` (t, r, n), the derivatives of the efforts with respect to the tilts, t columns are appended.
         """
         return self._own_columns(
             i, self.rigid[:, i], chosen, np.empty((0, *self.columns.tau.shape)) if leaning is None else leaning
         )
 
     def to_base(self, num_effects: int) -> NDArray[np.float64]:
-        """(b + e, p + e) base parameters and effects from all parameters and the effects."""
+        """Returns the matrix (b + e, p + e) from all parameters and effects to base parameters and effects."""
         return scipy.linalg.block_diag(self.columns.base, np.eye(num_effects))
 
     def rigid_parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(p,) phi of a selection's unknowns x (k,)."""
+        """Returns the rigid-body parameters phi (p,) for the unknowns x (k,) of a selection."""
         V = self._informative
         return self.prior + self.deviation * (V @ x[: V.shape[1]])
 
     def subset(self, rows: NDArray[np.bool_]) -> DynamicProblem:
-        """The problem of some of the rows (r,), with their folds numbered anew."""
+        """Returns the problem for a subset of the rows (r,), with the folds renumbered."""
         c = self.columns
         shapes = tuple(shape[rows] for shape in c.shapes)
         columns = replace(c, tau=c.tau[rows], rigid=c.rigid[rows], tilts=c.tilts[:, rows], shapes=shapes)
@@ -200,16 +202,16 @@ class DynamicProblem:
         return replace(self, columns=columns, fold=fold, edge=self.edge[rows], independent=independent)
 
     def consistent(self, chosen: NDArray[np.int_], weights: NDArray[np.float64]) -> ConsistentFit:
-        """The physically consistent fit with some of the effects.
+        """Returns the physically consistent fit with the chosen effects.
 
         Raises:
-            IdentificationError: the solver did not converge.
+            IdentificationError: The solver did not converge.
         """
         return ConsistentFit(self, chosen, weights)
 
     @cached_property
     def _informative(self) -> NDArray[np.float64]:
-        """(p, k) orthonormal directions of the scaled rigid body's parameters that the recording says something of."""
+        """Orthonormal directions (p, k) of the scaled rigid-body parameters that the recording is informative about."""
         weights = self.independent / self.num_rows / (self.efforts / self.num_rows * _FIRST_ERROR**2)
         H = sum(weight * self.rigid[:, i].T @ self.rigid[:, i] for i, weight in enumerate(weights))
         scaled = self.columns.base * self.deviation
@@ -218,16 +220,16 @@ class DynamicProblem:
 
 
 class ConsistentFit:
-    """The convex program on one problem with chosen effects.
+    """Physically consistent fit of one problem with chosen effects.
 
     Attributes:
         chosen: (e,) indices of the effects.
-        weights: (n,) of the actuators' squared errors.
-        x: (p + e,) parameters of the rigid body, then coefficients of the chosen effects.
-        lower: (p + e,) bounds of x, -inf where there is none.
-        errors: (n,) sum of squares that x leaves.
-        information: (p + e, p + e) sum of weights X' X.
-        prior_precision: (p + e, p + e) second derivative of both priors at x.
+        weights: (n,) weights of the actuators' squared errors.
+        x: (p + e,) rigid-body parameters, then coefficients of the chosen effects.
+        lower: (p + e,) lower bounds of x, -inf if there is none.
+        errors: (n,) sums of squared residuals.
+        information: (p + e, p + e) weighted sum of X' X.
+        prior_precision: (p + e, p + e) Hessian of both priors at x.
     """
 
     def __init__(self, problem: DynamicProblem, chosen: NDArray[np.int_], weights: NDArray[np.float64]) -> None:
@@ -246,11 +248,11 @@ class ConsistentFit:
 
 
 class ConsistentProgram:
-    """What the convex program of one problem knows before the recording, with chosen effects.
+    """Convex program of one problem with chosen effects.
 
     Attributes:
-        precision: (p + e,) one over the variance of each parameter and effect.
-        lower: (p + e,) bounds, -inf where there is none.
+        precision: (p + e,) reciprocal prior variances of the parameters and effects.
+        lower: (p + e,) lower bounds, -inf if there is none.
     """
 
     def __init__(self, problem: DynamicProblem, chosen: NDArray[np.int_]) -> None:
@@ -264,13 +266,14 @@ class ConsistentProgram:
         self._mean = np.concatenate([problem.prior, np.zeros(len(chosen))])
 
     def solve(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
-        """x (p + e,) from (p + e + 1, p + e + 1) weighted sums of squares, the measured effort last.
+        """Returns x (p + e,) for weighted sums of squares (p + e + 1, p + e + 1), the measured effort last.
 
-        The sums of squares are compressed to a triangle by Cholesky's decomposition in units of the prior's deviation,
-        where no eigenvalue is below 1: as exact as the QR decomposition of the rows, and a hundred times shorter.
+        The sums of squares are reduced to a triangular matrix by a Cholesky decomposition in units of the prior
+        deviation. No eigenvalue is below 1 there, so the result is as accurate as a QR decomposition of the rows, at
+        lower cost.
 
         Raises:
-            IdentificationError: the solver did not converge.
+            IdentificationError: The solver did not converge.
         """
         scale = 1 / np.sqrt(self.precision)
         H = sums[:-1, :-1] + np.diag(self.precision)

@@ -1,4 +1,4 @@
-"""Which effects the drives of an arm have: chosen one by one, by how well folds of the motion predict each other."""
+"""Stepwise selection of joint effects by cross-validation over the folds of a motion."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.normal_equations import NonNegativeFit, NormalEquations
 
-#: An effect must lower the cross-validated error, relative and averaged over the actuators, by this much. What gains
-#: less is chosen by chance: on the public motions other phases choose others, which predict the left-out phases worse.
+#: Least reduction of the cross-validated relative error, averaged over the actuators, for adding an effect. Smaller
+#: gains are due to chance: on the public motions they select different effects in different phases, and the errors on
+#: held-out phases increase.
 MIN_GAIN = 0.005
-#: So many of the effects that promise most are tried at every step.
+#: Number of the most promising effects that are evaluated at every step.
 TRIALS = 8
-#: An actuator's error is not taken for less than this share of its effort.
+#: Least relative error of an actuator that the weights assume.
 MIN_ERROR = 0.02
 
 
 @dataclass
 class StepwiseSelection:
-    """The choice of effects on one motion, in unknowns that are 0 before the recording.
+    """Stepwise selection of effects on one motion, in unknowns with prior mean 0.
 
     Attributes:
-        equations: columns: the rigid body's unknowns, then the effects; the last is what remains of the effort.
-        efforts: (folds, n) sum of squares of the measured efforts.
-        rows: (folds,) their number.
-        num_rigid: of the rigid body's.
-        precision: (k,) of all unknowns.
-        non_negative: (k,).
-        independent: share of the rows that are independent measurements of an actuator's effort.
+        equations: Normal equations. The columns are the rigid-body unknowns, the effects and the remaining effort.
+        efforts: (folds, n) sums of squares of the measured efforts.
+        rows: (folds,) numbers of rows.
+        num_rigid: Number of rigid-body unknowns.
+        precision: (k,) reciprocal prior variances of all unknowns.
+        non_negative: (k,) mask of the unknowns that must not be negative.
+        independent: Share of the rows that are independent measurements of an actuator's effort.
     """
 
     equations: NormalEquations
@@ -51,27 +52,27 @@ class StepwiseSelection:
         self.weights = self._weights(np.full(len(self._efforts), 0.1**2))
 
     def without(self, first: int, count: int) -> StepwiseSelection:
-        """The choice that knows nothing of some folds: `count` from `first` on."""
+        """Returns the selection without `count` folds from `first` on."""
         kept = self.equations.others(first, count)
         return replace(
             self, equations=self.equations.without(first, count), efforts=self.efforts[kept], rows=self.rows[kept]
         )
 
     def fit(self, effects: NDArray[np.int_]) -> NDArray[np.float64]:
-        """(k,) all unknowns, 0 where an effect is not chosen; weighs every actuator by the error that is left."""
+        """Returns all unknowns (k,), 0 for excluded effects, and updates the weights from the residuals."""
         for _ in range(3):
             x = self._fit_to(self._total.weighted(self.weights), effects).solve()
             self.weights = self._weights(self._total.squared_errors(x) / self._efforts)
         return x
 
     def relative_error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n,) |tau - X x| / |tau|."""
+        """Returns the relative error |tau - X x| / |tau| of each actuator (n,)."""
         return np.asarray(np.sqrt(self._total.squared_errors(x) / self._efforts))
 
     def cross_validated(self, effects: NDArray[np.int_], candidates: Sequence[int] = ()) -> tuple[float, list[float]]:
-        """Error of folds that are predicted from the others, with the current weights; with each candidate added.
+        """Returns the cross-validated error with `effects`, and with each candidate added, for the current weights.
 
-        It is relative, and the mean over the actuators.
+        The error is relative, and averaged over the actuators.
         """
         squares = np.zeros((1 + len(candidates), len(self._efforts)))
         added = [None, *(self.num_rigid + k for k in candidates)]
@@ -84,11 +85,12 @@ class StepwiseSelection:
     def choose(
         self, start: NDArray[np.int_], candidates: NDArray[np.int_], report: Callable[[float], object] = lambda _: None
     ) -> NDArray[np.int_]:
-        """Adds candidates to `start` while `MIN_GAIN` is had, and drops those that are no longer of use.
+        """Adds candidates to `start` while the gain is at least `MIN_GAIN`, then drops those that are no longer useful.
 
         Args:
-            start, candidates: indices of effects, from 0.
-            report: told the share of the work that is done, a guess.
+            start: Indices of the effects to start from, counted from 0.
+            candidates: Indices of the effects that may be added, counted from 0.
+            report: Callback that receives the estimated share of the work that is done.
         """
         chosen = start
         for step in itertools.count():
@@ -107,7 +109,7 @@ class StepwiseSelection:
         return chosen
 
     def _promising(self, chosen: NDArray[np.int_], open_: NDArray[np.int_]) -> NDArray[np.int_]:
-        """The open effects that would lower the sum of squares most, were all signs free."""
+        """Returns the open effects that reduce the sum of squares most, without sign constraints."""
         used, new = self._index(chosen), self.num_rigid + open_
         sums = self._total.weighted(self.weights)
         x = self._fit_to(sums, chosen).solve()
@@ -123,11 +125,11 @@ class StepwiseSelection:
     def _fit_to(
         self, sums: NDArray[np.float64], effects: NDArray[np.int_], others: NDArray[np.int_] | None = None
     ) -> NonNegativeFit:
-        """To weighted sums; `others`: effects that may be added."""
+        """Returns the fit to weighted sums. `others` are effects that may be added."""
         new = None if others is None else self.num_rigid + others
         return NonNegativeFit(sums, self.precision, self.non_negative, self._index(effects), new)
 
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
-        """One over the variance of an independent measurement, from the squared relative errors."""
+        """Returns the reciprocal variances of independent measurements, from the squared relative errors."""
         variance = np.maximum(squared, MIN_ERROR**2) * self._efforts / np.sum(self.rows)
         return np.asarray(self.independent / variance)

@@ -1,4 +1,4 @@
-"""How well an identified arm's dynamics predict the efforts of a motion, and of what kind the error is."""
+"""Validates a dynamic model on a motion and splits its error into kinds."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from dvrk_drake.analysis.verdict import judge, rule_text
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.recordings.recording import Recording
 
-#: Width of the smoothed sign of the friction that an error is searched for, as a share of the RMS speed.
+#: Width of the smoothed sign function of the friction-like error, as a share of the RMS speed.
 _FRICTION_WIDTH = 0.1
-#: Periods in the joint's travel of the position-dependent error that is searched for.
+#: Number of harmonics over the travel of the joint in the position-dependent error.
 _HARMONICS = 2
 
 
 @dataclass(frozen=True)
 class ActuatorError:
-    """One actuator's error over a motion, behind the low-pass: RMS in N m (N of one that slides).
+    """Error of one actuator over a motion after low-pass filtering, RMS in N m (N if prismatic).
 
-    `relative_error` = rms_error / rms_effort, None where nothing was measured. The rest of it splits rms_error^2 into
-    shares: `bias` is its mean, `friction_like` what viscous and Coulomb friction in the actuator would explain of it
-    then, `position_dependent` what two harmonics over its travel would explain of what is left, `other` the remainder.
-    `repeatability`: what differs from period to period, relative; None where the motion does not repeat.
-    `verdict`: see `judge`.
+    `relative_error` is rms_error / rms_effort, None if nothing was measured. The next four fields are shares of
+    rms_error^2. `bias` is the share of the mean error. `friction_like` is the further share that viscous and Coulomb
+    friction in the actuator explain. `position_dependent` is the further share that two harmonics over the travel
+    explain. `other` is the remainder. `repeatability` is the relative difference between periods, None if the motion
+    does not repeat. For `verdict` see `judge`.
     """
 
     name: str
@@ -49,11 +49,13 @@ class DynamicValidation(Validation):
     """Errors of a model on one motion.
 
     Attributes:
-        actuators: in the arm's order.
-        cut_off: of the low-pass that efforts are compared behind [Hz].
-        t: (r,) [s] of the rows that count: a second at each end is left out, where the filter swings in.
-        q, v: (r, n) of the actuators there.
-        measured, predicted: (r, n) efforts of the actuators behind the low-pass.
+        actuators: Errors of the actuators, in the arm's order.
+        cut_off: Cut-off of the low-pass filter of the compared efforts [Hz].
+        t: (r,) times of the compared rows [s]. One second at each end is omitted because of filter transients.
+        q: (r, n) positions of the actuators.
+        v: (r, n) velocities of the actuators.
+        measured: (r, n) measured efforts of the actuators after low-pass filtering.
+        predicted: (r, n) predicted efforts of the actuators after low-pass filtering.
     """
 
     actuators: list[ActuatorError]
@@ -66,7 +68,7 @@ class DynamicValidation(Validation):
 
     @property
     def mean_relative_error(self) -> float:
-        """Over the actuators of which something was measured."""
+        """Mean relative error over the actuators with measured efforts."""
         errors = [a.relative_error for a in self.actuators if a.relative_error is not None]
         return float(np.mean(errors)) if errors else float("nan")
 
@@ -77,7 +79,7 @@ class DynamicValidation(Validation):
 
     @property
     def relative_errors(self) -> dict[str, float | None]:
-        """RMS error / RMS effort of each actuator behind the low-pass [1]; None where nothing was measured."""
+        """RMS error / RMS effort of each actuator after low-pass filtering [1], None if nothing was measured."""
         return {actuator.name: actuator.relative_error for actuator in self.actuators}
 
     def as_dict(self) -> dict:
@@ -93,11 +95,11 @@ class DynamicValidation(Validation):
 
 
 def predict_motion(model: IdentifiedModel, recording: Recording) -> NDArray[np.float64]:
-    """(m, n) efforts of the actuators at all rows of a motion, behind the low-pass of the model's identification.
+    """Predicts the efforts (m, n) of the actuators at all rows of a motion, low-pass filtered as in the identification.
 
     Raises:
-        RecordingError: the recording does not fit the arm, or is no motion.
-        ModelError: the model has no dynamics.
+        RecordingError: The recording does not fit the arm, or is not a motion.
+        ModelError: The model has no dynamics.
     """
     dynamics = model.dynamic_model
     grid = motion_grid(recording, model.arm, dynamics.section.signals)
@@ -107,12 +109,12 @@ def predict_motion(model: IdentifiedModel, recording: Recording) -> NDArray[np.f
 def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicValidation:
     """Compares the model's efforts with those of a motion, in actuator coordinates.
 
-    The error of an actuator is |tau_f - tau_hat| / |tau_f|, both behind the zero-phase low-pass, a second left out at
-    each end: the metric of Wang et al. (RA-L 2019).
+    The error of an actuator is |tau_f - tau_hat| / |tau_f|, where both are filtered with the zero-phase low-pass filter
+    and one second at each end is omitted. This is the metric of Wang et al. (RA-L 2019).
 
     Raises:
-        RecordingError: the recording does not fit the arm, has no efforts, or is no motion.
-        ModelError: the model has no dynamics.
+        RecordingError: The recording does not fit the arm, has no efforts, or is not a motion.
+        ModelError: The model has no dynamics.
     """
     dynamics = model.dynamic_model
     arm = model.arm

@@ -1,1 +1,1 @@
-"""Signals of a recording: filtered, resampled, cut into rests, repetitions and folds."""
+"""Signal processing of recordings: filtering, resampling, static segments, repetitions and folds."""

@@ -1,4 +1,4 @@
-"""The efforts that a model expects over a motion, part by part: what friction takes and what all else does."""
+"""Computes the efforts that a model predicts over a motion, with friction separated from all other efforts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.recording import Recording
 
 FrictionPart = Literal["dry", "viscous"]
-#: Which kinds of effects are friction, and of which part: what a change of temperature or of grease changes together.
+#: Friction kinds and their part. The kinds of one part change together with temperature or lubrication.
 FRICTION_PARTS: dict[str, FrictionPart] = {
     **dict.fromkeys(("coulomb", "load coulomb", "stribeck", "presliding"), "dry"),
     "viscous": "viscous",
@@ -23,27 +23,27 @@ FRICTION_PARTS: dict[str, FrictionPart] = {
 
 @dataclass(frozen=True, eq=False)
 class DriveEfforts:
-    """Efforts of the actuators (r, n) [N m, N] at the rows of a motion behind the low-pass, ends left out.
+    """Efforts of the actuators (r, n) [N m, N] at the rows of a motion after low-pass filtering, without the ends.
 
     Attributes:
-        other: of the rigid bodies and of the effects that are no friction.
-        friction: of each coordinate's dry and viscous friction.
+        other: Efforts of the rigid bodies and of all effects except friction.
+        friction: Dry and viscous friction of each coordinate.
     """
 
     other: NDArray[np.float64]
     friction: dict[tuple[str, FrictionPart], NDArray[np.float64]]
 
     def total(self) -> NDArray[np.float64]:
-        """(r, n) all of it."""
+        """Returns the sum (r, n) of all efforts."""
         return self.other + sum(self.friction.values(), np.zeros_like(self.other))
 
     def friction_part(self, part: FrictionPart) -> NDArray[np.float64]:
-        """(r, n) of all coordinates together."""
+        """Returns one part of the friction (r, n), summed over all coordinates."""
         return sum((x for (_, own), x in self.friction.items() if own == part), np.zeros_like(self.other))
 
 
 def drive_efforts(model: DynamicModel, grid: MotionGrid) -> DriveEfforts:
-    """What `model` expects of the motion on `grid`."""
+    """Returns the efforts that `model` predicts for the motion on `grid`."""
     other = model.rigid_body_effort(grid.q, grid.v, grid.vd)
     friction: dict[tuple[str, FrictionPart], NDArray[np.float64]] = {}
     rows = model.arm.effect_coordinates
@@ -63,22 +63,23 @@ def drive_efforts(model: DynamicModel, grid: MotionGrid) -> DriveEfforts:
     )
 
 
-#: Efforts that correlate with the model's by less than this have the other sign: one of unknown sign is near 0.
+#: Efforts whose correlation with the model is below this have the opposite sign. For a random sign it is near 0.
 OPPOSITE = -0.3
 
 
 def refuse_opposite_efforts(
     recording: Recording, names: tuple[str, ...], tau: NDArray[np.float64], expected: NDArray[np.float64]
 ) -> None:
-    """Compares measured efforts with what a model expects, offsets aside.
+    """Compares the sign of measured and expected efforts, without their offsets.
 
     Args:
-        recording: for the message.
-        names: of the n joints whose actuators they are.
-        tau, expected: (r, n) of the actuators, behind one low-pass [N m, N].
+        recording: Recording that the message names.
+        names: Names of the n joints of the actuators.
+        tau: (r, n) measured efforts of the actuators after low-pass filtering [N m, N].
+        expected: (r, n) expected efforts after the same filter [N m, N].
 
     Raises:
-        RecordingError: an actuator's efforts go against the model's.
+        RecordingError: The efforts of an actuator are opposite to those of the model.
     """
     x, y = tau - np.mean(tau, axis=0), expected - np.mean(expected, axis=0)
     size = np.sqrt(np.sum(x**2, axis=0) * np.sum(y**2, axis=0))

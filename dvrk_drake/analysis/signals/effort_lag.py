@@ -1,4 +1,4 @@
-"""How late efforts look behind the motion, and whether their friction opposes it."""
+"""Estimates the delay of the efforts relative to the motion, and the sign of their friction."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.signals.low_pass import low_pass
 from dvrk_drake.analysis.signals.motion_grid import MotionSignals
 
-#: Of the low-pass that efforts and what explains them get [Hz].
+#: Cut-off of the low-pass filter for efforts and regressor columns [Hz].
 CUT_OFF = 20.0
-#: Delays that are tried [s], and their step.
+#: Largest delay that is tried, and the step [s].
 MAX_LAG, LAG_STEP = 0.04, 0.0025
-#: Left out at each end, where filters swing in [s].
+#: Omitted at each end because of filter transients [s].
 ENDS = 1.0
-#: Coulomb friction is smoothed over this share of the RMS speed.
+#: Width of the smoothed Coulomb friction, as a share of the RMS speed.
 SMOOTHING = 0.1
-#: Parts of the motion whose estimates give the standard errors.
+#: Parts of the motion from which the standard errors are estimated.
 PARTS = 5
-#: A delay is told only if it takes the variance that is left down by this factor, and exceeds so many standard errors.
+#: Least ratio of the residual variances, and least number of standard errors, for a delay to be significant.
 MIN_GAIN, MIN_ERRORS = 1.12, 5.0
 
 
 class EffortLag(NamedTuple):
-    """How late tau is behind the motion, and its step where the speed changes its sign; (n,) each.
+    """Delay of tau relative to the motion, and Coulomb friction; (n,) each.
 
     Attributes:
-        lag: that leaves least of tau unexplained [s], at most `MAX_LAG`; nan where the joint or its effort rests.
-        standard_error: of it, from `PARTS` parts of the motion [s].
-        gain: variance left without a delay over that with it [1].
-        determined: whether the lag is one: large gain, and many standard errors.
-        coulomb: Coulomb friction [N m, N]; negative where the effort has the wrong sign.
-        coulomb_error: its standard error, from `PARTS` parts of the motion.
+        lag: Delay with the least residual variance [s], at most `MAX_LAG`; nan if the joint or its effort is constant.
+        standard_error: Standard error of the delay, from `PARTS` parts of the motion [s].
+        gain: Residual variance without a delay, divided by that with it [1].
+        determined: True if the delay is significant: large gain, and many standard errors.
+        coulomb: Coulomb friction [N m, N]; negative if the effort has the wrong sign.
+        coulomb_error: Standard error of the Coulomb friction, from `PARTS` parts of the motion.
     """
 
     lag: NDArray[np.float64]
@@ -45,14 +45,14 @@ class EffortLag(NamedTuple):
 
 
 def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
-    """Fits each effort, delayed by up to 40 ms either way, by what its joint does; the least residual tells the delay.
+    """Estimates the delay of each effort by a fit with delays of up to 40 ms in both directions.
 
-    Explained by: own Coulomb and viscous friction, all accelerations, sine and cosine of all positions. Friction that
-    builds up over some way after a reversal (presliding) looks like a delay, and no fit of one motion tells them apart.
+    The regressors are the actuator's Coulomb and viscous friction, all accelerations, and sine and cosine of all
+    positions. Presliding friction, which builds up after a reversal, resembles a delay. One motion cannot separate them.
 
     Args:
-        signals: of the actuators: friction is theirs.
-        moving: (n,) which of them move.
+        signals: Signals of the actuators, because friction acts there.
+        moving: (n,) mask of the actuators that move.
     """
     rate = signals.rate
     start = max(int(ENDS * rate), int(MAX_LAG * rate))
@@ -74,7 +74,7 @@ def effort_lag(signals: MotionSignals, moving: NDArray[np.bool_]) -> EffortLag:
 
 
 def _coulomb(columns: NDArray[np.float64], tau: NDArray[np.float64]) -> tuple[float, float]:
-    """The first column's coefficient and its standard error."""
+    """Returns the coefficient of the first column and its standard error."""
     parts = zip(np.array_split(columns, PARTS), np.array_split(tau, PARTS), strict=True)
     estimates = [np.linalg.lstsq(A, b, rcond=None)[0][0] for A, b in parts]
     whole = np.linalg.lstsq(columns, tau, rcond=None)[0][0]
@@ -82,7 +82,7 @@ def _coulomb(columns: NDArray[np.float64], tau: NDArray[np.float64]) -> tuple[fl
 
 
 def _fit(tau: NDArray[np.float64], Q: NDArray[np.float64], inner: slice, rate: float) -> tuple[float, float, float]:
-    """Lag [s], its standard error [s] and its gain, for what spans the columns of Q."""
+    """Returns the lag [s], its standard error [s] and its gain for the column space of Q."""
     step = max(round(LAG_STEP * rate), 1)
     shifts = np.arange(-(inner.start // step), inner.start // step + 1) * step
     shifts = shifts[np.abs(shifts) <= MAX_LAG * rate]
@@ -95,7 +95,7 @@ def _fit(tau: NDArray[np.float64], Q: NDArray[np.float64], inner: slice, rate: f
 
 
 def _least(at: NDArray[np.int_], values: NDArray[np.float64]) -> float:
-    """Where a sampled curve is least, between its samples by a parabola."""
+    """Returns the minimiser of a sampled curve, with parabolic interpolation."""
     i = int(np.clip(np.argmin(values), 1, len(values) - 2))
     before, here, after = values[i - 1 : i + 2]
     curvature = before - 2 * here + after

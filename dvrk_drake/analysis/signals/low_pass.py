@@ -1,7 +1,7 @@
-"""Filtering without delay, derivatives of what is left, and correlation.
+"""Zero-phase filters, differentiation, resampling and correlation.
 
-scipy.signal has these filters too. Its import alone takes a tenth of the time of an identification, and its filter runs
-one column at a time, so they are compiled here; tests compare them with scipy's.
+scipy.signal has these filters too. They are compiled here for speed: importing scipy.signal is slow compared with an
+identification, and its filter processes one column at a time. Tests compare the results with those of scipy.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-#: Order of the Butterworth low-pass; run forwards and backwards, so that it halves the amplitude at the cut-off.
+#: Order of the Butterworth low-pass filter. It runs forwards and backwards, which halves the amplitude at the cut-off.
 ORDER = 6
 
 
 def low_pass(x: NDArray[np.float64], rate: float, cut_off: ArrayLike, order: int = ORDER) -> NDArray[np.float64]:
-    """Zero-phase Butterworth low-pass along axis 0: forwards, then backwards, as scipy's `sosfiltfilt`.
+    """Applies a zero-phase Butterworth low-pass filter along axis 0, forwards and backwards as scipy's `sosfiltfilt`.
 
     Args:
-        x: (m,) or (m, n) at a constant rate.
-        rate: samples a second [Hz].
-        cut_off: where the amplitude is halved [Hz]; one, or (n,) one a column. At half the rate or above, a column
-            stays as it is.
-        order: of the filter that runs each way; even.
+        x: (m,) or (m, n) samples at a constant rate.
+        rate: Sampling rate [Hz].
+        cut_off: Frequency at which the amplitude is halved [Hz], a scalar or (n,) for one per column. At half the
+            sampling rate or above, a column is not changed.
+        order: Order of the filter in each direction, even.
     """
     columns = np.asarray(x, dtype=np.float64).reshape(len(x), -1)
     filtered = np.empty(columns.shape)
@@ -36,7 +36,7 @@ def low_pass(x: NDArray[np.float64], rate: float, cut_off: ArrayLike, order: int
 
 
 def _forwards_and_backwards(x: NDArray[np.float64], cut_off: float, order: int) -> NDArray[np.float64]:
-    """Filters columns (m, k), continued beyond both ends by reflection in a point; `cut_off`: share of the rate."""
+    """Filters columns (m, k), extended at both ends by point reflection. `cut_off` is a share of the sampling rate."""
     if cut_off >= 0.5:
         return x
     sos = butterworth(order, cut_off)
@@ -44,7 +44,7 @@ def _forwards_and_backwards(x: NDArray[np.float64], cut_off: float, order: int) 
     if len(x) <= edge:
         raise ValueError(f"the filter needs more than {edge} rows, got {len(x)}")
     y = np.concatenate([2 * x[0] - x[edge:0:-1], x, 2 * x[-1] - x[-2 : -edge - 2 : -1]])
-    # The state (s, 2, 1) of each section after a long time at 1, which it passes unchanged.
+    # State (s, 2, 1) of each section in steady state for a constant input of 1, which it passes unchanged.
     at_one = np.stack([1 - sos[:, 0], sos[:, 2] - sos[:, 5]], axis=1)[:, :, None]
     for _ in ("forwards", "backwards"):
         _filter(sos, at_one * y[0], y)
@@ -54,11 +54,11 @@ def _forwards_and_backwards(x: NDArray[np.float64], cut_off: float, order: int) 
 
 @lru_cache(64)
 def butterworth(order: int, cut_off: float) -> NDArray[np.float64]:
-    """Second-order sections (s, 6) [b0 b1 b2 1 a1 a2] of a Butterworth low-pass by the bilinear transform.
+    """Returns second-order sections (s, 6) [b0 b1 b2 1 a1 a2] of a Butterworth low-pass, by the bilinear transform.
 
     Args:
-        order: even.
-        cut_off: as a share of the rate, below 0.5.
+        order: Order of the filter, even.
+        cut_off: Cut-off frequency as a share of the sampling rate, below 0.5.
     """
     w = np.tan(np.pi * cut_off)
     damping = 2 * np.sin(np.pi * np.arange(1, order, 2) / (2 * order))
@@ -82,7 +82,7 @@ def _filter(sos, state, x):  # pragma: no cover - compiled
 
 
 def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2 m - 1,) sum over t of a(t + lag) b(t) of a, b (m,), for lags 1 - m .. m - 1."""
+    """Returns the correlation (2 m - 1,) of a and b (m,): the sum over t of a(t + lag) b(t), for lags 1 - m .. m - 1."""
     count = len(a)
     size = 1 << (2 * count - 1).bit_length()
     circular = np.fft.irfft(np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size)), size)
@@ -90,12 +90,15 @@ def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.fl
 
 
 def central_difference(x: NDArray[np.float64], rate: float) -> NDArray[np.float64]:
-    """Derivative of x (m, ...) along axis 0, per second; one-sided at both ends."""
+    """Computes the derivative of x (m, ...) along axis 0 per second, one-sided at both ends."""
     return np.asarray(np.gradient(x, 1 / rate, axis=0), dtype=float)
 
 
 def resample(t: NDArray[np.float64], x: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x (m, ...), known at increasing times t (m,), at `times` (k,): piecewise cubic, without overshoot (PCHIP)."""
+    """Interpolates x (m, ...), given at increasing times t (m,), at `times` (k,).
+
+    The interpolation is piecewise cubic without overshoot (PCHIP).
+    """
     from scipy.interpolate import PchipInterpolator
 
     return np.asarray(PchipInterpolator(t, x, axis=0)(np.clip(times, t[0], t[-1])), dtype=float)

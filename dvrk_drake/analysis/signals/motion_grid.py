@@ -1,4 +1,4 @@
-"""A recorded motion on an even grid of its true times, filtered without delay, for checks and for a dynamic model."""
+"""Resamples a recorded motion to an even grid of its true times and filters it without delay."""
 
 from __future__ import annotations
 
@@ -14,25 +14,27 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
 
-#: Rate of the grid [Hz]: fine enough for hysteresis to turn round where the joint does.
+#: Rate of the grid [Hz], high enough to resolve hysteresis at reversals of a joint.
 GRID_RATE = 400.0
-#: Left out at each end, where filters swing in [s].
+#: Omitted at each end because of filter transients [s].
 ENDS = 1.0
-#: Shortest motion, and least rate of its rows, that tell anything [s, Hz].
+#: Shortest motion [s] and least row rate [Hz] that are accepted.
 MIN_DURATION, MIN_RATE = 5.0, 50.0
 
 
 @dataclass(frozen=True, eq=False)
 class MotionSignals:
-    """A motion at a constant rate, in the coordinates of its recording. SI and radians.
+    """Signals of a motion at a constant rate, in the coordinates of its recording. SI units and radians.
 
     Attributes:
         t: (m,) times, evenly spaced [s].
-        q, v, vd: (m, n) positions, velocities and accelerations, low-pass filtered.
-        tau: (m, n) efforts, not filtered: filter them and what is to explain them alike, see `low_pass`.
-        rows: (k,) rows of the recording that are used; the others repeat the row before them.
-        row_times: (k,) the time of each of them, on the same clock as `t`.
-        differentiated: (n,) True where v is dq/dt because the recorded qd disagrees with it, or there is none.
+        q: (m, n) positions, low-pass filtered.
+        v: (m, n) velocities, low-pass filtered.
+        vd: (m, n) accelerations, low-pass filtered.
+        tau: (m, n) efforts, not filtered. Apply the same filter to them and to their regressors, see `low_pass`.
+        rows: (k,) rows of the recording that are used. The others repeat the row before them.
+        row_times: (k,) time of each of these rows, on the same clock as `t`.
+        differentiated: (n,) True where v is dq/dt because the recorded qd is missing or inconsistent with it.
     """
 
     t: NDArray[np.float64]
@@ -46,27 +48,27 @@ class MotionSignals:
 
     @property
     def rate(self) -> float:
-        """Samples a second [Hz]."""
+        """Sampling rate [Hz]."""
         return float((len(self.t) - 1) / (self.t[-1] - self.t[0]))
 
 
 def motion_signals(
     recording: Recording, acceleration_cut_off: ArrayLike, *, cut_off: float = 50.0, rate: float = GRID_RATE
 ) -> MotionSignals:
-    """Brings a motion onto an even grid of its true times and differentiates it.
+    """Resamples a motion to an even grid of its true times and differentiates it.
 
-    Rows that repeat the row before are left out and the times of the others made good (`true_time`); then everything is
-    interpolated at `rate`, q and v are filtered at `cut_off`, and vd is the central difference of v filtered at
-    `acceleration_cut_off`.
+    Rows that repeat the row before are omitted, and the times of the others are corrected (`true_time`). The signals are
+    then interpolated at `rate`, and q and v are filtered at `cut_off`. The acceleration vd is the central difference of
+    v, filtered at `acceleration_cut_off`.
 
     Args:
-        recording: with t and tau, in the coordinates that the signals shall have.
-        acceleration_cut_off: of the zero-phase low-pass for vd [Hz]; one, or (n,) one a joint.
-        cut_off: of the one for q and v [Hz].
-        rate: of the grid [Hz].
+        recording: Motion with t and tau, in the coordinates that the signals shall have.
+        acceleration_cut_off: Cut-off of the zero-phase low-pass filter for vd [Hz], a scalar or (n,) for one per joint.
+        cut_off: Cut-off of the filter for q and v [Hz].
+        rate: Rate of the grid [Hz].
 
     Raises:
-        RecordingError: no efforts, or no motion: no times that increase.
+        RecordingError: The recording has no efforts, or its times do not increase.
     """
     clock = true_time(recording)
     tau = recording.measured_effort()[clock.rows]
@@ -88,16 +90,18 @@ def _even_times(clock: TrueTime, rate: float) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class MotionGrid:
-    """A motion of an arm's joints; every quantity below is low-pass filtered as `settings` says.
+    """Motion of an arm's joints, resampled and low-pass filtered according to `settings`.
 
     Attributes:
-        arm: which moves.
-        settings: of the filters and delays.
-        t: (m,) even times [s] at `GRID_RATE`.
-        q, v, vd: (m, n) of the joints.
-        row_times: (r,) the true time of every row of the recording, on the clock of t.
-        rate: mean rate of the rows [Hz].
-        clock: of the rows that say something new.
+        arm: Arm that moves.
+        settings: Cut-offs of the filters and delays of the efforts.
+        t: (m,) evenly spaced times at `GRID_RATE` [s].
+        q: (m, n) positions of the joints.
+        v: (m, n) velocities of the joints.
+        vd: (m, n) accelerations of the joints.
+        row_times: (r,) true time of every row of the recording, on the clock of t.
+        rate: Mean rate of the rows [Hz].
+        clock: True times of the rows that do not repeat the row before.
     """
 
     arm: Arm
@@ -112,29 +116,29 @@ class MotionGrid:
 
     @property
     def inner(self) -> slice:
-        """The rows that count: without `ENDS`."""
+        """Rows without `ENDS`."""
         ends = round(ENDS * self.rate)
         return slice(ends, len(self.row_times) - ends)
 
     def at_rows(self, x: NDArray[np.float64], actuator: int) -> NDArray[np.float64]:
-        """x (m, ...), what explains an actuator's effort, at the rows (r, ...), later by that effort's delay."""
+        """Interpolates x (m, ...) on the grid at the rows (r, ...), delayed by the delay of the actuator's effort."""
         place = (self.row_times - self.settings.effort_delay[actuator] - self.t[0]) * GRID_RATE
         before = np.clip(np.floor(place).astype(int), 0, len(x) - 2)
         share = np.clip(place - before, 0.0, 1.0).reshape(-1, *[1] * (x.ndim - 1))
         return (1 - share) * x[before] + share * x[before + 1]
 
     def behind_filter(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """x (r, ...) at the rows behind the low-pass that efforts are compared behind, ends left out."""
+        """Applies the low-pass filter of the efforts to x (r, ...) and omits the ends."""
         flat = low_pass(x.reshape(len(x), -1), self.rate, self.settings.effort_cut_off)
         return flat.reshape(x.shape)[self.inner]
 
     def efforts_at_rows(self, tau: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Efforts (m, n) of the actuators on the grid, at the rows (r, n)."""
+        """Interpolates efforts (m, n) of the actuators on the grid at the rows (r, n)."""
         return np.column_stack([self.at_rows(tau[:, i], i) for i in range(tau.shape[1])])
 
 
 def default_settings(arm: Arm) -> SignalSettings:
-    """What the arm's files say."""
+    """Returns the signal settings of the arm file."""
     motion = arm.identification
     return SignalSettings(
         acceleration_cut_off=list(motion.acceleration_cut_off),
@@ -144,19 +148,19 @@ def default_settings(arm: Arm) -> SignalSettings:
 
 
 def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock: TrueTime | None = None) -> MotionGrid:
-    """Brings a motion in either coordinates onto the grid.
+    """Resamples a motion in joint or actuator coordinates to the grid.
 
-    The positions are differentiated (recorded velocities only tell the times, see `true_time`): actuator by actuator,
-    since each has its own encoder and cut-off.
+    The positions of each actuator are differentiated, because each has its own encoder and cut-off. Recorded velocities
+    are used only for the times, see `true_time`.
 
     Args:
-        recording: the motion.
-        arm: which moves.
-        settings: of the filters and delays.
-        clock: `true_time` of the recording in actuator coordinates, if it is known.
+        recording: Motion with t and efforts.
+        arm: Arm that moves.
+        settings: Cut-offs of the filters and delays of the efforts.
+        clock: `true_time` of the recording in actuator coordinates, if already computed.
 
     Raises:
-        RecordingError: it does not fit the arm, has no times, or is too short or too coarse.
+        RecordingError: The recording does not fit the arm, has no times, or is too short or too coarse.
     """
     recording.check_fits(arm)
     recording = recording.in_actuator_coordinates(arm)

@@ -1,4 +1,4 @@
-"""Where in frequency a motion's signals are noise: cut-offs that follow from it, and noise of a narrow band."""
+"""Estimates signal and noise spectra of a motion, cut-off frequencies and narrow-band noise."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-#: Length of the pieces whose periodograms are averaged [s]; 1 / it is the resolution [Hz].
+#: Length of the segments for averaged periodograms [s]. Its reciprocal is the resolution [Hz].
 PIECE = 2.56
 #: Lowest cut-off that is proposed [Hz].
 MIN_CUT_OFF = 2.0
-#: A narrow band: noise above this many times what it is on both sides.
+#: Least ratio of the noise in a narrow band to the noise on both sides.
 PEAK = 4.0
-#: Its edges: where the noise falls below this share of its peak; at most this many octaves apart.
+#: Noise at the edges of a band as a share of its peak, and largest width of a band [octaves].
 EDGE, WIDEST = 0.15, 2.0
-#: It matters from this share of the signal's RMS on.
+#: Least RMS of a narrow band that is reported, as a share of the signal's RMS.
 MIN_SHARE = 0.03
 
 
@@ -29,7 +29,7 @@ class Spectra(NamedTuple):
 
 
 class Band(NamedTuple):
-    """Noise between two frequencies [Hz], and its RMS over that of the signal [1]."""
+    """Noise between two frequencies [Hz], with the ratio of its RMS to that of the signal [1]."""
 
     lower: float
     upper: float
@@ -37,15 +37,15 @@ class Band(NamedTuple):
 
 
 def spectra(x: NDArray[np.float64], rate: float, period: float | None) -> Spectra:
-    """Spectra of what repeats and of what does not.
+    """Computes the spectra of the repeating part (signal) and of the rest (noise).
 
-    With a period T, noise is (x(t) - x(t + T)) / sqrt(2) and the signal what is left of the power of x. Without one,
-    noise is taken for white: the median density above a quarter of the rate.
+    With a period T, the noise is (x(t) - x(t + T)) / sqrt(2), and the signal is the remaining power of x. Without a
+    period, the noise is assumed white: the median density above a quarter of the sampling rate.
 
     Args:
-        x: (m, n) at a constant rate.
-        rate: samples a second [Hz].
-        period: of the motion [s], or None.
+        x: (m, n) samples at a constant rate.
+        rate: Sampling rate [Hz].
+        period: Period of the motion [s], or None.
     """
     from scipy.signal import welch  # takes 0.3 s, see `low_pass`
 
@@ -61,9 +61,10 @@ def spectra(x: NDArray[np.float64], rate: float, period: float | None) -> Spectr
 
 
 def cut_offs(of: Spectra) -> NDArray[np.float64]:
-    """(n,) the lowest frequency above which the signal is under the noise [Hz], at least `MIN_CUT_OFF`.
+    """Returns the lowest frequencies (n,) above which the signal is below the noise [Hz], at least `MIN_CUT_OFF`.
 
-    Both are smoothed over five lines. Where the signal is above the noise up to the end, that is half the rate.
+    Both spectra are smoothed over five lines. If the signal exceeds the noise at all frequencies, the result is half the
+    sampling rate.
     """
     kernel = np.ones(5) / 5
     result = []
@@ -75,7 +76,7 @@ def cut_offs(of: Spectra) -> NDArray[np.float64]:
 
 
 def narrow_band(of: Spectra, joint: int) -> Band | None:
-    """The strongest narrow band of one joint's noise, if it stands out on both sides and matters."""
+    """Returns the strongest narrow band of one joint's noise, or None if no band is significant."""
     noise = median_filter(of.noise[:, joint], 3)
     noise[0] = noise[1]
     peak = int(np.argmax(noise))

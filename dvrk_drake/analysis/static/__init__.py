@@ -1,1 +1,1 @@
-"""Identification from static poses, and how good it is."""
+"""Identification and validation of static models from poses."""

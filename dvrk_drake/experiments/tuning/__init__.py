@@ -1,1 +1,1 @@
-"""Gains of `GravityPidController` for one arm: found by the paper's procedure and from a model, and compared."""
+"""Tuning of `GravityPidController` for one arm, by the paper's procedure and from a model, with a comparison."""

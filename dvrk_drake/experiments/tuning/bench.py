@@ -1,4 +1,4 @@
-"""The simulated arm that gains are tuned on: what both tuners agree on, and one closed loop for all trials."""
+"""Simulated arm for tuning: quantities that both tuning methods share, and one closed loop for all trials."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
-#: A joint is tried by steps of this size [rad, m].
+#: Size of the test steps of a joint [rad, m].
 STEP_REVOLUTE, STEP_PRISMATIC = 0.05, 0.005
 
 
 def step_size(arm: Arm) -> NDArray[np.float64]:
-    """(n,) of each joint [rad, m]."""
+    """Returns the step size (n,) of each joint [rad, m]."""
     return arm.per_joint(STEP_REVOLUTE, STEP_PRISMATIC)
 
 
 def band(arm: Arm) -> NDArray[np.float64]:
-    """(n,) a joint has settled if it stays this near [rad, m]: 2 % of the step, or a count if that is more."""
+    """Returns the settling band (n,) of each joint [rad, m]: 2 % of the step, but at least one encoder count."""
     return np.maximum(0.02 * step_size(arm), arm.encoder_counts())
 
 
 def effort_limits(arm: Arm) -> NDArray[np.float64]:
-    """(n,) the largest effort that a joint can have while the others have none: the arm's, or its motors'."""
+    """Returns the maximum effort (n,) of each joint with zero effort of the others, limited by the arm and its motors."""
     motors = per_actuator(arm.effects.saturation, arm.joint_names, np.inf)
     # tau_joint = J' tau_actuator: one joint's effort needs these actuator efforts.
     share = np.abs(np.linalg.inv(arm.transmission.matrix).T)
@@ -48,21 +48,21 @@ def effort_limits(arm: Arm) -> NDArray[np.float64]:
 
 
 def known_model(arm: Arm) -> IdentifiedModel:
-    """What an identification leaves a controller with: the SDF's links, and springs and cables of the arm's effects."""
+    """Returns an ideal identified model: the SDF's links, and the springs and cables of the arm's effects."""
     return IdentifiedModel.from_arm(arm, [*arm.effects.cables, *arm.effects.springs])
 
 
-#: Poses that tuning looks at need this share of each motor's largest effort to be held, at most: with nothing left to
-#: move the joint no gains help. (An MTM's wrist spring alone asks for more than its motor has in some of the box.)
+#: Maximum holding effort in tuning poses, as a share of the motor's maximum effort. No gains help a motor without
+#: reserve. (In a part of the joint box the wrist spring of an MTM exceeds the maximum effort of its motor.)
 HOLDING_SHARE = 0.5
 
 
 @cache
 def tuning_poses(arm: Arm, count: int, seed: int) -> NDArray[np.float64]:
-    """(count, n) poses all over the joint box, a tenth of each range from the stops, that the motors hold easily.
+    """Draws poses (count, n) from the joint box, a tenth of each range from the stops, with low holding efforts.
 
     Raises:
-        ArmError: hardly any pose is.
+        ArmError: Too few poses have a low holding effort.
     """
     candidates = arm.sample_poses(40 * count, np.random.default_rng(seed), margin=0.1)
     efforts = known_model(arm).holding_torque(candidates) @ np.linalg.inv(arm.transmission.matrix)
@@ -74,7 +74,7 @@ def tuning_poses(arm: Arm, count: int, seed: int) -> NDArray[np.float64]:
 
 
 def middle_pose(arm: Arm) -> NDArray[np.float64]:
-    """(n,) of such poses the one nearest to the middle of the joint box, in ranges."""
+    """Returns the tuning pose (n,) nearest to the middle of the joint box, with distances scaled by the ranges."""
     poses = tuning_poses(arm, 200, 0)
     width = arm.position_upper - arm.position_lower
     middle = 0.5 * (arm.position_upper + arm.position_lower)
@@ -83,12 +83,12 @@ def middle_pose(arm: Arm) -> NDArray[np.float64]:
 
 
 def rounded_gains(joints: Iterable[tuple[float, float, float]]) -> Gains:
-    """Of (kp, kd, ki) of each joint, to three digits: what is compared is what a file has."""
+    """Rounds (kp, kd, ki) of each joint to three digits, as in a gains file."""
     return Gains(*([float(f"{value:.3g}") for value in column] for column in zip(*joints, strict=True)))
 
 
-#: The paper's simulation (Rutfield, Zia, Boos, Santoso, Sujumnong, WPI 2015), from the controller node that the team
-#: gave along with it: gains of the joints of an MTM.
+#: Gains of the joints of an MTM in the paper's simulation (Rutfield, Zia, Boos, Santoso, Sujumnong, WPI 2015), from
+#: the controller node that the team published.
 _PUBLISHED_JOINTS = (
     *("outer_yaw", "shoulder_pitch", "elbow_pitch"),
     *("wrist_platform", "wrist_pitch", "wrist_yaw", "wrist_roll"),
@@ -96,12 +96,12 @@ _PUBLISHED_JOINTS = (
 _PUBLISHED_KP = (0.5, 0.8, 0.85, 3.7, 0.5, 0.02, 0.006)
 _PUBLISHED_KV = (1.95, 0.95, 1.75, 0.2, 0.1, 0.8, 0.08)
 _PUBLISHED_KI = (1e-5, 5e-5, 1e-4, 4e-4, 1e-6, 1e-7, 1e-8)
-#: The controller ran at 100 Hz and summed errors sample by sample: 1 of its Ki is 100 N m/(rad s).
+#: The controller ran at 100 Hz and summed the errors of all samples. A Ki of 1 equals 100 N m/(rad s).
 _PUBLISHED_RATE = 100.0
 
 
 def published_gains(arm: Arm) -> Gains | None:
-    """Of an arm with the joints of an MTM, per second; None of another one, for which none were published."""
+    """Returns the published gains, with Ki per second, for an arm with the joints of an MTM, or None for other arms."""
     if arm.joint_names != _PUBLISHED_JOINTS:
         return None
     return Gains(list(_PUBLISHED_KP), list(_PUBLISHED_KV), [_PUBLISHED_RATE * ki for ki in _PUBLISHED_KI])
@@ -113,13 +113,13 @@ PERIOD = 1e-3
 
 @dataclass(frozen=True)
 class Condition:
-    """How the simulated arm differs from what its controller and its tuner know.
+    """Difference between the simulated arm and the model of its controller and tuner.
 
     Attributes:
-        name: of the condition, in tables.
-        gravity: the true gravity torque over the modelled one.
-        inertia: every true mass and inertia over the modelled one; the controller is told how much heavier the arm is.
-        ticks: time steps of delay beyond the arm's own.
+        name: Name of the condition in tables.
+        gravity: Ratio of the true to the modelled gravity torque.
+        inertia: Ratio of all true to modelled masses and inertias. The gravity model is scaled accordingly.
+        ticks: Additional delay in time steps.
     """
 
     name: str
@@ -133,14 +133,14 @@ NOMINAL = Condition("modelled")
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Of the n joints at m times [s; rad, N m; m, N on a prismatic joint].
+    """Response of the n joints at m times [s; rad, N m; m, N for a prismatic joint].
 
     Attributes:
-        t: (m,).
-        q: (m, n) where the arm is.
-        q_measured: (m, n) where its encoders say that it is, late.
-        effort: (m, n) what the controller commands.
-        q_desired: (n,).
+        t: Times (m,).
+        q: True positions (m, n).
+        q_measured: Delayed positions (m, n) from the encoders.
+        effort: Commanded efforts (m, n).
+        q_desired: Desired positions (n,).
     """
 
     t: NDArray[np.float64]
@@ -151,12 +151,12 @@ class Response:
 
 
 class Bench:
-    """An arm with all of its `effects` under GravityPidController, which knows what an identification would find."""
+    """Closed loop of an arm with all of its `effects` and a GravityPidController with an ideal identified model."""
 
     def __init__(self, arm: Arm, condition: Condition = NOMINAL) -> None:
-        """Builds the loop; the first one of an arm in a process compiles its controller, which takes seconds."""
+        """Builds the loop. The first loop of an arm in a process compiles its controller, which takes seconds."""
         self.arm = arm
-        # Links that are heavier by a factor are as hard to hold as to accelerate: the controller is told the former.
+        # Heavier links increase both gravity and inertia. Scale the gravity model so that only `gravity` remains wrong.
         believed = condition.inertia / condition.gravity
         self._station = ArmStation(
             arm,
@@ -177,7 +177,7 @@ class Bench:
         self._inertias = _scaled_links(self._station.plant, condition.inertia)
 
     def step(self, q: NDArray[np.float64], q_desired: NDArray[np.float64], gains: Gains, duration: float) -> Response:
-        """The arm rests at q (n,), springs of its friction slack; at time 0 it is wanted at rest at q_desired (n,)."""
+        """Simulates a step from rest at q (n,), with unloaded friction springs, to q_desired (n,) at time 0."""
         root = self._diagram.CreateDefaultContext()
         station = self._station.GetMyMutableContextFromRoot(root)
         controller = self._controller.GetMyMutableContextFromRoot(root)
@@ -205,7 +205,7 @@ def _scale_rotors(plant: MultibodyPlant, factor: float) -> None:
 
 
 def _scaled_links(plant: MultibodyPlant, factor: float) -> dict[str, SpatialInertia]:
-    """Every link of the arm `factor` times as heavy; none if that changes nothing."""
+    """Returns the inertias of the links scaled by `factor`, or an empty dict for a factor of 1."""
     if factor == 1.0:
         return {}
     instance = plant.GetBodyByName("base_link").model_instance()
@@ -218,15 +218,15 @@ def _scaled_links(plant: MultibodyPlant, factor: float) -> dict[str, SpatialIner
 
 @cache
 def bench_of(arm: str, condition: Condition = NOMINAL) -> Bench:
-    """The bench of an arm, by its name or file: one a process."""
+    """Returns the bench of an arm, given by its name or file. Each process caches its benches."""
     return Bench(load_arm(arm), condition)
 
 
 class JointOnBench:
-    """A `procedure.JointUnderTest`: the joint is released at `step` from the arm's middle pose, where it is wanted."""
+    """Implements `procedure.JointUnderTest`: the joint is released at a distance of `step` from the arm's middle pose."""
 
     def __init__(self, bench: Bench, joint: int) -> None:
-        """Of the arm's joint with this index; the others are held with the arm's own gains."""
+        """Selects the joint with this index. The other joints are held with the arm's own gains."""
         arm = bench.arm
         self._bench, self._joint = bench, joint
         self._q_desired = middle_pose(arm)

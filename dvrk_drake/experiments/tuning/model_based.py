@@ -1,4 +1,4 @@
-"""Gains from what a model knows of an arm: its mass matrix over the joint box, friction, encoders, motors and delay."""
+"""Model-based gains, from the mass matrix over the joint box, friction, encoders, motors and delay."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.plant import holding_torques, make_arm_plant, set_arm_positions, tree_selector
 
-#: Damping ratio of a joint at its largest inertia, without its dry friction, which damps it more.
+#: Damping ratio of a joint at its largest inertia, without the additional damping of dry friction.
 DAMPING_RATIO = 0.8
-#: The least margins at any inertia that the joint has in its box: 30 degrees, and twice the gain.
+#: Minimum phase margin [rad] and gain margin at all inertias of the joint in its box.
 PHASE_MARGIN, GAIN_MARGIN = np.pi / 6, 2.0
-#: One count of its encoder may shake a motor by its dry friction, or by this share of its largest effort if more.
+#: Maximum effort caused by one encoder count, as a share of the maximum effort, unless the dry friction is larger.
 SHAKE = 0.05
-#: A joint that sticks at the edge of its band is to be on its way again after this time [s]...
+#: Time after which the integrator shall move a joint that sticks at the edge of its band [s].
 BREAK_AWAY = 0.25
-#: ...with this part of the largest gravity torque unknown, but Ki is at most this share of Kp times the frequency.
+#: Assumed gravity error, as a share of the largest gravity torque; upper bound of Ki / (Kp w).
 GRAVITY_ERROR, INTEGRAL_SHARE = 0.2, 0.15
-#: Frequencies that are tried, the fastest first [rad/s].
+#: Candidate frequencies in descending order [rad/s].
 FREQUENCIES = np.geomspace(300.0, 1.0, 400)
-#: Poses of the joint box where the mass matrix is looked at, and of these where all joints are looked at together.
+#: Number of poses for the mass matrix, and number of these at which the stability of all joints together is checked.
 POSES, MIN_CORRELATION = 200, 20
 
 
 @dataclass(frozen=True)
 class JointFacts:
-    """What one joint's gains depend on [kg m^2, N m, rad; kg, N, m].
+    """Properties of one joint that determine its gains [kg m^2, N m, rad; kg, N, m].
 
     Attributes:
-        inertia: the least at its motor, all other joints free; and the largest, all others held.
-        dry_friction: what holds it at rest, at most.
-        viscous: friction.
-        gravity: the largest gravity torque on it.
-        count: what its position is known to.
-        band: how near is near enough.
-        effort_limit: the largest effort that it has.
+        inertia: Smallest inertia, with all other joints free, and largest inertia, with all other joints held.
+        dry_friction: Maximum dry friction.
+        viscous: Coefficient of viscous friction.
+        gravity: Largest gravity torque.
+        count: Resolution of the encoder.
+        band: Settling band.
+        effort_limit: Maximum effort.
     """
 
     inertia: tuple[float, float]
@@ -56,13 +56,13 @@ class JointFacts:
 
 @dataclass(frozen=True)
 class JointDesign:
-    """Gains of one joint and where they come from.
+    """Gains of one joint and their derivation.
 
     Attributes:
-        kp, kd, ki: the gains.
-        frequency: of the closed loop at the largest inertia [rad/s].
-        margins: at the least and at the largest inertia.
-        limited_by: what would be violated by a faster loop.
+        kp, kd, ki: Gains.
+        frequency: Natural frequency of the closed loop at the largest inertia [rad/s].
+        margins: Margins at the smallest and at the largest inertia.
+        limited_by: Requirement that a faster loop would violate.
     """
 
     kp: float
@@ -75,12 +75,12 @@ class JointDesign:
 
 @dataclass(frozen=True)
 class ArmDesign:
-    """Gains of an arm and where they come from.
+    """Gains of an arm and their derivation.
 
     Attributes:
-        gains: of all joints.
-        facts: of each joint.
-        joints: the design of each.
+        gains: Gains of all joints.
+        facts: Properties of each joint.
+        joints: Design of each joint.
     """
 
     gains: Gains
@@ -89,13 +89,13 @@ class ArmDesign:
 
 
 def design_arm(arm: Arm) -> ArmDesign:
-    """Designs each joint by itself, then looks at all of them together, at poses all over the joint box.
+    """Designs each joint separately, then checks the stability of all joints together at poses of the joint box.
 
-    Together they must be stable with a period of delay more than the arm has and 20 % less inertia than the model.
-    Until they are, the frequency of the joint that takes part most in the motion that grows comes down by a tenth.
+    The coupled joints must be stable with one additional period of delay and with 20 % less inertia than the model.
+    While they are unstable, the frequency of the joint with the largest share of the unstable mode is reduced by 10 %.
 
     Raises:
-        ControllerError: no gains are good, for one joint or for all together.
+        ControllerError: No gains satisfy the requirements, for one joint or for all joints together.
     """
     sampling = sampling_of(arm)
     masses = mass_matrices(arm, arm.sample_poses(POSES, np.random.default_rng(1)))
@@ -124,10 +124,10 @@ def _named(arm: Arm, name: str, fact: JointFacts, sampling: Sampling) -> JointDe
 
 
 def design_joint(fact: JointFacts, sampling: Sampling, slowed: float = 1.0) -> JointDesign:
-    """The fastest gains that nothing speaks against, then `slowed` times that frequency.
+    """Returns the fastest gains that satisfy all requirements, with their frequency multiplied by `slowed`.
 
     Raises:
-        ControllerError: something speaks against all gains.
+        ControllerError: No gains satisfy the requirements.
     """
     limited_by = "fastest tried"
     for w in FREQUENCIES:
@@ -145,16 +145,16 @@ def design_joint(fact: JointFacts, sampling: Sampling, slowed: float = 1.0) -> J
 
 
 def _joint_gains(fact: JointFacts, sampling: Sampling, w: float) -> tuple[float, float, float]:
-    """At the largest inertia."""
+    """Returns kp, kd and ki for the frequency w at the largest inertia."""
     kp, kd = place(fact.inertia[1], w, DAMPING_RATIO, sampling, fact.viscous)
     unknown = fact.dry_friction + GRAVITY_ERROR * fact.gravity
     return kp, kd, min(unknown / (fact.band * BREAK_AWAY), INTEGRAL_SHARE * w * kp)
 
 
 def _objection(fact: JointFacts, sampling: Sampling, design: tuple[float, float, float]) -> str:
-    """What speaks against gains; "" if nothing does."""
+    """Returns the requirement that the gains violate, or "" if they violate none."""
     kp, kd, ki = design
-    # One count in one period, before the low-pass has spread it.
+    # Effort of one count in one period, before low-pass filtering.
     jolt = fact.count * (kp + kd * (1.0 - sampling.decay) / sampling.period)
     if jolt > max(fact.dry_friction, SHAKE * fact.effort_limit):
         return "encoder count"
@@ -168,14 +168,14 @@ def _objection(fact: JointFacts, sampling: Sampling, design: tuple[float, float,
 
 
 def sampling_of(arm: Arm, period: float = 1e-3) -> Sampling:
-    """When an arm is measured and driven: its own delay, and the period that a controller beside it takes."""
+    """Returns the sampling of an arm. Its delay includes one period for the computation of the controller."""
     delay, encoder = arm.effects.delay, arm.effects.encoder
     own = delay.measurement + delay.command if delay else 0
     return Sampling(period, own + 1, encoder.velocity_cut_off if encoder else np.inf)
 
 
 def mass_matrices(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m, n, n) of the joints at poses (m, n), with the linkage that follows them and the rotors: G' M G."""
+    """Computes the mass matrices (m, n, n) at poses (m, n), including the linkage and the rotors: G' M G."""
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     tree, G = tree_selector(plant, arm), arm.linkage.matrix
@@ -187,7 +187,7 @@ def mass_matrices(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def joint_facts(arm: Arm, masses: NDArray[np.float64]) -> tuple[JointFacts, ...]:
-    """Of each joint; `masses` (m, n, n) are of poses all over the joint box."""
+    """Returns the properties of each joint from `masses` (m, n, n) at poses of the whole joint box."""
     least = 1.0 / np.max(np.diagonal(np.linalg.inv(masses), axis1=1, axis2=2), axis=0)
     largest = np.max(np.diagonal(masses, axis1=1, axis2=2), axis=0)
     columns = (
@@ -204,18 +204,21 @@ def joint_facts(arm: Arm, masses: NDArray[np.float64]) -> tuple[JointFacts, ...]
 
 
 def friction(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(n,) what dry friction holds in both directions [N m, N], (n,) viscous [N m s/rad; N s/m], each joint alone."""
+    """Returns the dry friction (n,) that acts in both directions [N m, N] and the viscous friction (n,) of each joint.
+
+    Viscous friction is in [N m s/rad; N s/m]. Both are for the motion of one joint alone.
+    """
     dry, viscous = np.zeros(arm.num_joints), np.zeros(arm.num_joints)
     for effect in arm.effects.friction:
         row = np.abs(joint_row(arm, effect.coordinate))
         if effect.kind == "viscous":
             viscous += effect.coefficient * row**2
-        elif effect.kind != "presliding forward":  # that holds in one direction only
+        elif effect.kind != "presliding forward":  # acts in one direction only
             dry += effect.coefficient * row
     return dry, viscous
 
 
 def largest_gravity(arm: Arm) -> NDArray[np.float64]:
-    """(n,) the largest torque that holds the arm against gravity, over poses of its box [N m, N]."""
+    """Returns the largest gravity torque (n,) of each joint over poses of the joint box [N m, N]."""
     poses = arm.sample_poses(POSES, np.random.default_rng(1))
     return np.asarray(np.abs(holding_torques(arm, poses)).max(axis=0))

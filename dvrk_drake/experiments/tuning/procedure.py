@@ -1,6 +1,7 @@
-"""The paper's way to tune: Kp up until the joint oscillates, then Kv until it does not, then Ki against the offset.
+"""Tuning procedure of the paper (section III.J).
 
-Section III.J of the paper. It does not say how far each step was taken; what is decided here stands at the constants.
+Kp is raised until the joint oscillates. Then Kv is raised until the oscillation is damped, and Ki until the offset
+vanishes. The paper does not give the stopping criteria. The criteria used here are the constants of this module.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Oscillation:
-    """Swings go from one turning point to the next.
+    """Oscillation of a joint. A swing is the motion from one turning point to the next.
 
     Attributes:
-        swings: their number; the first is not judged, it begins with slack cables and an integral at zero.
-        growth: the size of a swing over that of the one before, on average; 0 if there are too few to tell.
-        period: of two swings [s]; infinite if there are too few to tell.
+        swings: Number of swings. The first is not evaluated, since it starts with slack cables and a zero integral.
+        growth: Mean ratio of the sizes of consecutive swings; 0 for too few swings.
+        period: Duration of two swings [s]; infinite for too few swings.
     """
 
     swings: int
@@ -29,18 +30,21 @@ class Oscillation:
 
     @property
     def sustained(self) -> bool:
-        """Whether it does not die away."""
+        """Whether the amplitude does not decay."""
         return self.growth >= 1.0
 
 
-#: Swings that are judged after the first: enough for 1 % of growth to show, few enough not to reach the stops.
+#: Number of evaluated swings: enough to detect 1 % of growth, but too few to reach the stops.
 JUDGED = 8
-#: With fewer nothing is said: a joint that sticks after three swings does not oscillate.
+#: Minimum number of evaluated swings. A joint that sticks after three swings does not oscillate.
 MIN_TURNING_POINTS = 3
 
 
 def judge_oscillation(t: NDArray[np.float64], x: NDArray[np.float64], threshold: float) -> Oscillation:
-    """Of a position x (m,) at times t (m,) after a release at rest; what is below `threshold` [rad, m] is no swing."""
+    """Evaluates the oscillation of positions x (m,) at times t (m,) after a release at rest.
+
+    Motions smaller than `threshold` [rad, m] are not counted as swings.
+    """
     turns = turning_points(x, threshold)[: JUDGED + 2]
     swings = np.abs(np.diff(x[turns]))
     judged = swings[1:]
@@ -52,7 +56,7 @@ def judge_oscillation(t: NDArray[np.float64], x: NDArray[np.float64], threshold:
 
 
 def turning_points(x: NDArray[np.float64], threshold: float) -> NDArray[np.int_]:
-    """Indices of the first sample and of each extremum from which x (m,) comes back by more than `threshold`."""
+    """Returns the indices of the first sample and of each extremum of x (m,) with a reversal above `threshold`."""
     found, extreme, direction = [0], 0, 0.0
     for i, value in enumerate(x):
         way = value - x[extreme]
@@ -67,44 +71,44 @@ def turning_points(x: NDArray[np.float64], threshold: float) -> NDArray[np.int_]
     return np.array(found)
 
 
-#: A release is watched for this long [s], or for so many periods of the last one; steps for this long [s].
+#: Maximum duration of a release [s] and in periods of the last release; durations of the step tests [s].
 RELEASE, PERIODS, DAMPING_STEP, OFFSET_STEP = 1.5, 7.0, 1.0, 2.0
-#: Kp goes up by this factor until the joint oscillates, then the last factor is halved (in the logarithm) so often.
+#: Factor by which Kp is raised until the joint oscillates, and number of logarithmic bisections after that.
 RAISE, BISECTIONS = 2.0, 5
-#: Damped: a step overshoots by no more than this share, and nothing swings in the last fifth.
+#: Maximum overshoot of a damped step, as a share of the step, without and with the integral term.
 OVERSHOOT, OVERSHOOT_WITH_INTEGRAL = 0.05, 0.15
-#: Kv and Ki go up by this factor, Kp comes down by this one if no Kv damps the joint.
+#: Factor by which Kv and Ki are raised; factor by which Kp is lowered if no Kv damps the joint.
 FINER, LESS = 1.5, 0.7
-#: Kv begins at this damping ratio and ends at that one; Ki begins at this share of Kp a period, and ends at that one.
+#: Range of the damping ratio for Kv; range of Ki as a share of Kp per period.
 RATIOS, SHARES = (0.05, 3.0), (0.02, 1.0)
 
 
 class JointUnderTest(Protocol):
-    """One joint of an arm that holds still otherwise."""
+    """Interface to one joint of an arm whose other joints are held."""
 
     step: float
-    """How far it is moved away before it is let go, or stepped [rad, m]."""
+    """Initial distance from the desired position in releases and steps [rad, m]."""
     count: float
-    """What its position is known to [rad, m]."""
+    """Resolution of the measured position [rad, m]."""
     band: float
-    """How near is near enough [rad, m]."""
+    """Settling band [rad, m]."""
     effort_limit: float
-    """[N m, N]."""
+    """Maximum effort [N m, N]."""
 
     def respond(self, kp: float, kd: float, ki: float, duration: float) -> tuple[NDArray, NDArray]:
-        """Times (m,) and what is measured of the way to go (m,), from `step` at time 0."""
+        """Returns times (m,) and measured distances (m,) from the desired position; the distance at time 0 is `step`."""
         ...
 
 
 @dataclass(frozen=True)
 class Ultimate:
-    """Where a joint under Kp alone begins to oscillate.
+    """Ultimate gain of a joint: the proportional gain at which it begins to oscillate.
 
     Attributes:
-        gain: the least Kp with which swings do not die away [N m/rad; N/m]; the largest that was tried if none does.
-        period: of the oscillation there [s].
-        growth: of a swing over the one before, there.
-        sustained: False if no Kp made the joint oscillate.
+        gain: Smallest Kp with a sustained oscillation [N m/rad; N/m], or the largest tested Kp if there is none.
+        period: Period of the oscillation at this gain [s].
+        growth: Ratio of consecutive swings at this gain.
+        sustained: False if the joint oscillated with none of the tested gains.
     """
 
     gain: float
@@ -115,14 +119,14 @@ class Ultimate:
 
 @dataclass(frozen=True)
 class JointProcedure:
-    """What the procedure found for one joint, and how.
+    """Result of the procedure for one joint.
 
     Attributes:
-        kp, kd, ki: the gains.
-        ultimate: where it began.
-        kp_lowered: by what Kp had to come down before a Kv could damp it; 1 if at once.
-        damped: False if no Kv did.
-        offset: what is left of a step at its end [rad, m].
+        kp, kd, ki: Gains.
+        ultimate: Ultimate gain, with which the procedure starts.
+        kp_lowered: Ratio of the final Kp to the ultimate gain; 1 if Kp did not have to be lowered.
+        damped: False if no Kv damped the joint.
+        offset: Remaining distance at the end of a step [rad, m].
     """
 
     kp: float
@@ -135,7 +139,7 @@ class JointProcedure:
 
 
 def tune_joint(joint: JointUnderTest) -> JointProcedure:
-    """Tunes one joint."""
+    """Tunes one joint by the procedure of the paper."""
     ultimate = find_ultimate_gain(joint)
     kp, kd, damped = _damp(joint, ultimate)
     ki, offset = _remove_offset(joint, kp, kd, ultimate.period)
@@ -143,11 +147,11 @@ def tune_joint(joint: JointUnderTest) -> JointProcedure:
 
 
 def find_ultimate_gain(joint: JointUnderTest) -> Ultimate:
-    """Raises Kp until the swings after a release from `joint.step` do not die away, then bisects.
+    """Raises Kp until the oscillation after a release from `joint.step` is sustained, then bisects.
 
-    With dry friction F the joint moves at all only if Kp step > F: that is where Kp begins. Near the ultimate gain of
-    such a joint small swings die away and large ones grow, so the gain found belongs to the step. Kp ends where the
-    motor is at its limit within a twentieth of the step, and more Kp changes nothing.
+    With dry friction F the joint moves only if Kp step > F. Near the ultimate gain of such a joint small swings decay
+    and large ones grow. The result is therefore valid for the given step. Kp is raised until the motor reaches its
+    limit within a twentieth of the step; a higher Kp has no effect.
     """
 
     watched = RELEASE
@@ -156,7 +160,7 @@ def find_ultimate_gain(joint: JointUnderTest) -> Ultimate:
         nonlocal watched
         t, error = joint.respond(kp, 0.0, 0.0, watched)
         found = judge_oscillation(t, error, max(2.0 * joint.count, 0.02 * joint.step))
-        # More gain swings faster, and a bisection does not go back far.
+        # The period decreases with the gain, and a bisection lowers the gain only slightly.
         watched = min(RELEASE, PERIODS * found.period)
         return found
 
@@ -183,11 +187,11 @@ def _bisect(swing: Callable[[float], Oscillation], low: float, high: float, foun
 
 
 def _damp(joint: JointUnderTest, ultimate: Ultimate) -> tuple[float, float, bool]:
-    """Kp, the least Kv that damps it, and whether there was one. Kp comes down until there is."""
+    """Returns Kp, the smallest Kv that damps the joint, and whether one exists. Kp is lowered until one exists."""
     period = ultimate.period if np.isfinite(ultimate.period) else 0.1
     kp = ultimate.gain
     while kp > 0.003 * ultimate.gain:
-        # The frequency goes with the root of Kp.
+        # The frequency is proportional to the square root of Kp.
         w = 2.0 * np.pi / period * np.sqrt(kp / ultimate.gain)
         for ratio in _raised(RATIOS):
             kd = 2.0 * ratio * kp / w
@@ -198,7 +202,7 @@ def _damp(joint: JointUnderTest, ultimate: Ultimate) -> tuple[float, float, bool
 
 
 def _remove_offset(joint: JointUnderTest, kp: float, kd: float, period: float) -> tuple[float, float]:
-    """The least Ki with which the joint ends inside its band; without one that with which it ends nearest."""
+    """Returns the smallest Ki with which the joint settles, or the Ki with the smallest offset, and this offset."""
     best, nearest = 0.0, _try_step(joint, (kp, kd, 0.0), OFFSET_STEP, OVERSHOOT_WITH_INTEGRAL).offset
     for share in _raised(SHARES):
         if nearest <= joint.band:
@@ -223,7 +227,7 @@ class _Step(NamedTuple):
 
 
 def _try_step(joint: JointUnderTest, gains: tuple[float, float, float], duration: float, overshoot: float) -> _Step:
-    """Whether a step overshoots by no more than that share and then rests, and how far from the goal it does."""
+    """Returns whether a step has at most this overshoot and comes to rest, and the remaining distance."""
     t, error = joint.respond(*gains, duration)
     last = error[t > 0.8 * duration]
     rests = np.ptp(last) <= max(2.0 * joint.count, joint.band)

@@ -1,4 +1,4 @@
-"""Joints under PID control as a linear sampled system: stability, margins, and the gains that place them."""
+"""Linear sampled-data model of joints under PID control: stability, margins, and pole placement."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from dvrk_drake.models.arm_schema import Gains
 
 @dataclass(frozen=True)
 class Sampling:
-    """When and how joints are measured and driven.
+    """Sampling and delay of the control loop.
 
     Attributes:
-        period: of measurement and control [s].
-        ticks: periods from a measurement to the effort that answers it.
-        cut_off: of the low-pass behind the difference of two readings [Hz]; infinite for the difference itself.
+        period: Period of measurement and control [s].
+        ticks: Number of periods from a measurement to the effort that is computed from it.
+        cut_off: Cut-off frequency of the low-pass filter of the velocity [Hz]; infinite for no filter.
     """
 
     period: float = 1e-3
@@ -27,28 +27,28 @@ class Sampling:
 
     @property
     def decay(self) -> float:
-        """What the low-pass of the velocity keeps of its last value."""
+        """Weight of the previous value in the low-pass filter of the velocity."""
         return math.exp(-2.0 * math.pi * self.cut_off * self.period)
 
     @property
     def position_lag(self) -> float:
-        """Between a position and the effort that answers it, on average over the period that this is held [s]."""
+        """Mean delay from a position to the effort computed from it, including the zero-order hold [s]."""
         return (self.ticks + 0.5) * self.period
 
     @property
     def velocity_lag(self) -> float:
-        """The same of a velocity: the difference is half a period old, the low-pass adds its own lag [s]."""
+        """Mean delay of the velocity, including half a period for the difference and the low-pass filter [s]."""
         return self.position_lag + (0.5 + self.decay / (1.0 - self.decay)) * self.period
 
 
 @dataclass(frozen=True)
 class Margins:
-    """Of one joint's open loop, which is cut at the motor.
+    """Stability margins of one joint's loop, opened at the motor.
 
     Attributes:
-        phase: the least at any frequency where the gain is 1 [rad]; not positive if the loop is unstable.
-        crossover: that frequency [rad/s].
-        gain: by what the loop may be amplified before it is unstable.
+        phase: Smallest phase margin over all crossover frequencies [rad]; not positive for an unstable loop.
+        crossover: Crossover frequency of the smallest phase margin [rad/s].
+        gain: Gain margin: the factor by which the loop gain can be raised before the loop is unstable.
     """
 
     phase: float
@@ -57,14 +57,15 @@ class Margins:
 
 
 class SampledLoop:
-    """n joints with a mass matrix M, viscous friction b and the law of GravityPidController, linear:
+    """Linear closed loop of n joints with mass matrix M, viscous friction b and the law of GravityPidController.
 
-    M vd = u - b v between two samples; u = Kp e + Kd de + Ki sum(e) h of what was measured `ticks` periods ago, held
-    for a period; e = -q. Gravity is compensated. Velocity as in `systems.arm_effects.drive_step.DriveStep`.
+    Between two samples M vd = u - b v. The effort u = Kp e + Kd de + Ki sum(e) h, with e = -q, uses the measurement
+    from `ticks` periods ago and is held for one period. Gravity is compensated. The velocity is estimated as in
+    `systems.arm_effects.drive_step.DriveStep`.
     """
 
     def __init__(self, M: ArrayLike, sampling: Sampling, viscous: ArrayLike = 0.0) -> None:
-        """Of M (n, n) [kg m^2; kg] and `viscous` (n,) [N m s/rad; N s/m]."""
+        """Discretises the joints with mass matrix M (n, n) [kg m^2; kg] and `viscous` (n,) [N m s/rad; N s/m]."""
         from scipy.signal import cont2discrete  # takes 0.3 s
 
         self._M = np.atleast_2d(np.asarray(M, float))
@@ -77,13 +78,16 @@ class SampledLoop:
         self._plant = cont2discrete((A, np.vstack([zero, M_inverse]), np.eye(2 * n), 0), sampling.period)[:2]
 
     def closed_loop(self, gains: Gains) -> NDArray[np.float64]:
-        """A with x[k+1] = A x[k]. x (n (5 + 2 ticks),) is q, v; the last reading and velocity estimate; the
-        measurements under way, oldest first; the integral as an effort: see `at_rest`."""
+        """Returns the matrix A with x[k+1] = A x[k].
+
+        The state x (n (5 + 2 ticks),) consists of q and v, the last reading and velocity estimate, the delayed
+        measurements with the oldest first, and the integral as an effort; see `at_rest`.
+        """
         size = self._n * (5 + 2 * self._sampling.ticks)
         return np.column_stack([self._advance(x, gains) for x in np.eye(size)])
 
     def at_rest(self, q: ArrayLike) -> NDArray[np.float64]:
-        """The state of joints that have been at q (n,) for long."""
+        """Returns the state of joints that have been at rest at q (n,)."""
         still = np.concatenate([np.broadcast_to(np.asarray(q, float), self._n), np.zeros(self._n)])
         return np.concatenate([np.tile(still, 2 + self._sampling.ticks), np.zeros(self._n)])
 
@@ -101,12 +105,14 @@ class SampledLoop:
         return np.concatenate([A @ plant + B @ effort, measured, queue[2 * n :], integral])
 
     def is_stable(self, gains: Gains) -> bool:
-        """Whether every motion dies away."""
+        """Returns whether the closed loop is asymptotically stable."""
         return bool(np.max(np.abs(np.linalg.eigvals(self.closed_loop(gains)))) < 1.0)
 
     def least_damped_mode(self, gains: Gains) -> tuple[float, NDArray[np.float64]]:
-        """What the slowest motion to decay is multiplied by in a period, and each joint's share (n,) of its kinetic
-        energy, leaving out what couples them."""
+        """Returns the growth factor per period of the least damped mode and each joint's share (n,) of its energy.
+
+        The shares are those of the kinetic energy without the coupling terms of the mass matrix.
+        """
         z, modes = np.linalg.eig(self.closed_loop(gains))
         worst = int(np.argmax(np.abs(z)))
         v = np.abs(modes[self._n : 2 * self._n, worst])
@@ -114,7 +120,7 @@ class SampledLoop:
         return float(np.abs(z[worst])), energy / max(energy.sum(), np.finfo(float).tiny)
 
     def margins(self, gains: Gains) -> Margins:
-        """Of a single joint."""
+        """Computes the margins of the loop, which must have a single joint."""
         assert self._n == 1
         h, decay = self._sampling.period, self._sampling.decay
         w = np.geomspace(1e-2, np.pi / h, 4000)
@@ -127,7 +133,7 @@ class SampledLoop:
         stable = self.is_stable(gains)
         size, phase = np.abs(loop), np.unwrap(np.angle(loop))
         crossings = np.flatnonzero((size[:-1] >= 1) & (size[1:] < 1))
-        # A double integrator begins at -pi; with an integral in the law at -3 pi / 2.
+        # The phase of a double integrator starts at -pi, with an integral term at -3 pi / 2.
         margins = [abs((phase[i] + 2 * np.pi) % (2 * np.pi) - np.pi) for i in crossings]
         turns = np.flatnonzero(np.diff(np.sign(np.imag(loop))) * (np.real(loop[:-1]) < 0))
         amplify = [1 / size[i] for i in turns if size[i] < 1]
@@ -140,18 +146,19 @@ class SampledLoop:
 def place(
     inertia: float, frequency: float, damping_ratio: float, sampling: Sampling, viscous: float = 0.0
 ) -> tuple[float, float]:
-    """kp and kd with which one joint has this natural frequency and damping, delay included.
+    """Computes kp and kd for a given natural frequency and damping ratio of one joint, including the delays.
 
-    To second order in s a lag T of position takes Kp T of the damping and a lag T_v of velocity takes Kd T_v of the
-    inertia: (M - Kd T_v + Kp T^2 / 2) s^2 + (b + Kd - Kp T) s + Kp = 0. That is m (s^2 + 2 z w s + w^2) if
-    m (1 + (2 z w + w^2 T) T_v - w^2 T^2 / 2) = M + b T_v, Kp = m w^2, Kd = 2 z w m + Kp T - b; kd is never negative.
+    To second order in s, a lag T of the position reduces the damping by Kp T, and a lag T_v of the velocity reduces
+    the inertia by Kd T_v: (M - Kd T_v + Kp T^2 / 2) s^2 + (b + Kd - Kp T) s + Kp = 0. This equals
+    m (s^2 + 2 z w s + w^2) if m (1 + (2 z w + w^2 T) T_v - w^2 T^2 / 2) = M + b T_v, Kp = m w^2, and
+    Kd = 2 z w m + Kp T - b. A negative kd is replaced by zero.
 
     Args:
-        inertia: M [kg m^2; kg].
-        frequency: w [rad/s]; far below the inverse of the lags, or the gains place it only roughly.
-        damping_ratio: z.
-        sampling: gives the lags.
-        viscous: friction b of the joint [N m s/rad; N s/m].
+        inertia: Inertia M [kg m^2; kg].
+        frequency: Natural frequency w [rad/s]. The result is accurate if w is far below the inverse of the lags.
+        damping_ratio: Damping ratio z.
+        sampling: Sampling that determines the lags.
+        viscous: Viscous friction b of the joint [N m s/rad; N s/m].
     """
     w, z, T, T_v = frequency, damping_ratio, sampling.position_lag, sampling.velocity_lag
     m = (inertia + viscous * T_v) / (1.0 + (2.0 * z * w + w**2 * T) * T_v - 0.5 * (w * T) ** 2)

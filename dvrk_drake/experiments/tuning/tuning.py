@@ -1,4 +1,4 @@
-"""Tunes an arm and compares the gains, on all cores."""
+"""Tuning of an arm and comparison of the gains, in parallel on all cores."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from dvrk_drake.experiments.tuning.procedure import JointProcedure, tune_joint
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
 
-#: How long a step is watched [s], and the part of it at the end in which nothing should move any more.
+#: Duration of a step test [s], and its final part in which the joints should be at rest [s].
 DURATION, REST = 2.0, 0.4
 CONDITIONS = (
     NOMINAL,
@@ -39,20 +39,20 @@ CONDITIONS = (
     Condition("M -20 %", inertia=0.8),
     Condition("+1 tick", ticks=1),
 )
-#: Poses of the joint box, and the seed that draws them.
+#: Number of random poses in the joint box, and their seed.
 POSES, SEED = 6, 3
 
 
 @dataclass(frozen=True, eq=False)
 class StepMeasures:
-    """Of the n joints in one step, from the positions that the joints truly have.
+    """Performance measures of the n joints in one step, computed from their true positions.
 
     Attributes:
-        settling: (n,) time after which the joint stays inside its `band` [s]; infinite if it does not, or not for
+        settling: Time (n,) after which the joint stays inside its `band` [s]; infinite if it leaves the band during
             the last `REST`.
-        overshoot: (n,) farthest beyond the goal, as a share of the step; 0 if it does not get there.
-        steady_error: (n,) mean distance from the goal over the last `REST` [rad, m].
-        oscillation: (n,) peak to peak of the commanded effort over the last `REST`, as a share of the effort limit.
+        overshoot: Maximum distance (n,) beyond the goal, as a share of the step; 0 if the joint does not reach it.
+        steady_error: Mean distance (n,) from the goal over the last `REST` [rad, m].
+        oscillation: Peak-to-peak commanded effort (n,) over the last `REST`, as a share of the effort limit.
     """
 
     settling: NDArray[np.float64]
@@ -63,15 +63,15 @@ class StepMeasures:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What gains do.
+    """Comparison of the gains of an arm.
 
     Attributes:
-        arm: whose gains they are.
-        gains: name -> gains.
-        conditions: (c,) of the arm.
-        poses: (p, n) where the steps begin.
-        measures: name -> condition by condition, pose by pose.
-        responses: name -> the step from the first pose, arm as modelled.
+        arm: Arm that the gains are for.
+        gains: Gains by name.
+        conditions: Conditions (c,) of the arm.
+        poses: Start poses (p, n) of the steps.
+        measures: Measures by name, for each condition and pose.
+        responses: Response by name to the step from the first pose, with the arm as modelled.
     """
 
     arm: Arm
@@ -82,11 +82,11 @@ class Comparison:
     responses: Mapping[str, Response]
 
     def table(self, name: str, measure: str) -> NDArray[np.float64]:
-        """(c, p, n) one of the fields of `StepMeasures`."""
+        """Returns one field of `StepMeasures` as an array (c, p, n)."""
         return np.array([[getattr(m, measure) for m in poses] for poses in self.measures[name]])
 
     def best(self, names: Iterable[str]) -> str:
-        """Of these gains those with which joints fail to settle least often; of equal ones the fastest."""
+        """Returns the gains with the fewest joints that do not settle; for equal numbers, the fastest gains."""
 
         def rank(name: str) -> tuple[int, float]:
             settling = self.table(name, "settling")
@@ -97,14 +97,14 @@ class Comparison:
 
 
 def step_goal(arm: Arm, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n,) every joint one step from q (n,), to the side where the middle of its range is."""
+    """Returns the goal (n,) of a step of all joints from q (n,) towards the middle of their ranges."""
     middle = 0.5 * (arm.position_lower + arm.position_upper)
     goal: NDArray[np.float64] = q + np.where(q < middle, 1.0, -1.0) * step_size(arm)
     return goal
 
 
 def measure_step(arm: Arm, response: Response) -> StepMeasures:
-    """What a response to a step from where it begins says."""
+    """Computes the performance measures of a step response."""
     t, error = response.t, response.q - response.q_desired
     way = error[0]
     outside = np.abs(error) > band(arm)
@@ -120,28 +120,28 @@ def measure_step(arm: Arm, response: Response) -> StepMeasures:
 
 
 def run_step(bench: Bench, q: NDArray[np.float64], gains: Gains) -> Response:
-    """All joints step at once: each also has to bear what the others do."""
+    """Simulates a simultaneous step of all joints, so that each joint is disturbed by the others."""
     return bench.step(q, step_goal(bench.arm, q), gains, DURATION)
 
 
 Method = Literal["paper", "model"]
-#: What gains are called in tables that no method has found.
+#: Names in tables of gains that were not found by a method.
 OWN, PUBLISHED = "the arm's own", "published"
-#: Called with the finished share, 0..1.
+#: Function called with the finished share, 0..1.
 Progress = Callable[[float], object]
-#: Of the time that a run takes, the share of the procedure.
+#: Share of the procedure in the total duration of a run.
 PROCEDURE_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """What tuning an arm gave.
+    """Result of tuning an arm.
 
     Attributes:
-        arm: that was tuned.
-        procedure: of each joint by the paper's procedure, if that was asked for.
-        design: by the model, if that was asked for.
-        comparison: of these gains, the arm's own and published ones.
+        arm: Arm that was tuned.
+        procedure: Result of the paper's procedure for each joint, if requested.
+        design: Result of the model-based design, if requested.
+        comparison: Comparison of these gains with the arm's own and the published ones.
     """
 
     arm: Arm
@@ -151,7 +151,7 @@ class Tuning:
 
     @property
     def found(self) -> dict[str, Gains]:
-        """Gains that were found here, by method."""
+        """Gains that were found by tuning, by method."""
         gains = self.comparison.gains
         return {name: gains[name] for name in gains if name not in (OWN, PUBLISHED)}
 
@@ -163,17 +163,17 @@ def tune_arm(
     conditions: tuple[Condition, ...] = CONDITIONS,
     poses: int = POSES,
 ) -> Tuning:
-    """Finds gains and compares them; the same arm gives the same numbers.
+    """Tunes an arm and compares the gains. The result is deterministic.
 
     Args:
-        name: of an arm, or the path of its YAML file.
-        methods: how to find gains.
-        progress: of all of it.
-        conditions: of the arm in the comparison; the first is the arm as modelled.
-        poses: of the joint box, in the comparison.
+        name: Name of an arm, or path of its YAML file.
+        methods: Tuning methods.
+        progress: Function called with the finished share of the run, 0..1.
+        conditions: Conditions of the arm in the comparison. The first is the arm as modelled.
+        poses: Number of poses in the comparison.
 
     Raises:
-        ArmError: no such arm, or its motors hardly hold it.
+        ArmError: The arm does not exist, or its motors are too weak to hold it.
     """
     arm = load_arm(name)
     share = PROCEDURE_SHARE if "paper" in methods else 0.0
@@ -202,7 +202,7 @@ def _compare(
     progress: Progress,
 ) -> Comparison:
     arm = load_arm(name)
-    # Condition by condition: a process builds an arm for each that it meets.
+    # Sort the runs by condition, since each process builds one arm per condition.
     runs = {
         (which, c, p): executor.submit(_step, name, condition, poses, p, gains[which])
         for c, condition in enumerate(conditions)

@@ -97,9 +97,9 @@ def reproduce_psm(session: ReproductionSession) -> Section:
     remarks = (
         "The paper shows a model and no experiment: its masses are placeholders. The table sets its file's faults "
         "beside what our plant gives when it is asked.",
-        f"{psm.truth.origin} Ours is identified from {sample_sizes.collected} poses collected on it. Each release is at a "
-        f"random pose inside the limits, watched for {sample_sizes.duration:g} s under gravity compensation alone. **Every "
-        f"joint stays within {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm) at "
+        f"{psm.truth.origin} Ours is identified from {sample_sizes.collected} poses collected on it. Each release is "
+        f"at a random pose inside the limits, watched for {sample_sizes.duration:g} s under gravity compensation alone. "
+        f"**Every joint stays within {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm) at "
         f"{share(ours.num_held, len(poses))}** of the poses with ours, at {share(drawn.num_held, len(poses))} with "
         "the model as drawn.",
         f"`identify` gives no torque to {', '.join(disabled) or 'no joint'}: what it measured there is below 2 % of "

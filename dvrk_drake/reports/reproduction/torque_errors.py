@@ -60,7 +60,7 @@ def reproduce_figure_4(
     )
     left_out = ResultTable(
         "fig4_left_out",
-        "RMS error at poses that were not fitted [N m]; without the measurements that our check excluded, then with all",
+        "RMS error at poses that were not fitted [N m]; without excluded measurements, then with all",
         ("", *joints),
         (
             ("zero torque", *rms(zero, included)),

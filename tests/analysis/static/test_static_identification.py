@@ -242,8 +242,8 @@ def test_model_file_round_trip_and_refusals(arm, tmp_path):
             'kind is "viscous"; allowed: offset, spring, cable sine, cable cosine',
         ),
         (
-            text.replace("model 3", "model 1").replace("\neffects:", "\njoint_effects:"),
-            'model 1", this version reads "dvrk_drake identified model 3" and 2; identify anew',
+            text.replace("model 4", "model 1").replace("\neffects:", "\njoint_effects:"),
+            'model 1", this version reads "dvrk_drake identified model 4", 3 and 2; identify anew',
         ),
         (
             text.replace("feedforward_scale: 1.0", "feedforward_scale: 2.0"),
@@ -274,12 +274,14 @@ def test_a_model_file_finds_its_arm_after_both_have_moved_and_one_of_version_2_i
     model.save(tmp_path / "new.yaml")
     new = (tmp_path / "new.yaml").read_text()
     for name in ("mtmr", f"{moved}/own.yaml"):
-        old = new.replace("model 3", "model 2").replace("package://dvrk_drake/arms/mtmr.yaml", name)
-        (tmp_path / "old.yaml").write_text(old.replace("coefficient:", "value:"))
-        read = IdentifiedModel.load(tmp_path / "old.yaml")
+        old = new.replace("model 4", "model 2").replace("package://dvrk_drake/arms/mtmr.yaml", name)
+        old = old.replace("coefficient:", "value:").replace("feedforward_scale:", "trust:")
+        (tmp_path / "old.yaml").write_text(old.replace("_included:", "_undoubted:").replace("excluded:", "doubted:"))
+        with pytest.warns(FutureWarning, match='old.yaml: key "trust" is now "feedforward_scale"'):
+            read = IdentifiedModel.load(tmp_path / "old.yaml")
         assert (read.arm, read.effects) == (load_arm(name), effects)
-    with pytest.raises(ModelError, match=r"old\.yaml: is of MTMR, not of PSM"):
-        IdentifiedModel.load(tmp_path / "old.yaml", load_arm("psm"))
+    with pytest.raises(ModelError, match=r"new\.yaml: is of MTMR, not of PSM"):
+        IdentifiedModel.load(tmp_path / "new.yaml", load_arm("psm"))
 
 
 # The paper's own recording.
