@@ -23,7 +23,7 @@ class EffortRamp(LeafSystem):
         output_ports:
         - effort
 
-    `effort_wanted`, `effort_measured` and `effort` have n numbers [N m; N on a prismatic joint]. `enabled` has one, zero
+    `effort_wanted`, `effort_measured` and `effort` have n numbers [N m; N on a prismatic joint]. `enabled` has one, 0
     or not. `effort` is start + share * (wanted - start), where start is the last measured effort before it was enabled
     and share increases from 0 to 1. Both are discrete state, updated every `period` or by a forced discrete update.
     """

@@ -31,7 +31,7 @@ class HardwareArmStation(Diagram):
     command HOLD.
 
     After the guard's watchdog took over, e.g. because this process was stopped for 50 ms, efforts act again only when
-    an operator resumes: stop this process, inspect the arm, run `dvrk-drake run --reset`, stop it, restart this process.
+    an operator resumes: stop this process, inspect the arm, run `dvrk-drake run --reset`, stop it, start this again.
     """
 
     def __init__(self, arm: Arm, *, driver: DvrkDriver | None = None, lcm: DrakeLcmInterface | None = None) -> None:

@@ -70,7 +70,7 @@ def add_ideal_drive(
     """Connects a finalized plant's inputs and returns the ports. All added systems are C++ and have no state."""
     n = len(joints.index)
     commanded = builder.AddNamedSystem("effort_commanded", PassThrough(n))
-    # The plant clamps as well but does not output the result. Clamp here, at its limits, to measure what is applied.
+    # The plant clamps as well but does not output the result. Clamp here at its limits, to measure the effort.
     limits = joints.effort_limits
     clamp = builder.AddNamedSystem("effort_clamp", Saturation(min_value=-limits, max_value=limits))
     to_actuators = builder.AddNamedSystem("to_actuators", MatrixGain(D=joints.actuation))

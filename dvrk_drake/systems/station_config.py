@@ -1,4 +1,4 @@
-"""Which station there is, as a schema for Drake's yaml_load_typed, and the station that it describes.
+"""Configuration of a station, as a schema for Drake's yaml_load_typed, and the station that it describes.
 
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
@@ -30,16 +30,16 @@ from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 @dataclass
 class ArmConfig:
-    """The arm of a station or of a scenario, and how it is simulated.
+    """Arm of a station or of a scenario, and the options of its simulation.
 
     Attributes:
-        arm: name, or path of an arm's YAML file; paths are relative to the folder that the command runs in.
-        closure: how the linkage's loops are held: "ball" or "mimic".
-        gravity: (3,) in the base frame [m/s^2]; the arm's own if left out.
-        effects: more of them in the drive of the simulated arm, of position alone; controllers do not know them.
-        stretch: actuator -> cable of the simulated arm that stretches, beside those of `simulated_effects`.
-        simulated_effects: parts of the arm's own `effects` that the simulation has, by name; ["all"] for all of them.
-        seed: of all noise.
+        arm: Name, or path of an arm's YAML file. Paths are relative to the working directory of the command.
+        closure: Method that closes the linkage's loops: "ball" or "mimic".
+        gravity: Gravity vector (3,) in the base frame [m/s^2]; the arm's own by default.
+        effects: Additional position-dependent effects in the drive of the simulated arm. Controllers do not model them.
+        stretch: Mapping of actuator to an elastic cable of the simulated arm, besides those of `simulated_effects`.
+        simulated_effects: Names of the parts of the arm's own `effects` that are simulated; ["all"] for all of them.
+        seed: Seed of all noise.
     """
 
     arm: str = ""
@@ -52,16 +52,16 @@ class ArmConfig:
 
     @cached_property
     def mounted_arm(self) -> Arm:
-        """The arm, with gravity from where the file says."""
+        """Returns the arm with the gravity vector of the configuration."""
         arm = load_arm(self.arm)
         return arm if self.gravity is None else arm.with_gravity(self.gravity)
 
     @property
     def all_effects(self) -> ArmEffects | None:
-        """What the simulated arm has beside its links: `simulated_effects`, `effects` and `stretch`; None if there is nothing.
+        """Effects of the simulated arm: `simulated_effects`, `effects` and `stretch`. None if there are none.
 
         Raises:
-            ArmError: a name that is no part.
+            ArmError: A name of an unknown part.
         """
         if not (self.simulated_effects or self.effects or self.stretch):
             return None
@@ -69,10 +69,10 @@ class ArmConfig:
         return own.joined(ArmEffects(cables=self.effects, stretch=self.stretch))
 
     def arm_fault(self) -> str:
-        """The first thing here that cannot be simulated: a number of any field, closure or effects; or "".
+        """Describes the first field that cannot be simulated: a number, the closure or the effects. Empty: none.
 
         Raises:
-            ArmError: the arm cannot be loaded.
+            ArmError: The arm cannot be loaded.
         """
         if not self.arm:
             return "arm is missing; give an arm's name, or the path of its YAML file"
@@ -94,12 +94,12 @@ class ArmConfig:
 
 @dataclass
 class StationConfig(ArmConfig):
-    """Schema of a station's file: one arm, simulated or the hardware.
+    """Schema of a station file: one arm, simulated or real.
 
     Attributes:
-        plant: of the simulation; what a file leaves out is as in `arm_plant_config`.
-        simulator: for `ApplySimulatorConfig`, by whoever simulates the station.
-        driver: of the hardware; files that it names are relative to the station's file.
+        plant: Configuration of the simulated plant. The defaults are those of `arm_plant_config`.
+        simulator: Configuration for `ApplySimulatorConfig`, which the caller applies.
+        driver: Configuration of the hardware driver. Its paths are relative to the station file.
     """
 
     plant: MultibodyPlantConfig = field(default_factory=arm_plant_config)
@@ -110,8 +110,8 @@ class StationConfig(ArmConfig):
         """Checks the values.
 
         Raises:
-            StationError: names the field, its value, and what is allowed.
-            ArmError: the arm cannot be loaded.
+            StationError: A value is not allowed. The message states the field, its value and the allowed range.
+            ArmError: The arm cannot be loaded.
         """
         if fault := self.arm_fault():
             raise StationError(fault)
@@ -121,11 +121,11 @@ class StationConfig(ArmConfig):
 
 
 def load_station_config(path: str | Path) -> StationConfig:
-    """Reads a station's file with Drake's loader.
+    """Reads a station file with Drake's loader.
 
     Raises:
-        StationError: it cannot be read, has an unknown key, or a value that is not allowed.
-        ArmError: the arm cannot be loaded.
+        StationError: The file cannot be read, or has an unknown key or a value that is not allowed.
+        ArmError: The arm cannot be loaded.
     """
     content = with_current_keys(StationConfig, load_yaml(path, StationError), str(path))
     try:
@@ -133,7 +133,7 @@ def load_station_config(path: str | Path) -> StationConfig:
         config.check()
     except ArmError as error:
         raise ArmError(f"{path}: {error}") from error
-    except Exception as error:  # of many types: Drake's, YAML's, the system's
+    except Exception as error:  # types of Drake, YAML and the operating system
         raise StationError(f"{path}: {' '.join(str(error).split())}") from error
     config.driver.relative_to(Path(path).parent)
     return config
@@ -146,16 +146,16 @@ def make_arm_station(
     meshcat: Meshcat | None = None,
     lcm: DrakeLcmInterface | None = None,
 ) -> ArmStation | HardwareArmStation:
-    """Returns the station of `config`, as Drake's MakeHardwareStation: a controller uses the same ports of both.
+    """Returns the station of `config`. As with Drake's MakeHardwareStation, both kinds have the same ports.
 
     Args:
-        config: what it is; `simulator` is not read here.
-        hardware: the arm itself instead of its simulation.
-        meshcat: draws the simulated arm.
-        lcm: of the hardware, see `HardwareArmStation`.
+        config: Configuration of the station; `simulator` is not used here.
+        hardware: True for the real arm instead of its simulation.
+        meshcat: Meshcat that draws the simulated arm.
+        lcm: LCM interface of the hardware, see `HardwareArmStation`.
 
     Raises:
-        StationError, ArmError: the configuration is not allowed.
+        StationError, ArmError: The configuration is not allowed.
     """
     config.check()
     if hardware:

@@ -1,4 +1,4 @@
-"""Simulated teleoperation: a hand moves a master arm in gravity compensation, and a patient side manipulator follows."""
+"""Simulated teleoperation: a hand moves a master arm in gravity compensation, which leads a PSM."""
 
 from __future__ import annotations
 

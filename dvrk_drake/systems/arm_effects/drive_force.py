@@ -85,7 +85,7 @@ class EffortSensor(LeafSystem):
     """
 
     def __init__(self, arm: Arm, motors: Motors, effort: EffortEffect | None, time_step: float, seed: int) -> None:
-        """Creates the sensor of `arm` with noise from `seed` >= 0 every `time_step` [s]. It is exact without `effort`."""
+        """Creates the sensor of `arm` with noise from `seed` >= 0 every `time_step` [s]. No `effort`: it is exact."""
         super().__init__()
         effort = effort or EffortEffect()
         names, n = arm.joint_names, arm.num_joints

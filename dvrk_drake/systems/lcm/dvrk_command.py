@@ -44,7 +44,7 @@ class DvrkCommandSender(LeafSystem):
     - `lcmt_dvrk_status`: status to answer. The command carries its session, time and sequence. The arm refuses a
       command that is repeated without a new status as sent twice. So without new statuses, the arm holds.
     - `effort` (n) and `desired_state` (2n: q, then v): commanded values.
-    - `control_mode` (1): lcmt_dvrk_command.HOLD, POSITION, EFFORT or OFF. Other values mean HOLD. Unconnected: EFFORT if
+    - `control_mode` (1): lcmt_dvrk_command.HOLD, POSITION, EFFORT or OFF. Others mean HOLD. Unconnected: EFFORT if
       `effort` is connected, else POSITION if `desired_state` is, else HOLD.
     - `reset_fault` (1): not zero requests to reset a fault, or to resume after the watchdog took over. The mode is then
       HOLD.
