@@ -1,4 +1,4 @@
-"""The regressor of an arm's full dynamics, and its base parameters: those that a motion can identify."""
+"""Regressor of an arm's full dynamics, and its base parameters, which a motion can identify."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant
 
-#: Samples of which `torque` keeps a regressor at a time.
+#: Number of samples per regressor in `torque`.
 _CHUNK = 256
 
 
 class DynamicRegressor:
-    """tau = Y(q, v, vd) phi: the torque on the n independent joints that moves the arm, linkage and rotors included.
+    """Regressor Y of the inverse dynamics tau = Y(q, v, vd) phi of an arm, including linkage and rotors.
 
-    phi (p,) holds the ten inertial parameters of every moving link, each about its origin in its frame of the SDF, and
-    then the inertias of the rotors in actuator coordinates. The equations are those of the arm's MultibodyPlant, whose
-    joints are read; tau equals its inverse dynamics less gravity forces, projected through the linkage with G'.
-    Friction and joint damping are not part of it.
+    tau is the torque on the n independent joints. phi (p,) contains the ten inertial parameters of every moving link,
+    about the origin and along the axes of its SDF frame, then the inertias of the rotors in actuator coordinates. The
+    joints are read from the arm's MultibodyPlant. tau equals the plant's inverse dynamics minus gravity forces,
+    projected through the linkage with G'. Friction and joint damping are not included.
 
     Attributes:
-        arm: whose equations these are, mounted as its `gravity` says.
-        links: the moving links with their SDF's parameters, in the order of the columns.
-        rotors: the rotor parameters, in the order of their columns, which follow the links'.
+        arm: Arm of the regressor. Its `gravity` specifies the mounting.
+        links: Moving links with the parameters of their SDF, in the order of the columns.
+        rotors: Rotor parameters, in the order of their columns, which follow those of the links.
     """
 
     def __init__(self, arm: Arm) -> None:
         """Reads the arm's plant.
 
         Raises:
-            ArmError: a joint of its SDF neither turns, slides nor is fixed.
+            ArmError: A joint of the SDF is not revolute, prismatic or fixed.
         """
         self.arm = arm
         plant = shared_plant(arm)
@@ -64,34 +64,37 @@ class DynamicRegressor:
         self.rotors: tuple[RotorInertia, ...] = rotor_inertias(plant, arm)
 
     def with_gravity(self, gravity: Sequence[float]) -> DynamicRegressor:
-        """The same arm's under a gravity vector (3,) in its base frame [m/s^2]."""
+        """Returns the regressor of the same arm with gravity vector (3,) in its base frame [m/s^2]."""
         other = copy.copy(self)
         other.arm = self.arm.with_gravity(gravity)
         return other
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """(p,) such as "forearm_link.mcx" [kg m] and "rotor.elbow_pitch" [kg m^2; kg on a prismatic actuator]."""
+        """Parameter names (p,).
+
+        Examples are "forearm_link.mcx" [kg m] and "rotor.elbow_pitch" [kg m^2; kg for a prismatic actuator].
+        """
         links = [f"{link.link}.{name}" for link in self.links for name in PARAMETER_NAMES]
         return tuple(links + [rotor.name for rotor in self.rotors])
 
     @cached_property
     def values(self) -> NDArray[np.float64]:
-        """(p,) what the SDF states."""
+        """Parameters (p,) of the SDF."""
         return np.concatenate([*(link.parameters for link in self.links), [rotor.value for rotor in self.rotors]])
 
     def regressor(
         self, q: ArrayLike, v: ArrayLike, vd: ArrayLike, out: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Y (m, n, p).
+        """Returns the regressor Y (m, n, p).
 
         Args:
-            q, v, vd: (m, n) positions [rad, m], velocities and accelerations of the independent joints.
-            out: array to write to and return. Getting memory for a new one takes longer than computing Y, so a caller
-                that goes through many samples in parts keeps one.
+            q, v, vd: Positions [rad, m], velocities and accelerations (m, n) of the independent joints.
+            out: Array that receives the result and is returned. Allocating a new array takes longer than computing Y,
+                so callers that process many samples in chunks should reuse one.
 
         Raises:
-            ModelError: the arrays are not of these shapes, or `out` is not C-contiguous float64.
+            ModelError: The arrays do not have these shapes, or `out` is not C-contiguous float64.
         """
         motion = self._checked_motion(q, v, vd)
         shape = (*motion[0].shape, len(self.names))
@@ -102,13 +105,16 @@ class DynamicRegressor:
         return Y
 
     def torque(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike, parameters: ArrayLike) -> NDArray[np.float64]:
-        """tau (m, n) [N m; N on a prismatic joint] for parameters (p,); arguments as in `regressor`."""
+        """Returns tau (m, n) [N m; N for a prismatic joint] for parameters (p,).
+
+        The other arguments are those of `regressor`.
+        """
         return self._torque(self._checked_motion(q, v, vd), self.arm.gravity, self._checked_parameters(parameters))
 
     def mass_matrix(self, q: ArrayLike, parameters: ArrayLike) -> NDArray[np.float64]:
-        """M (m, n, n) of the independent joints at the poses q (m, n), for parameters (p,): tau = M vd + ...
+        """Returns the mass matrix M (m, n, n) of the independent joints at poses q (m, n) for parameters (p,).
 
-        Column j is the torque of a unit acceleration of joint j at rest and without gravity.
+        Column j is the torque for a unit acceleration of joint j at zero velocity and without gravity.
         """
         q, _, _ = self._checked_motion(q, np.zeros_like(q, dtype=float), np.zeros_like(q, dtype=float))
         n = self.arm.num_joints
@@ -119,7 +125,7 @@ class DynamicRegressor:
     def _torque(
         self, motion: tuple[NDArray, NDArray, NDArray], gravity: NDArray, parameters: NDArray
     ) -> NDArray[np.float64]:
-        """Chunk by chunk, so that no regressor of all samples is held."""
+        """Computes the torque in chunks, to limit memory use."""
         tau = np.empty(motion[0].shape)
         Y = np.empty((_CHUNK, self.arm.num_joints, len(parameters)))
         for start in range(0, len(tau), _CHUNK):
@@ -149,7 +155,7 @@ class DynamicRegressor:
 
     @cached_property
     def _rotor_rows(self) -> NDArray[np.float64]:
-        """(r, 2, n) as `fill_regressor` takes them."""
+        """Rotor rows (r, 2, n) for `fill_regressor`."""
         J = self.arm.transmission.matrix
         index = self.arm.joint_names.index
         rows = [
@@ -176,16 +182,16 @@ _AXES = tuple(parameter_axis(name) for name in PARAMETER_NAMES)
 
 @dataclass(frozen=True, eq=False)
 class DynamicBaseParameters:
-    """beta = base.combination phi_F, with tau = Y_base beta = Y phi for every motion.
+    """Base parameters beta = base.combination phi_F, with tau = Y_base beta = Y phi for every motion.
 
-    phi_F (p,) are the ten parameters of each link about the origin and along the axes of its frame dh_<label> (a link
-    that has none: its SDF frame), then the rotors'; `base.names` are written in them. phi (p,) are those of
-    `DynamicRegressor`, about the links' own origins.
+    phi_F (p,) contains the ten parameters of each link about the origin and along the axes of its frame dh_<label>,
+    then those of the rotors. A link without such a frame uses its SDF frame. `base.names` refer to phi_F. phi (p,) are
+    the parameters of `DynamicRegressor`, about the origins of the SDF frames.
 
     Attributes:
-        standard_parameters: (p,) phi_F.
-        base: the combinations.
-        to_links: (p, p) phi = to_links phi_F.
+        standard_parameters: Standard parameters phi_F (p,).
+        base: Base parameters as combinations of phi_F.
+        to_links: Matrix (p, p) with phi = to_links phi_F.
     """
 
     standard_parameters: tuple[StandardParameter, ...]
@@ -194,22 +200,23 @@ class DynamicBaseParameters:
 
     @cached_property
     def combination(self) -> NDArray[np.float64]:
-        """(b, p) with beta = combination phi."""
+        """Matrix (b, p) with beta = combination phi."""
         return np.asarray(np.linalg.solve(self.to_links.T, self.base.combination.T).T, dtype=np.float64)
 
 
 def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True) -> DynamicBaseParameters:
-    """Reduces the regressor at random states, chosen so that gravity, velocity and acceleration weigh about the same.
+    """Derives the base parameters numerically from the regressor at random states.
 
-    They are those of the arm as it is mounted: tilting it can bring parameters of the first links into the torque.
+    The states are chosen so that gravity, velocity and acceleration terms have similar magnitude. The base parameters
+    depend on the mounting: on a tilted arm, additional parameters of the first links can affect the torque.
 
     Args:
-        model: of the arm.
-        coupled_rotors: False leaves out what couples two rotors, which no motor has (see `rotor_inertias`); p is less
-            by these, the last columns of the regressor.
+        model: Regressor of the arm.
+        coupled_rotors: False to exclude the coupling terms between two rotors, which no motor has (see
+            `rotor_inertias`). These are the last columns of the regressor, and p is reduced by their number.
 
     Raises:
-        ArmError: the arm's SDF has no frames dh_1, dh_2, ...
+        ArmError: The arm's SDF has no frames dh_1, dh_2, ...
     """
     plant = shared_plant(model.arm)
     bodies = labelled_bodies(plant, "dh")
@@ -237,13 +244,16 @@ def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True)
 def _link_frames(
     model: DynamicRegressor, plant: MultibodyPlant, bodies: dict[str, tuple[RigidBody, RigidTransform]]
 ) -> list[tuple[str, RigidTransform]]:
-    """Label and X_LF of each link of the model; a link without a dh frame is called as in the SDF, less its "_link"."""
+    """Returns label and X_LF of each link of the model.
+
+    The label of a link without a dh frame is its name in the SDF without the suffix "_link".
+    """
     named = {body.name(): (label, X_LF) for label, (body, X_LF) in bodies.items()}
     return [named.get(link.link, (link.link.removesuffix("_link"), RigidTransform())) for link in model.links]
 
 
 def _regressor_at_random_states(model: DynamicRegressor) -> NDArray[np.float64]:
-    """(rows, p), three times as many as columns."""
+    """Returns regressor rows (rows, p) at random states, about three times as many rows as columns."""
     generator = np.random.default_rng(0)
     shape = (3 * len(model.values) // model.arm.num_joints + 1, model.arm.num_joints)
     q, v, vd = generator.uniform(-2, 2, shape), generator.normal(0, 2, shape), generator.normal(0, 5, shape)
@@ -253,7 +263,7 @@ def _regressor_at_random_states(model: DynamicRegressor) -> NDArray[np.float64]:
 def _hinge_axes(
     plant: MultibodyPlant, model: DynamicRegressor, frames: list[tuple[str, RigidTransform]]
 ) -> dict[str, int]:
-    """Label -> which axis of its frame F (0, 1, 2) the link turns about, for links that turn about one."""
+    """Returns label -> index (0, 1, 2) of the axis of frame F that is parallel to the joint axis, for revolute joints."""
     axes = {}
     for link, (label, X_LF) in zip(model.links, frames, strict=True):
         joints = (plant.get_joint(i) for i in plant.GetJointIndices())
@@ -265,12 +275,12 @@ def _hinge_axes(
 
 
 def _readable_preference(parameters: list[StandardParameter], hinge_axes: dict[str, int]) -> list[int]:
-    """Columns in the order in which they become base parameters.
+    """Returns the columns in the order of preference as base parameters.
 
-    A link that turns about its axis u gives its mass, its first moment along u and one of its moments of inertia
-    across u to the link before it (Khalil and Dombre, "Modeling, Identification and Control of Robots", 9.4.2): these
-    come last, and from the base. Numbered links come before those of the linkage, which are read as additions to them,
-    and rotors last of all but masses.
+    For a revolute link with axis u, three parameters can be regrouped with the previous link: its mass, its first
+    moment along u and one moment of inertia about an axis perpendicular to u (Khalil and Dombre, "Modeling,
+    Identification and Control of Robots", 9.4.2). These come last, starting from the base. Numbered links precede the
+    links of the linkage. Rotors follow the links, and masses are last.
     """
 
     def given_away(p: StandardParameter) -> bool:
@@ -290,7 +300,7 @@ def _readable_preference(parameters: list[StandardParameter], hinge_axes: dict[s
 
 
 def _named_coefficients(lengths: dict[str, float]) -> dict[str, float]:
-    """1, the lengths, and what inertias have in front of moments and masses: products, squares, ratios of two."""
+    """Returns named coefficients of base parameters: numbers, lengths, and their products, squares and ratios."""
     lengths = {name: length for name, length in lengths.items() if name != "1"}
     named = {**lengths, **{f"{name}^2": length**2 for name, length in lengths.items()}}
     for (a, x), (b, y) in itertools.permutations(lengths.items(), 2):

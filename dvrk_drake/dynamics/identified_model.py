@@ -121,7 +121,7 @@ class Provenance:
     version: str = ""
 
 
-#: Verdicts on a joint of a model; `off` means that the model commands no torque.
+#: Verdicts on a joint of a model, from most to least favourable; `off` means that the model commands no torque.
 Verdict = Literal["off", "good", "usable", "not judged", "do not use"]
 
 

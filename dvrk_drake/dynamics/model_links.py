@@ -1,4 +1,4 @@
-"""The links and rotors of an identified model: bodies that a simulator can use."""
+"""Computes links and rotors of an identified model for use in a simulator."""
 
 from __future__ import annotations
 
@@ -21,30 +21,31 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import shared_plant
 
-#: Least eigenvalue of a link's pseudo-inertia, as a share of that of the SDF's link in all directions.
+#: Lower bound on the eigenvalues of Z, the pseudo-inertia of a link relative to that of the SDF (see `nearest_links`).
 MIN_SHARE = 0.01
-#: Change of Z below which a link has not moved.
+#: Change of Z below which a link counts as unchanged.
 _ROUNDING = 1e-7
 _UPPER = [(i, k) for i in range(4) for k in range(i, 4)]
 
 
 def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
-    """Links of which the gravity torque is Y(q) beta, as near to the SDF's as bodies can be.
+    """Returns the physically consistent links nearest to those of the SDF whose gravity torque is Y(q) beta.
 
-    With the SDF's pseudo-inertia J0 = L L' of a link, Z = L^-1 J L^-T is 1 where nothing changes, whatever the link's
-    size: the distance is the sum of |Z - 1|^2 (Frobenius) over the links, under Z > MIN_SHARE and the linear
-    equations of the gravity torque. Distance and condition do not depend on frames or units (Lee, Wensing, Park,
-    "Geometric robot dynamic identification", 2020: its second-order approximation at J0).
+    With the pseudo-inertia J0 = L L' of a link in the SDF, Z = L^-1 J L^-T is the identity for an unchanged link of any
+    size. The distance is the sum of |Z - 1|^2 (Frobenius norm) over the links. It is minimized subject to Z > MIN_SHARE
+    and the linear equations of the gravity torque. Distance and constraint do not depend on frames or units. The
+    distance is the second-order approximation at J0 of the one by Lee, Wensing and Park, "Geometric robot dynamic
+    identification" (2020).
 
     Args:
-        arm: the arm.
-        base_values: (b,) values of `derive_gravity(arm).base`.
+        arm: Arm of the links.
+        base_values: Values (b,) of the base parameters `derive_gravity(arm).base`.
 
     Raises:
-        ModelError: no bodies have these base parameters, or the solver did not converge.
+        ModelError: No physically consistent links have these base parameters, or the solver did not converge.
     """
     regressor = DynamicRegressor(arm)
-    # phi of a link as a linear function of the ten numbers z of its Z; a rotor stays as it is.
+    # phi of a link is a linear function of the ten elements z of its Z. Rotors are not changed.
     maps = {i: _map(link) for i, link in enumerate(regressor.links) if not _is_rotor(arm, link.link)}
     A, b = _equations(regressor, maps, np.asarray(base_values, dtype=np.float64))
     z = _nearest(A, b)
@@ -65,7 +66,10 @@ def _map(link: LinkInertia) -> NDArray[np.float64]:
 
 
 def _is_rotor(arm: Arm, link: str) -> bool:
-    """Links without a frame dh_<name> are centred on their axis, see `derive_gravity`, and must stay so."""
+    """Returns whether a link has no frame dh_<name>.
+
+    The centre of mass of such a link is on its axis (see `derive_gravity`) and must remain there.
+    """
     plant = shared_plant(arm)
     frames = map(plant.get_frame, plant.GetFrameIndices(plant.GetBodyByName(link).model_instance()))
     return not any(f.name().startswith("dh_") and f.body().name() == link for f in frames)
@@ -74,7 +78,10 @@ def _is_rotor(arm: Arm, link: str) -> bool:
 def _equations(
     regressor: DynamicRegressor, maps: dict[int, NDArray[np.float64]], base_values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A z = b: as many independent rows as there are base parameters, from random poses beyond the joint box."""
+    """Returns A and b of the equations A z = b, with one independent row per base parameter.
+
+    The equations are derived from random poses, not restricted to the joint limits.
+    """
     arm = regressor.arm
     q = np.random.default_rng(0).uniform(-1.5, 1.5, (60, arm.num_joints))
     Y = regressor.regressor(q, np.zeros_like(q), np.zeros_like(q))
@@ -85,25 +92,28 @@ def _equations(
     A = np.hstack([Y[:, 10 * i : 10 * i + 10] @ T for i, T in maps.items()])
     U, s, Vt = np.linalg.svd(A, full_matrices=False)
     rank = int(np.sum(s > 1e-9 * s[0]))
-    # Rows of unit size, so that the solver's tolerance is one of torques of each kind alike.
+    # Rows of unit norm, so that the solver's tolerance applies equally to all torques.
     return Vt[:rank], (U[:, :rank].T @ tau) / s[:rank]
 
 
 def _weights(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weights of the squares in |Z - 1|^2, where entries off the diagonal count twice, and the entries of 1."""
+    """Returns the weights of the squares in |Z - 1|^2 and the elements of the identity.
+
+    Off-diagonal elements have weight 2.
+    """
     diagonal = np.array([i == k for i, k in _UPPER])
     return np.tile(np.where(diagonal, 1.0, 2.0), count), np.tile(diagonal.astype(float), count)
 
 
 def _nearest(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The nearest z of the equations alone; links that they do not concern stay exactly as they are."""
+    """Returns the nearest z that satisfies the equations. Links that the equations do not affect remain unchanged."""
     weights, target = _weights(A.shape[1] // 10)
     step = np.linalg.lstsq(A / np.sqrt(weights), b - A @ target, rcond=None)[0]
     return target + step / np.sqrt(weights)
 
 
 def _nearest_body(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The nearest z of which all Z exceed MIN_SHARE."""
+    """Returns the nearest z for which the eigenvalues of all Z are at least MIN_SHARE."""
     weights, target = _weights(A.shape[1] // 10)
     program = MathematicalProgram()
     z = program.NewContinuousVariables(len(weights), "z")
@@ -119,9 +129,9 @@ def _nearest_body(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.
 
 
 def _polished(A: NDArray[np.float64], b: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """z with links that only rounding moved put back, and the equations met to machine precision by the others.
+    """Resets links that changed only by rounding, and satisfies the equations to machine precision with the others.
 
-    Clarabel meets them to 1e-8; this last step is far smaller than the distance from the cone's edge.
+    Clarabel satisfies the equations to 1e-8. This correction is much smaller than the distance to the cone boundary.
     """
     _, target = _weights(A.shape[1] // 10)
     moved = np.repeat(np.abs(z - target).reshape(-1, 10).max(axis=1) > _ROUNDING, 10)
@@ -135,7 +145,7 @@ def _least_eigenvalue(z: NDArray[np.float64]) -> float:
 
 
 def _symmetric(z: NDArray) -> NDArray:
-    """(4, 4) of its ten numbers or variables, row by row from the diagonal on."""
+    """Returns the symmetric matrix (4, 4) with upper triangle `z` (10,), row by row."""
     Z = np.empty((4, 4), dtype=z.dtype)
     for (i, k), value in zip(_UPPER, z, strict=True):
         Z[i, k] = Z[k, i] = value
@@ -144,12 +154,12 @@ def _symmetric(z: NDArray) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class ModelBodies:
-    """What a simulator can have of a model.
+    """Parts of an identified model that a simulator can represent.
 
     Attributes:
-        links: every moving link; a rotor that turns as a link does is part of it, as in the SDF.
-        rotors: joint -> inertia that its motors add to it [kg m^2; kg if prismatic]; empty: those of the SDF.
-        left_out: what the model's torque has beside these, a line each, for people.
+        links: All moving links. A rotor that turns together with a link is part of it, as in the SDF.
+        rotors: Joint -> reflected rotor inertia [kg m^2; kg for a prismatic joint]. If empty, those of the SDF apply.
+        left_out: Descriptions of the terms of the model's torque that are not represented, one line each.
     """
 
     links: tuple[LinkInertia, ...]
@@ -158,12 +168,13 @@ class ModelBodies:
 
 
 def model_bodies(model: IdentifiedModel) -> ModelBodies:
-    """The links of the model's dynamics, and its rotors; of a static model the links nearest to the SDF's.
+    """Returns the links and rotors of a model.
 
-    A static model knows no more than gravity base parameters; its links have exactly these.
+    A static model contains only base parameters of gravity. For such a model, the result is the links nearest to those
+    of the SDF that have exactly these base parameters.
 
     Raises:
-        ModelError: no bodies have these base parameters.
+        ModelError: No physically consistent links have these base parameters.
     """
     arm = model.arm
     left_out = _static_effects(model)
@@ -198,11 +209,15 @@ def _static_effects(model: IdentifiedModel) -> list[str]:
 def _place_rotors(
     arm: Arm, links: dict[str, NDArray[np.float64]], inertias: list[float]
 ) -> tuple[dict[str, float], list[str]]:
-    """Puts rotors on joints, or into `links` that turn with them; returns the joints' and the rotors that lose terms.
+    """Assigns rotor inertias to joints, or adds them to `links` that turn with the rotor.
 
-    A rotor adds I J_k' J_k to the mass matrix, J_k its row of the transmission. On a joint SDF has only the diagonal of
-    that, which is all where one joint alone moves the motor. Where several do, a link that turns by J_k q takes it, as
-    the SDF's own crank and motor_4 links do: about its axis, and half of it about the others, as bodies must.
+    A rotor adds I J_k' J_k to the mass matrix, where J_k is its row of the transmission. In SDF, a joint can represent
+    only the diagonal of this matrix. This is sufficient if a single joint moves the motor. If several joints do, the
+    inertia is added to a link that turns by J_k q, such as the crank and motor_4 links of the SDF. The inertia about
+    the two perpendicular axes is half of it, to be physically consistent.
+
+    Returns:
+        Joint -> rotor inertia, and descriptions of the rotors whose coupling terms are lost.
     """
     plant = shared_plant(arm)
     turning = _turning_links(plant, arm)
@@ -211,7 +226,7 @@ def _place_rotors(
     for name, row, inertia in zip(arm.joint_names, arm.transmission.matrix, inertias, strict=True):
         same = [link for link, (rate, _) in turning.items() if np.allclose(rate, row, atol=1e-9)]
         if np.count_nonzero(row) > 1 and same:
-            # Links that always turn alike feel it alike; the last of them is one of the linkage's, like the SDF's own.
+            # All links in `same` turn at the same rate, so any of them can be used. The last is part of the linkage.
             link = same[-1]
             axis = turning[link][1]
             links[link] = links[link] + inertia * np.concatenate([np.zeros(4), _about(axis)])
@@ -224,14 +239,17 @@ def _place_rotors(
 
 
 def _about(axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6,) Ixx .. Iyz of a rotor of inertia 1 about `axis`, and a half about all that are normal to it."""
+    """Returns Ixx .. Iyz (6,) of a rotor with inertia 1 about `axis` and 1/2 about perpendicular axes."""
     inertia = (np.eye(3) + np.outer(axis, axis)) / 2
     return np.concatenate([np.diag(inertia), inertia[[0, 0, 1], [1, 2, 2]]])
 
 
 def _turning_links(plant: MultibodyPlant, arm: Arm) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Links on hinges: by which of q they turn about their hinge's axis (n,), parents with parallel hinges included,
-    and that axis in the link's frame (3,)."""
+    """Returns link -> (rate, axis) for links with a revolute joint.
+
+    rate (n,) is the angular velocity about the joint axis per joint velocity. It includes parents with parallel axes.
+    axis (3,) is the joint axis in the link's frame.
+    """
     context = plant.CreateDefaultContext()
     turning: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
     axes: dict[str, NDArray[np.float64]] = {}

@@ -1,4 +1,4 @@
-"""Inertial parameters that a body can have, nearest to what a recording and the SDF say: a convex program."""
+"""Estimates physically consistent inertial parameters from a recording and the SDF by convex optimization."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from dvrk_drake.models.sdf_model import compose_sdf
 
 @dataclass(frozen=True, eq=False)
 class BoundingBox:
-    """A box along the axes of the frame of link L: `lower` and `upper` (3,) are its corners, p_LoC_L [m]."""
+    """Box aligned with the axes of the frame of link L. `lower` and `upper` (3,) are its corners p_LoC_L [m]."""
 
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
 
     @property
     def center(self) -> NDArray[np.float64]:
-        """(3,) [m]."""
+        """Center (3,) [m]."""
         return (self.lower + self.upper) / 2
 
     @property
     def half_width(self) -> NDArray[np.float64]:
-        """(3,) [m]."""
+        """Half of the width (3,) [m]."""
         return (self.upper - self.lower) / 2
 
 
 def bounding_boxes(arm: Arm) -> dict[str, BoundingBox]:
-    """Link -> its box, for every link of the arm, as the `bounding_shapes` of the arm's files say.
+    """Returns link -> bounding box for every moving link, according to `bounding_shapes` in the arm's files.
 
     Raises:
-        ArmError: a link that can move has neither collision shapes nor a box of its own, or a box is none.
+        ArmError: A moving link has neither collision shapes nor a box, or a box is not valid.
     """
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
@@ -64,7 +64,7 @@ def bounding_boxes(arm: Arm) -> dict[str, BoundingBox]:
 
 
 def _shapes_of_links(arm: Arm) -> dict[str, BoundingShapes]:
-    """Link -> the settings that stand beside the SDF file that it is first named in."""
+    """Returns link -> settings that belong to the first SDF file with this link."""
     settings: dict[str, BoundingShapes] = {}
     for url, shapes in zip(arm.sdf, arm.identification.bounding_shapes, strict=True):
         names = [link.get("name", "") for link in compose_sdf([url]).iterfind("model/link")]
@@ -99,32 +99,34 @@ def _stated(link: str, corners: BoxCorners) -> BoundingBox:
     return BoundingBox(lower, upper)
 
 
-#: Least eigenvalue of a pseudo-inertia [kg, kg m, kg m^2], unless the SDF's own link has less than four times that.
+#: Lower bound on the eigenvalues of a pseudo-inertia [kg, kg m, kg m^2]. It is lower for a link whose smallest
+#: eigenvalue in the SDF is less than four times this value (see `least_eigenvalue_bound`).
 MIN_EIGENVALUE = 1e-9
-#: A link's mass stays within these multiples of the SDF's.
+#: Lower and upper bound of a link's mass, as multiples of its mass in the SDF.
 MASS_RANGE = 0.1, 5.0
-#: The sum of all links' masses stays within this share of the SDF's.
+#: Tolerance of the sum of all link masses, relative to the sum in the SDF.
 TOTAL_MASS_TOLERANCE = 0.2
-#: Weight of the log-det prior, in units of one squared standard deviation; the largest that no actuator's
-#: cross-validated error rises by more than a thousandth with, on the public motions.
+#: Weight of the log-det prior, in units of one squared standard deviation. It is the largest weight that increases the
+#: cross-validated error of no actuator by more than 0.1 % on the public motions.
 LOG_DET_WEIGHT = 0.03
-#: Relative accuracy that the solver must reach: on the public motions and simulated arms the cost is then within 0.0003
-#: of the least, in units of one squared standard deviation.
+#: Required relative accuracy of the solver. On the public motions and simulated arms, the cost is then within 0.0003 of
+#: the minimum, in units of one squared standard deviation.
 _TOLERANCE = 1e-8
-#: Nearer to a bound than this share of it, a parameter is at the bound.
+#: Relative distance to a bound below which a parameter is considered to be at the bound.
 _AT_BOUND = 1e-3
 _UNITS = np.eye(10)
-#: Of the way to the cones' boundary that a step may go, tried one after the other; the first is Clarabel's default.
+#: Maximum step, as a fraction of the distance to the cone boundary. The values are tried in this order; the first is
+#: the default of Clarabel.
 _STEP_FRACTIONS = (0.99, 0.95, 0.9)
 
 
 @dataclass(frozen=True)
 class LinkScale:
-    """Sizes of one link as the SDF has it: what its parameters are measured against.
+    """Characteristic mass and length of one link in the SDF, which scale its inertial parameters.
 
     Attributes:
-        mass: [kg].
-        length: distance of the centre of mass from the origin plus the radius of gyration [m].
+        mass: Mass [kg].
+        length: Distance of the centre of mass from the origin plus the radius of gyration [m].
     """
 
     mass: float
@@ -132,7 +134,7 @@ class LinkScale:
 
     @classmethod
     def of(cls, link: LinkInertia) -> LinkScale:
-        """Reads the sizes."""
+        """Returns the scale of `link`."""
         m, h, moments = link.parameters[0], link.parameters[1:4], link.parameters[4:7]
         com = h / m
         gyration = float(np.sqrt(max(np.sum(moments) / (2 * m) - com @ com, 1e-12)))
@@ -140,7 +142,7 @@ class LinkScale:
 
     @property
     def deviations(self) -> NDArray[np.float64]:
-        """(10,) by how much a parameter may well differ from the SDF's, which is an estimate: by its own size."""
+        """Prior standard deviations (10,) of the parameters about the values of the SDF, equal to their scale."""
         return self.mass * np.concatenate([[1.0], np.full(3, self.length), np.full(6, self.length**2)])
 
 
@@ -151,34 +153,40 @@ def consistent_parameters(
     boxes: Mapping[str, BoundingBox],
     lower: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """x (p,) that minimises |R x - b|^2 / 2 + the log-det prior such that every link can exist and x >= lower.
+    """Returns x (p,) that minimizes |R x - b|^2 / 2 + log-det prior, subject to physical consistency and x >= lower.
 
     x starts with the ten parameters of each link. The prior of a link is LOG_DET_WEIGHT times
 
         trace(S0^-1 S) - log det S,    S = J - eps I,
 
-    J its pseudo-inertia, S0 that of the SDF's: least at the SDF's, and infinite at the edge of what can exist, so
-    that J - eps I is positive definite. Where R says nothing, x is the SDF's. Its mass and the mass of all are near
-    the SDF's (`MASS_RANGE`, `TOTAL_MASS_TOLERANCE`), and it has a place in its bounding box (`BoundingBox`): the mean
-    square distance from the box's middle is at most the half width squared along each axis, which is linear in J and
-    puts the centre of mass into the box. Pseudo-inertia, and trace(J Q) >= 0 of a bounding ellipsoid, here a flat one
-    an axis: Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter
-    identification" (2018); log-det: Lee, Wensing and Park, "Geometric robot dynamic identification" (2020).
+    where J is the pseudo-inertia of the link and S0 is S for the link of the SDF. The prior has its minimum at the
+    parameters of the SDF. It is infinite on the boundary of the consistent parameters, so J - eps I is positive
+    definite. Parameters that R does not determine keep the values of the SDF.
+
+    The mass of each link and the total mass are bounded relative to the SDF (`MASS_RANGE`, `TOTAL_MASS_TOLERANCE`).
+    The mass of a link must fit into its bounding box (`BoundingBox`): along each axis, the mean square distance from
+    the center of the box is at most the squared half width. This constraint is linear in J and implies that the centre
+    of mass is inside the box.
+
+    References: Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter
+    identification" (2018) for the pseudo-inertia and the constraint trace(J Q) >= 0 of a bounding ellipsoid, applied
+    here to one degenerate ellipsoid per axis. Lee, Wensing and Park, "Geometric robot dynamic identification" (2020)
+    for the log-det prior.
 
     Args:
-        R, b: (p, p) and (p,), compressed rows (e.g. the QR decomposition's) in units of their standard deviation, the
-            Gaussian prior's rows included.
-        links: as the SDF has them.
-        boxes: link -> where its mass can be.
-        lower: (p,) bounds, -inf where there is none.
+        R, b: Compressed regressor (p, p) and efforts (p,), e.g. from a QR decomposition, in units of their standard
+            deviation. They include the rows of the Gaussian prior.
+        links: Links of the SDF.
+        boxes: Link -> bounding box of its mass.
+        lower: Lower bounds (p,), -inf for unbounded parameters.
 
     Raises:
-        IdentificationError: the solver did not converge.
+        IdentificationError: The solver did not converge.
     """
     program = MathematicalProgram()
-    # In z = R x the cost is a sphere: what motions tell differs by many decades, which no scaling of x takes away.
+    # With z = R x the cost is isotropic. In x its curvature varies by many orders of magnitude, also after scaling.
     z = program.NewContinuousVariables(len(b), "z")
-    # With the links last, R is a triangle in which they depend on few z, which Clarabel's matrices are sparse with.
+    # With the links last, the triangular factor makes them depend on few z, so the matrices of Clarabel are sparse.
     order = np.roll(np.arange(len(b)), -10 * len(links))
     Q, triangle = np.linalg.qr(R[:, order])
     to_x = np.empty_like(R)
@@ -198,14 +206,14 @@ def consistent_parameters(
     program.AddLinearConstraint(total[None], [1 - share], [1 + share], z)
     result = _solve(program)
     x = to_x @ np.asarray(result.GetSolution(z), dtype=float)
-    # Interior-point solutions keep their inequalities to the tolerance; these are kept exactly.
+    # Interior-point solutions satisfy inequalities to within the tolerance. The lower bounds are enforced exactly.
     x[bounded] = np.maximum(x[bounded], lower[bounded])
     _check(x, links)
     return x
 
 
 def _solve(program: MathematicalProgram) -> MathematicalProgramResult:
-    """Solves to full accuracy, with shorter steps where rounding stops Clarabel's own short of it."""
+    """Solves to full accuracy, with shorter steps if rounding errors prevent convergence with the default steps."""
     for fraction in _STEP_FRACTIONS:
         options = SolverOptions()
         options.SetOption(ClarabelSolver.id(), "max_step_fraction", fraction)
@@ -213,7 +221,7 @@ def _solve(program: MathematicalProgram) -> MathematicalProgramResult:
             options.SetOption(ClarabelSolver.id(), name, _TOLERANCE)
         result = ClarabelSolver().Solve(program, None, options)
         details = result.get_solver_details()
-        # Drake counts what Clarabel calls AlmostSolved, at a reduced accuracy, as a success.
+        # Drake also reports success for AlmostSolved, which has reduced accuracy.
         if result.is_success() and details.status == "Solved":
             return result
     raise IdentificationError(
@@ -223,7 +231,7 @@ def _solve(program: MathematicalProgram) -> MathematicalProgramResult:
 
 
 def log_det_curvature(x: NDArray[np.float64], links: Sequence[LinkInertia]) -> NDArray[np.float64]:
-    """(p, p) second derivative of the log-det prior at x (p,)."""
+    """Returns the Hessian (p, p) of the log-det prior at x (p,)."""
     H = np.zeros((len(x),) * 2)
     for k, link in enumerate(links):
         chosen = slice(10 * k, 10 * k + 10)
@@ -234,17 +242,23 @@ def log_det_curvature(x: NDArray[np.float64], links: Sequence[LinkInertia]) -> N
 
 
 def least_eigenvalue_bound(link: LinkInertia) -> float:
-    """The least eigenvalue that a link's pseudo-inertia may get: `MIN_EIGENVALUE`, or a quarter of the SDF's."""
+    """Returns the lower bound on the eigenvalues of a link's pseudo-inertia.
+
+    It is the smaller of `MIN_EIGENVALUE` and a quarter of the smallest eigenvalue in the SDF.
+    """
     return min(MIN_EIGENVALUE, 0.25 * float(np.linalg.eigvalsh(link.pseudo_inertia())[0]))
 
 
 def room_in_box(parameters: NDArray[np.float64], box: BoundingBox) -> NDArray[np.float64]:
-    """(3,) 1 - mean square distance from the middle of the box / half width^2, along each axis; negative: outside."""
+    """Returns 1 - (mean square distance from the center of the box) / (half width)^2 for each axis (3,).
+
+    A negative value means that the mass does not fit into the box.
+    """
     return _room(box) @ parameters / parameters[0]
 
 
 def reached_bounds(parameters: NDArray[np.float64], link: LinkInertia, box: BoundingBox) -> list[str]:
-    """Which bounds (10,) parameters of a link lie at, for people; empty: none."""
+    """Returns a description of each bound that the parameters (10,) of a link have reached."""
     bounds = [
         f"mass at {limit:g} x the SDF's"
         for limit in MASS_RANGE
@@ -257,13 +271,13 @@ def reached_bounds(parameters: NDArray[np.float64], link: LinkInertia, box: Boun
 
 
 def total_mass_reached(total: float, nominal: float) -> bool:
-    """Whether the mass of all links [kg] lies at the edge of what the SDF's, `nominal`, allows."""
+    """Returns whether the total mass of all links [kg] is at its bound; `nominal` is the total mass in the SDF."""
     return abs(total / nominal - 1) > TOTAL_MASS_TOLERANCE - _AT_BOUND
 
 
 def _add_prior(program: MathematicalProgram, z: NDArray, to_link: NDArray[np.float64], link: LinkInertia) -> None:
     floor = least_eigenvalue_bound(link) * np.eye(4)
-    # With S0 = L L', Z = L^-1 S L^-T is 1 at the SDF's, whatever the link's size; log det S differs by a constant.
+    # With S0 = L L', Z = L^-1 S L^-T is the identity for the SDF's link of any size; log det S differs by a constant.
     L_inverse = np.linalg.inv(np.linalg.cholesky(link.pseudo_inertia() - floor))
     units = np.array([L_inverse @ pseudo_inertia(unit) @ L_inverse.T for unit in _UNITS])
     Z = program.NewSymmetricContinuousVariables(4, "Z")
@@ -288,7 +302,10 @@ def _constrain_link(
 
 
 def _room(box: BoundingBox) -> NDArray[np.float64]:
-    """(3, 10) of the parameters: integral of (1 - (x - c)^2 / w^2) dm for each axis, c and w of the box."""
+    """Returns a matrix (3, 10) that maps parameters to the integral of 1 - (x - c)^2 / w^2 over the mass, per axis.
+
+    c and w are center and half width of the box.
+    """
     units = np.array([pseudo_inertia(unit) for unit in _UNITS])
     m, h, squares = units[:, 3, 3], units[:, :3, 3].T, units[:, [0, 1, 2], [0, 1, 2]].T
     c, w = box.center[:, None], box.half_width[:, None]
