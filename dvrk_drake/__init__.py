@@ -1,7 +1,7 @@
-"""Model, identify, compensate and simulate da Vinci Research Kit arms with Drake.
+"""Models, identification, gravity compensation and simulation of da Vinci Research Kit arms with Drake.
 
-The public API: `import dvrk_drake as dvrk`, then `dvrk.load_arm`, `dvrk.identify` and the other names of `__all__`.
-Modules are loaded when a name of theirs is used, because drake and numba take seconds.
+The public API is `import dvrk_drake as dvrk`, then `dvrk.load_arm`, `dvrk.identify` and the other names in `__all__`.
+A module is imported when one of its names is first used, because importing drake and numba takes seconds.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from dvrk_drake.systems.gravity_pid_controller import GravityPidController
     from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
-#: Public name -> the module that defines it.
+#: Mapping from a public name to the module that defines it.
 _MODULES = {
     "Arm": "models.arm",
     "ArmStation": "systems.arm_station",

@@ -1,13 +1,13 @@
-"""Errors that a user can act on: each message says what is wrong, where, and what is allowed."""
+"""Errors that a user can correct. Each message states the problem, its location and the accepted values."""
 
 from __future__ import annotations
 
 
 class DvrkDrakeError(Exception):
-    """Base of every error that this package raises on purpose; the command line turns it into exit code 2.
+    """Base class of all errors that this package raises deliberately; the command line exits with code 2.
 
     Attributes:
-        findings: what `check` found in the recording that the error is about; `str` of each is one line.
+        findings: Findings of `check` in the recording that caused the error; `str` of each is one line.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -22,40 +22,40 @@ class DvrkDrakeError(Exception):
 
 
 class ArmError(DvrkDrakeError):
-    """An arm that does not exist, or whose files contradict each other."""
+    """Error for an arm that does not exist, or whose files contradict each other."""
 
 
 class RecordingError(DvrkDrakeError):
-    """A recording that cannot be read or used."""
+    """Error for a recording that cannot be read or used."""
 
 
 class ModelError(DvrkDrakeError):
-    """An identified model that cannot be read, or does not fit what it is used with."""
+    """Error for an identified model that cannot be read, or does not match the arm or data that it is used with."""
 
 
 class IdentificationError(DvrkDrakeError):
-    """A recording that does not determine what was asked of it."""
+    """Error for a recording that does not determine the requested quantities."""
 
 
 class ControllerError(DvrkDrakeError):
-    """A controller that was given gains, limits or a period that it cannot run with."""
+    """Error for gains, limits or a period that a controller cannot use."""
 
 
 class KeyFileError(DvrkDrakeError):
-    """A key for the authentication of messages that cannot be read, made or used."""
+    """Error for an authentication key that cannot be read, created or used."""
 
 
 class StationError(DvrkDrakeError):
-    """A station that cannot be built or used as asked."""
+    """Error for a station that cannot be built or used as requested."""
 
 
 class ScenarioError(DvrkDrakeError):
-    """A scenario that cannot be read or simulated."""
+    """Error for a scenario that cannot be read or simulated."""
 
 
 class CollectionError(DvrkDrakeError):
-    """Poses that cannot be visited, or a collection of measurements that cannot go on."""
+    """Error for poses that cannot be reached, or a collection of measurements that cannot be continued."""
 
 
 class StudyError(DvrkDrakeError):
-    """A study that cannot be read, run or gone on with."""
+    """Error for a study that cannot be read, run or resumed."""

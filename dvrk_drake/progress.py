@@ -1,10 +1,10 @@
-"""Progress of functions that take seconds, as a callback."""
+"""Progress callbacks for functions that take seconds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-#: Called with the name of the step that runs, e.g. "identifying", and its finished share, 0..1.
+#: Callback that receives the name of the current step, e.g. "identifying", and its completed share, 0..1.
 Progress = Callable[[str, float], object]
 
 
@@ -14,9 +14,9 @@ def step_progress(
     """Returns a callback for the shares 0..1 of one part of a step.
 
     Args:
-        progress: what the caller gave; None for no report.
-        step: name of the step.
-        start, end: shares of the step between which the part lies.
+        progress: Callback of the caller; None to disable reporting.
+        step: Name of the step.
+        start, end: Shares of the step at which the part begins and ends.
     """
     if progress is None:
         return lambda share: None

@@ -128,8 +128,7 @@ class Arm:
         """Returns a message on the first gain that is not accepted for this arm and the accepted values, or "".
 
         A gain must be large enough to move its joint. It must be so small that the resolution of the position
-        measurement
-        does not demand the whole effort limit. See `_MIN_SHARE` and `_MIN_ERROR`.
+        measurement does not demand the whole effort limit. See `_MIN_SHARE` and `_MIN_ERROR`.
         """
         if fault := _count_fault("gains.", vars(gains), self.joint_names):
             return fault

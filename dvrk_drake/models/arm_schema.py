@@ -70,8 +70,7 @@ class MotionSettings:
     cosine with one period per revolution), "cable 2" (two periods) and "asymmetric friction". A mechanism additionally
     has two settings. `base_may_tilt` selects whether the direction of gravity is estimated from a motion.
     `presliding_travels` are the breakaway displacements of elasto-plastic friction elements, as multiples of the
-    standard
-    deviation of the coordinate's position.
+    standard deviation of the coordinate's position.
     """
 
     acceleration_cut_off: list[float] = field(default_factory=list, metadata=_CUT_OFFS)
@@ -122,8 +121,7 @@ class Mechanism:
     """Schema of `mechanisms/*.yaml`: properties that all arms of one type share.
 
     `effort_cut_off` is the cut-off frequency of the low-pass filter for measured and modelled efforts [Hz]. `effects`
-    are
-    the friction, cable and sensor effects of the real arm, for its simulation.
+    are the friction, cable and sensor effects of the real arm, for its simulation.
     """
 
     sdf: str = ""

@@ -84,9 +84,8 @@ class EffortEffect:
     """Quantization and noise of the motor currents, as efforts of the actuators [N m, N].
 
     Each table maps an actuator to a value; actuators without an entry are exact. `command_resolution` is the
-    quantization
-    step of commanded efforts, `measured_resolution` that of measured efforts. `noise` is the standard deviation of
-    measured efforts.
+    quantization step of commanded efforts, `measured_resolution` that of measured efforts. `noise` is the standard
+    deviation of measured efforts.
     """
 
     command_resolution: dict[str, float] = field(default_factory=dict, metadata=_EFFORT_STEPS)
@@ -112,11 +111,9 @@ class ArmEffects:
         springs: Torques of springs that depend on the position.
         stops: Whether the arm's coupled limits are hard stops.
         stretch: Mapping from an actuator to its elastic cable. Motor, encoder and the actuator's own friction are on
-            the
-            motor side of the cable. Actuators without an entry are stiff.
+            the motor side of the cable. Actuators without an entry are stiff.
         saturation: Mapping from an actuator to the largest effort of its motor [N m, N]. Actuators without an entry do
-            not
-            saturate.
+            not saturate.
         encoder: Quantization of positions, and estimation of velocities from the quantized positions.
         effort: Quantization and noise of the motor currents.
         delay: Delays of measurement and command.

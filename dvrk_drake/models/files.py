@@ -41,8 +41,7 @@ def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | Non
 
     Raises:
         DvrkDrakeError: Error of type `error`: the file does not exist, is not a regular file, is too large, or cannot
-            be
-            read.
+            be read.
     """
     try:
         # Without O_NONBLOCK, opening a FIFO would block until a writer opens it.

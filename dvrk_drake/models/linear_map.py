@@ -1,4 +1,4 @@
-"""Constant affine maps of joint coordinates: what a linkage and a transmission of these arms are."""
+"""Constant affine maps between joint coordinates, for linkages and transmissions."""
 
 from __future__ import annotations
 
@@ -13,31 +13,34 @@ from dvrk_drake.models.schema_fault import within
 
 @dataclass(frozen=True, eq=False)
 class LinearMap:
-    """y = matrix x + offset, with velocities and efforts mapped as virtual work demands.
+    """Affine map y = matrix x + offset, with velocities and efforts mapped by the principle of virtual work.
 
     Attributes:
-        matrix: (m, n), constant.
-        offset: (m,), in the units of y.
+        matrix: Constant matrix (m, n).
+        offset: Constant vector (m,), in the units of y.
     """
 
     matrix: NDArray[np.float64] = field(metadata=within(-1e4, 1e4))
     offset: NDArray[np.float64] = field(metadata=within(-100.0, 100.0, "rad or m"))
 
     def position(self, x: ArrayLike) -> NDArray[np.float64]:
-        """y = matrix x + offset for x of shape (n,) or (samples, n)."""
+        """Returns y = matrix x + offset for x of shape (n,) or (samples, n)."""
         return np.asarray(x, float) @ self.matrix.T + self.offset
 
     def velocity(self, x_dot: ArrayLike) -> NDArray[np.float64]:
-        """The rate of y for rates of x, shape (n,) or (samples, n)."""
+        """Returns the rate of y for rates of x of shape (n,) or (samples, n)."""
         return np.asarray(x_dot, float) @ self.matrix.T
 
     def pull_back_effort(self, effort_y: ArrayLike) -> NDArray[np.float64]:
-        """Effort on x that does the same work as `effort_y` on y: matrix' effort_y, (m,) or (samples, m)."""
+        """Returns the effort on x that does the same work as `effort_y` on y.
+
+        It is matrix' effort_y, for `effort_y` of shape (m,) or (samples, m).
+        """
         return np.asarray(effort_y, float) @ self.matrix
 
     @cached_property
     def inverse(self) -> LinearMap:
-        """The map from y to x; raises numpy.linalg.LinAlgError if the matrix is singular or not square."""
+        """Returns the map from y to x. Raises numpy.linalg.LinAlgError if the matrix is singular or not square."""
         matrix = np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
         inverse = LinearMap(matrix, -matrix @ self.offset)
         vars(inverse)["inverse"] = self

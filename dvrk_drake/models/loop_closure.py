@@ -1,4 +1,4 @@
-"""Closes the loops of an arm's linkage in its plant: the parallelogram of an MTM, the remote centre of a PSM."""
+"""Closes the kinematic loops of an arm's plant: the parallelogram of an MTM, the remote centre linkage of a PSM."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import LoopClosure
 from dvrk_drake.models.sdf_model import DRAKE
 
-#: How the loops of a linkage are held: "mimic" couples the joints of a tree, "ball" pins the cut loops.
+#: Methods of closing the loops of a linkage: "mimic" couples the joints of a tree, "ball" constrains the cut loops.
 Closure = Literal["mimic", "ball"]
 
 
 def pin_loop(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClosure) -> None:
-    """Pins frame_a of the closing bar to frame_b, and holds the bar's length once more as an equation of its own.
+    """Pins frame_a of the closing bar to frame_b, and adds a distance constraint for the bar's length.
 
-    SAP gives each constraint the compliance 5e-10 s^2 / m at 1 ms, m being the mass that the tree without constraints
-    shows at the pin. The pin's three equations share one, and a light bar that is free to swing makes it soft in all
-    directions, also along the bar, where the linkage's load goes. The length alone shows the linkage behind it and
-    is stiff: the PSM's remote centre gives by 1e-8 m under its weight, instead of 2e-6 m.
+    SAP assigns each constraint the compliance 5e-10 s^2 / m at 1 ms, where m is the effective mass of the unconstrained
+    tree at the pin. The three equations of the pin share one effective mass. A light bar that swings freely makes the
+    pin compliant in all directions, including the direction of the bar, which carries the load of the linkage. The
+    distance constraint has the effective mass of the linkage and is stiff. With it, the PSM's remote centre moves by
+    1e-8 m under its weight, instead of 2e-6 m.
     """
     A, B = (plant.GetFrameByName(name, instance) for name in (loop.frame_a, loop.frame_b))
     p_AP, p_BQ = (frame.GetFixedPoseInBodyFrame().translation() for frame in (A, B))
@@ -39,9 +40,10 @@ def pin_loop(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClos
 
 
 def remove_loop_mimics(root: ElementTree.Element, arm: Arm) -> None:
-    """Removes the mimics of joints on a loop, no others.
+    """Removes the mimic tags of the joints in a loop, and no others.
 
-    A rotor or counterweight that follows another joint closes no loop: its mimic is its cable.
+    The mimic of a rotor or counterweight that follows another joint is kept, because it represents a cable and closes
+    no loop.
     """
     loop_joints = _loop_joints(root, arm)
     for joint in root.iter("joint"):
@@ -51,7 +53,7 @@ def remove_loop_mimics(root: ElementTree.Element, arm: Arm) -> None:
 
 
 def _loop_joints(root: ElementTree.Element, arm: Arm) -> set[str]:
-    """Dependent joints on the way from the base to a loop's cut."""
+    """Returns the dependent joints between the base and the cut of a loop."""
     parent_joint = {joint.findtext("child"): joint for joint in root.iter("joint")}
     frame_link = {frame.get("name"): frame.get("attached_to") for frame in root.iter("frame")}
     names = set()

@@ -1,4 +1,4 @@
-"""An arm as a Drake MultibodyPlant."""
+"""Creates the Drake MultibodyPlant of an arm."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 def package_map() -> PackageMap:
     """Returns a map with Drake's own packages and `dvrk_drake`, for URLs such as package://dvrk_drake/sdf/mtml.sdf.
 
-    With it Drake's parser finds the models: `Parser(plant).package_map().AddMap(package_map())`.
+    Drake's parser finds the models with `Parser(plant).package_map().AddMap(package_map())`.
     """
     packages = PackageMap()
     packages.AddPackageXml(str(MODELS_FOLDER / "package.xml"))
@@ -33,24 +33,25 @@ def package_map() -> PackageMap:
 def add_arm(
     plant: MultibodyPlant, arm: Arm, closure: Closure = "mimic", collision_shapes: bool = True
 ) -> ModelInstanceIndex:
-    """Adds `arm` to a plant that is not finalized, welds its base to the world and sets gravity and limits.
+    """Adds `arm` to a plant that is not finalized, welds its base to the world, and sets gravity and limits.
 
-    Drake's joint couplings and pins need the SAP solver, that of the contact approximations sap, similar and lagged. A
-    discrete plant with tamsi gets sap. A continuous one can only be simulated with the integrator CENIC (its pins need
-    drake 1.56 or newer).
+    Joint couplings and pins require Drake's SAP solver, which the contact approximations sap, similar and lagged use. A
+    discrete plant with tamsi is set to sap. A continuous plant can be simulated only with the integrator CENIC. Its
+    pins require drake 1.56 or newer.
 
     Args:
-        plant: with or without a scene graph.
-        arm: what to add.
-        closure: how the linkage's loops are held.
-        collision_shapes: without them nothing can touch the arm, and a step of a plant with a scene graph is cheaper.
+        plant: Plant, with or without a scene graph.
+        arm: Arm to add.
+        closure: Method of closing the loops of the linkage.
+        collision_shapes: Whether to add collision shapes. Without them the arm has no contact, and a plant with a scene
+            graph needs less time per step.
 
     Raises:
-        ArmError: no such closure, or Drake refuses the arm's SDF.
+        ArmError: The closure is unknown, or Drake refuses the arm's SDF.
     """
     if closure not in get_args(Closure):
         raise ArmError(f'unknown closure "{closure}"; known: {", ".join(get_args(Closure))}')
-    # By its name, since newer versions of drake have no tamsi.
+    # Compared by name, because newer versions of drake have no tamsi.
     if plant.time_step() > 0 and plant.get_discrete_contact_approximation().name == "kTamsi":
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
     parser = Parser(plant)
@@ -77,10 +78,10 @@ def add_arm(
 
 
 def check_plant(arm: Arm) -> None:
-    """Refuses an arm of which no plant can be made, whichever way its loops are closed.
+    """Checks that a plant of the arm can be created with each method of loop closure.
 
     Raises:
-        ArmError: Drake refuses its SDF; no joint holds a link; or the SDF lacks a frame of a loop, or one of the frames
+        ArmError: Drake refuses the SDF, no joint holds a link, or the SDF lacks a frame of a loop or one of the frames
             dh_0, dh_1, ...
     """
     for closure in get_args(Closure):
@@ -104,7 +105,7 @@ def _check_links_and_frames(plant: MultibodyPlant, arm: Arm) -> None:
 
 
 def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic") -> MultibodyPlant:
-    """A finalized plant that holds nothing but `arm`; `time_step` [s]."""
+    """Returns a finalized plant that contains only `arm`; `time_step` [s]."""
     plant = MultibodyPlant(time_step)
     add_arm(plant, arm, closure)
     plant.Finalize()
@@ -113,40 +114,46 @@ def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic"
 
 @cache
 def shared_plant(arm: Arm) -> MultibodyPlant:
-    """The finalized plant of an arm for those who only read it: made once for each Arm object."""
+    """Returns the finalized plant of an arm for read-only use; it is created once per Arm object."""
     return make_arm_plant(arm)
 
 
 def set_joint_damping(plant: MultibodyPlant, arm: Arm, damping: ArrayLike) -> None:
-    """Gives the independent joints viscous friction (n,) [N m s/rad; N s/m]; before the plant is finalized."""
+    """Sets the viscous friction (n,) of the independent joints [N m s/rad; N s/m] of a plant that is not finalized."""
     for name, value in zip(arm.joint_names, np.asarray(damping, float), strict=True):
         plant.GetJointByName(name).set_default_damping_vector([value])
 
 
 def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex | None = None) -> NDArray[np.int_]:
-    """Index into the plant's q (and v: all joints have one degree of freedom) of each of `arm.tree_joint_names`."""
+    """Returns the index of each of `arm.tree_joint_names` in the plant's q.
+
+    The indices are also valid for v, because all joints have one degree of freedom.
+    """
     joints = [plant.GetJointByName(name, instance) for name in arm.tree_joint_names]
     return np.array([joint.position_start() for joint in joints])
 
 
 def set_arm_positions(plant: MultibodyPlant, context: Context, arm: Arm, q: ArrayLike) -> None:
-    """Sets the whole tree, linkage included, to the pose of the independent joints q (n,)."""
+    """Sets the whole tree, including the linkage, to the pose of the independent joints q (n,)."""
     q_plant = plant.GetPositions(context)
     q_plant[tree_selector(plant, arm)] = arm.linkage.position(q)
     plant.SetPositions(context, q_plant)
 
 
 def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray[np.float64]:
-    """Torque (n,) on the independent joints that holds the arm against gravity at the context's pose.
+    """Returns the torque (n,) on the independent joints that compensates gravity at the context's pose.
 
-    Drake's gravity forces ignore constraints, so they are projected through the linkage: tau = -G' tau_g.
+    Drake's gravity forces do not include constraints, so they are projected through the linkage: tau = -G' tau_g.
     """
     tau_g = plant.CalcGravityGeneralizedForces(context)[tree_selector(plant, arm)]
     return -arm.linkage.pull_back_effort(tau_g)
 
 
 def holding_torques(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m, n) torques that hold the arm, as its SDF states it, at poses (m, n) of the independent joints [N m, N]."""
+    """Returns the torques (m, n) that compensate gravity at poses (m, n) of the independent joints [N m, N].
+
+    They are computed from the arm's SDF.
+    """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     tau = np.empty(poses.shape)

@@ -1,7 +1,7 @@
-"""Checks of a file's content and of settings made in Python: the message names the key, its value, what is allowed.
+"""Checks the content of files and settings made in Python; messages name the key, its value and the accepted values.
 
-The range of a number stands beside its field, as metadata: `field(default=0.05, metadata=within(0.002, 1.0, "s"))`. It
-is valid for all numbers in the field, in lists and tables as well. `schema_fault` checks the content of a file,
+The range of a number is metadata of its field: `field(default=0.05, metadata=within(0.002, 1.0, "s"))`. It applies to
+all numbers in the field, including those in lists and tables. `schema_fault` checks the content of a file,
 `number_fault` an object.
 """
 
@@ -20,11 +20,11 @@ import numpy as np
 
 _ONE = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 _MANY = {bool: "true or false", int: "whole numbers", float: "numbers", str: "texts"}
-#: Key in the metadata of a field: the `Range` of all numbers in it.
+#: Metadata key of a field: the `Range` of all numbers in it.
 RANGE = "range"
-#: Key in the metadata of a field: its name in files of earlier versions.
+#: Metadata key of a field: its name in files of earlier versions.
 FORMERLY = "formerly"
-#: Unit -> another unit that a number may be in by mistake, and its size.
+#: Mapping from a unit to a unit that may be used by mistake, and the size of that unit.
 _MISTAKEN = {
     "rad": ("degrees", math.pi / 180),
     "rad/s": ("degrees/s", math.pi / 180),
@@ -33,9 +33,9 @@ _MISTAKEN = {
     "s": ("ms", 1e-3),
     "kg": ("g", 1e-3),
 }
-#: Whole numbers are below this in size.
+#: Upper bound of the absolute value of whole numbers.
 _MAX_INT = 2**63
-#: A value is quoted up to so many letters.
+#: Maximum number of characters of a value in a message.
 _MAX_LENGTH = 60
 
 
@@ -44,10 +44,10 @@ class Range:
     """Numbers that a field accepts.
 
     Attributes:
-        low, high: smallest and largest number.
-        unit: of both; of a joint that turns and of one that slides: "rad or m".
-        also: further numbers, e.g. 0 or infinity.
-        either_sign: low and high are of the size, whatever the sign.
+        low, high: Smallest and largest accepted number.
+        unit: Unit of both; "rad or m" if it depends on the joint type.
+        also: Additional accepted numbers, e.g. 0 or infinity.
+        either_sign: Whether low and high apply to the absolute value.
     """
 
     low: float
@@ -57,7 +57,7 @@ class Range:
     either_sign: bool = False
 
     def __contains__(self, value: float) -> bool:
-        """Whether the number is accepted; NaN never is."""
+        """Returns whether the number is accepted; NaN never is."""
         return bool(self.low <= (abs(value) if self.either_sign else value) <= self.high) or value in self.also
 
     def __str__(self) -> str:
@@ -67,7 +67,7 @@ class Range:
         return "".join(f"{number:g} or " for number in self.also) + text
 
     def fault(self, key: str, value: float) -> str:
-        """Why the number is not accepted, with the unit that it probably is in; or ""."""
+        """Returns why the number is not accepted, including the unit that it probably has, or ""."""
         if value in self:
             return ""
         mistaken = [_MISTAKEN[unit] for unit in self.unit.split(" or ") if unit in _MISTAKEN]
@@ -78,6 +78,7 @@ class Range:
 
 def within(
     low: float, high: float, unit: str = "", *, also: tuple[float, ...] = (), either_sign: bool = False
+<<<<<<< HEAD
 ) -> dict[str, object]:
     """Metadata of a field whose numbers must be in a range, see `Range`."""
     return {RANGE: Range(low, high, unit, also, either_sign)}
@@ -85,6 +86,15 @@ def within(
 
 def formerly(name: str) -> dict[str, object]:
     """Metadata of a field that files of earlier versions call `name`; `with_current_keys` renames it."""
+=======
+) -> dict[str, Range]:
+    """Returns metadata of a field whose numbers must be in a range, see `Range`."""
+    return {RANGE: Range(low, high, unit, also, either_sign)}
+
+
+def formerly(name: str) -> dict[str, str]:
+    """Returns metadata of a field that files of earlier versions call `name`; `with_current_keys` renames it."""
+>>>>>>> c718567e99a44f47fb9babdc48cdbfec9b1a9ccc
     return {FORMERLY: name}
 
 
@@ -93,11 +103,11 @@ def with_current_keys(schema: Any, content: Any, where: str) -> Any:
 
     Args:
         schema: Dataclass that the content is read into.
-        content: Content of the file, not checked yet. It is not changed.
+        content: Unchecked content of the file. It is not modified.
         where: Name of the file, for the warning.
 
     Warns:
-        FutureWarning: once per renamed key, with its new name.
+        FutureWarning: Once per renamed key, with its new name.
     """
     origin, arguments = get_origin(schema), get_args(schema)
     if origin in (Union, types.UnionType):
@@ -121,9 +131,10 @@ def with_current_keys(schema: Any, content: Any, where: str) -> Any:
 
 
 def number_fault(instance: object) -> str:
-    """The first number in a dataclass that is not finite or outside the range of its field, with its key; or "".
+    """Returns a message on the first number in a dataclass that is not finite or out of range, or "".
 
-    Lists, tuples, tables, arrays and dataclasses in it are searched as well; what is no number is not checked.
+    The message contains the key of the number. Nested lists, tuples, tables, arrays and dataclasses are searched.
+    Values that are not numbers are ignored.
     """
     return next(_number_faults(instance, "", None), "")
 
@@ -150,13 +161,13 @@ def _number_faults(value: Any, key: str, allowed: Range | None) -> Iterator[str]
 
 
 def schema_fault(schema: type, content: Any, what: str) -> str:
-    """The first thing in `content` that does not fit, or "".
+    """Returns a message on the first part of `content` that does not match the schema, or "".
 
     Args:
-        schema: a dataclass of dataclasses, lists, tables with texts as keys, bool, int, float, str, and None with them.
-            Numbers must be finite and in the range of their field, see `within`.
-        content: as yaml_load gives it.
-        what: it should be, e.g. "a file of gains".
+        schema: Dataclass of dataclasses, lists, tables with text keys, bool, int, float, str, and optional values of
+            these types. Numbers must be finite and within the range of their field, see `within`.
+        content: Content as returned by yaml_load.
+        what: Kind of file that is expected, e.g. "a file of gains".
     """
     if not isinstance(content, dict):
         given = "is empty" if content is None else f"must be keys and values, not {_quoted(content)}"
@@ -165,7 +176,7 @@ def schema_fault(schema: type, content: Any, what: str) -> str:
 
 
 def _faults(schema: Any, value: Any, key: str, what: str, allowed: Range | None) -> Iterator[str]:
-    """Lazily; `key` is where the value stands, `what` what the keys of a table are of."""
+    """Yields messages on faults; `key` is the key of the value, `what` describes the keys of a table."""
     origin, arguments = get_origin(schema), get_args(schema)
     if origin in (Union, types.UnionType):
         if value is not None:
@@ -198,7 +209,7 @@ def _faults(schema: Any, value: Any, key: str, what: str, allowed: Range | None)
         for name, entry in value.items():
             yield from _faults(arguments[1], entry, f"{key}.{name}", key, allowed)
     elif allowed is not None and isinstance(value, float) and math.isinf(value) and value in allowed:
-        return  # infinity, where it is accepted
+        return  # infinity, if accepted
     elif not _fits(schema, value):
         yield _wrong(schema, value, key)
     elif allowed is not None and (fault := allowed.fault(key, schema(value))):
@@ -206,7 +217,10 @@ def _faults(schema: Any, value: Any, key: str, what: str, allowed: Range | None)
 
 
 def missing_key(schema: Any, content: Any, key: str = "") -> str:
-    """The first key that `content`, which fits the schema, lacks, or "". Keys whose default is None are optional."""
+    """Returns the first missing key of `content`, which matches the schema otherwise, or "".
+
+    Keys whose default is None are optional.
+    """
     if content is not None and get_origin(schema) in (Union, types.UnionType):
         (schema,) = (argument for argument in get_args(schema) if argument is not types.NoneType)
     inner: Iterator[str] = iter(())
@@ -223,7 +237,7 @@ def missing_key(schema: Any, content: Any, key: str = "") -> str:
 
 
 def _fits(schema: type, value: Any) -> bool:
-    """As yaml_load_typed converts, but numbers must be finite."""
+    """Returns whether a value can be converted to the type as in yaml_load_typed; numbers must be finite."""
     if schema is bool:
         return isinstance(value, bool) or value in ("true", "false")
     if schema is str:
@@ -255,7 +269,7 @@ def _wrong(schema: Any, value: Any, key: str) -> str:
 
 
 def _described(schema: Any, number: dict[type, str]) -> str:
-    """What is allowed: "a number", or of many "numbers"."""
+    """Returns a description of the accepted values: "a number", or "numbers" for a list."""
     one, arguments = number is _ONE, get_args(schema)
     if get_origin(schema) in (Union, types.UnionType):
         return _described(arguments[0], number)
@@ -273,7 +287,7 @@ def _keys(schema: Any) -> str:
 
 
 def meant(name: object, known: Iterable[str]) -> str:
-    """Returns "did you mean ...? " with the known name that is most like a wrong one, or "" without one or with two."""
+    """Returns "did you mean ...? " with the known name closest to a wrong name, or "" if there is none or a tie."""
     of_lower_case = {key.lower(): key for key in known}
     given = str(name)[:_MAX_LENGTH].lower()
     near = difflib.get_close_matches(given, of_lower_case, 2)

@@ -1,4 +1,4 @@
-"""An arm's SDF files as one model, and the few facts of them that Drake parses but does not give back."""
+"""Combines an arm's SDF files into one model, and reads properties that Drake parses but does not expose."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from dvrk_drake.models.schema_fault import Range
 MODELS_FOLDER = Path(__file__).parent
 PACKAGE_URL = "package://dvrk_drake/"
 DRAKE = "{http://drake.mit.edu}"
-#: Deepest nesting of elements; an arm's SDF has 7 levels.
+#: Maximum nesting of elements; the SDF of an arm has 7 levels.
 _MAX_DEPTH = 50
-#: Numbers that SDF files have where a joint has no limit.
+#: Numbers that SDF files contain for joints without a limit.
 _NO_LIMIT = (-1e16, 1e16, -math.inf, math.inf)
 _MOMENTS, _PRODUCTS = Range(0.0, 50.0, "kg m^2"), Range(-50.0, 50.0, "kg m^2")
 _LENGTHS = Range(1e-6, 10.0, "m")
-#: Element or attribute -> the range of its numbers. The links of a dVRK weigh 1 g to 10 kg, those of a UR10e up to
-#: 13 kg; all are shorter than 1 m. -1 and 0 are written where a limit of speed or effort is not stated.
+#: Mapping from an element or attribute to the range of its numbers. The links of a dVRK weigh 1 g to 10 kg, those of a
+#: UR10e up to 13 kg. All are shorter than 1 m. -1 and 0 denote unspecified limits of velocity or effort.
 _RANGES = {
     "mass": Range(1e-6, 200.0, "kg"),
     **{f"i{axis}": _MOMENTS for axis in ("xx", "yy", "zz")},
@@ -42,10 +42,10 @@ _RANGES = {
     "multiplier": Range(1e-3, 1e3, also=(0.0,), either_sign=True),
     "offset": Range(-12.6, 12.6, "rad or m"),
 }
-#: The angles of a pose: roll, pitch, yaw, or a quaternion.
+#: Ranges of the angles of a pose (roll, pitch, yaw) in radians and degrees.
 _POSE_ANGLES, _POSE_DEGREES = Range(-12.6, 12.6, "rad"), Range(-720.0, 720.0, "degrees")
 ElementTree.register_namespace("drake", DRAKE.strip("{}"))
-#: How many numbers an element holds that holds several; a pose has 7 with a quaternion.
+#: Accepted counts of numbers in elements with several numbers; a pose with a quaternion has 7.
 _COUNTS = {"pose": (6, 7), "xyz": (3,), "scale": (3,), "size": (3,)}
 
 
@@ -54,10 +54,10 @@ class SdfFacts:
     """Moving joints of one SDF model, in the order of the file.
 
     Attributes:
-        joint_names: every joint that can move.
-        mimics: dependent joint -> (joint it follows, multiplier, offset).
-        effort_limits: joint -> `<effort>` [N m or N]; joints without the tag are missing.
-        prismatic: joints that slide; all others turn.
+        joint_names: Names of all moving joints.
+        mimics: Mapping from a dependent joint to (leading joint, multiplier, offset).
+        effort_limits: Mapping from a joint to its `<effort>` [N m or N]; joints without the tag have no entry.
+        prismatic: Names of the prismatic joints; all others are revolute.
     """
 
     joint_names: tuple[str, ...]
@@ -67,25 +67,23 @@ class SdfFacts:
 
 
 def local_path(url: str) -> Path:
-    """Returns the path of a package URL, or of what is a path already."""
+    """Returns the path for a package URL; a path is returned unchanged."""
     return MODELS_FOLDER / url.removeprefix(PACKAGE_URL) if url.startswith(PACKAGE_URL) else Path(url)
 
 
 def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | None = None) -> ElementTree.Element:
-    """The model of the first file with the links, joints and frames of the others added: an arm and its instrument.
+    """Returns the model of the first file, extended by the links, joints and frames of the others (an instrument).
 
-    Meshes that a file names relative to itself get their absolute path.
-
-    A link that another file names again gets that file's shapes, so that an instrument's housing is drawn on the arm's
-    carriage without being a body of its own.
+    Relative paths of meshes become absolute. If a file repeats a link of an earlier file, only the shapes of that link
+    are added. In this way an instrument's housing is drawn on the arm's carriage without being a body of its own.
 
     Args:
-        urls: package URLs or paths.
-        mirrored: URL -> links of that file that are taken as their mirror image (`mirror_links`).
+        urls: Package URLs or paths.
+        mirrored: Mapping from a URL to the links of that file that are mirrored (`mirror_links`).
 
     Raises:
-        ArmError: a file is not an SDF with one model, gives a link that is already there more than shapes and a mass
-            of 0, or lacks one that is to be mirrored.
+        ArmError: A file is not an SDF with one model, gives an existing link more than shapes and a mass of 0, or lacks
+            a link that is to be mirrored.
     """
     root, *others = (_read(local_path(url)) for url in urls)
     for url, part in zip(urls, (root, *others), strict=True):
@@ -104,23 +102,24 @@ def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | Non
 
 
 def _add_to_filter_groups(model: ElementTree.Element, link: str) -> None:
-    """An instrument's link touches its arm as little as the arm's own links touch each other."""
+    """Adds an instrument's link to the collision filter groups of its arm."""
     for group in model.findall(f"{DRAKE}collision_filter_group"):
         member = ElementTree.SubElement(group, f"{DRAKE}member")
         member.text = link
 
 
 def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
-    """Reads them from a composed model.
+    """Reads the moving joints from a composed model.
 
     Raises:
-        ArmError: a joint has `<friction>`, which Drake drops silently, is of a type that no arm has, or follows another
-            by a multiple of 0; two joints have one name; there is no base_link, or another link has no mass.
+        ArmError: A joint has `<friction>`, which Drake ignores silently, has an unsupported type, or follows another
+            joint with a multiplier of 0; two joints have the same name; base_link is missing; or another link has no
+            mass.
     """
     if root.find("model/link[@name='base_link']") is None:
         raise ArmError("the SDF has no link base_link")
     for link in root.findall("model/link"):
-        # Drake takes 1 kg without a word.
+        # Drake uses 1 kg without a warning.
         if link.get("name") != "base_link" and not float(link.findtext("inertial/mass") or 0.0) > 0:
             raise ArmError(f"link {link.get('name')} of the SDF needs a positive <inertial><mass>")
     names, mimics, efforts, prismatic = [], {}, {}, set()
@@ -162,13 +161,13 @@ def _read(path: Path) -> ElementTree.Element:
     if root.find("model") is None or [e.tag for e in root.iter() if e.tag in ("model", "include")] != ["model"]:
         raise ArmError(f"{path}: must hold one <model> in <sdf>, with no <model> or <include> in it")
     for link in root.iterfind("model/link"):
-        # Written for Drake's parser, which takes 1 kg for a link without <inertial>.
+        # Required by Drake's parser, which uses 1 kg for a link without <inertial>.
         for inertial in link.findall("inertial"):
             if _number(inertial.findtext("mass") or "") == 0:
                 link.remove(inertial)
     _check_numbers(path, root)
     for uri in root.iter("uri"):
-        # Composed, a model has no folder of its own that Drake could look in.
+        # A composed model has no folder, so Drake cannot resolve relative paths.
         if uri.text and "://" not in uri.text:
             uri.text = str(path.resolve().parent / uri.text)
     return root
@@ -191,7 +190,7 @@ def _parse(content: bytes) -> ElementTree.Element:
 
 
 def _check_numbers(path: Path, root: ElementTree.Element) -> None:
-    """Raises ArmError for a number that is none, is not finite or is none of an arm, see `_RANGES`."""
+    """Raises ArmError for a number that is invalid, not finite or outside its range in `_RANGES`."""
     for part in root.iterfind("model/*"):
         for element in part.iter():
             texts = [(element.tag, f"<{element.tag}>", element.text)] if element.tag in _RANGES else []
@@ -205,7 +204,7 @@ def _check_numbers(path: Path, root: ElementTree.Element) -> None:
 
 
 def _numbers_of(where: str, name: str, text: str, element: ElementTree.Element) -> tuple[list[float], list[Range]]:
-    """The numbers of an element or attribute, and the range of each."""
+    """Returns the numbers of an element or attribute, and the range of each."""
     counts = _COUNTS.get(name, (1,))
     values = [_number(word) for word in text.split()]
     allowed = [_RANGES[name]] * len(values)
@@ -233,17 +232,17 @@ def _add_shapes(link: ElementTree.Element, again: ElementTree.Element) -> None:
 
 
 def mirror_links(root: ElementTree.Element, links: Sequence[str], source: str) -> None:
-    """Mirrors the inertia and the shapes of some links of an SDF model; joints and frames stay, as joint angles do.
+    """Mirrors the inertia and the shapes of some links of an SDF model; joints and frames are unchanged.
 
-    With M = diag(-1, 1, 1), a pose (R, p) becomes (M R M, M p), an inertia I becomes M I M.
+    With M = diag(-1, 1, 1), a pose (R, p) becomes (M R M, M p), and an inertia I becomes M I M.
 
     Args:
-        root: the SDF.
-        links: names.
-        source: where the SDF is from, for messages.
+        root: Root element of the SDF.
+        links: Names of the links.
+        source: Source of the SDF, for messages.
 
     Raises:
-        ArmError: there is no such link, or a pose of one that is not six plain numbers.
+        ArmError: A link does not exist, or one of its poses is not six plain numbers.
     """
     by_name = {link.get("name", ""): link for link in root.iterfind("model/link")}
     for name in links:

@@ -1,4 +1,4 @@
-"""Reads a YAML file into a schema; what does not fit becomes one error of ours: key, value, what is allowed."""
+"""Reads a YAML file into a schema; an error message names the key, its value and the accepted values."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from dvrk_drake.models.schema_fault import schema_fault, with_current_keys
 
 Schema = TypeVar("Schema")
 
-#: Deepest nesting and most values, aliases expanded, of a file; a PSM's files have 6 and 6000.
+#: Maximum nesting and maximum number of values of a file, with expanded aliases. The files of a PSM have 6 and 6000.
 MAX_DEPTH, MAX_VALUES = 50, 1_000_000
-# libyaml's parser is ten times as fast as the one in Python, and does not slow down where values are nested.
+# libyaml's parser is ten times as fast as the Python parser, and its speed does not depend on the nesting.
 _FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_FastLoader):
-    """Refuses a key that stands twice in one table, of which YAML takes the last one."""
+    """YAML loader that refuses duplicate keys in a table. By default YAML uses the last one."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         keys: set[str] = set()
@@ -35,47 +35,47 @@ class _Loader(_FastLoader):
 
 
 def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrakeError], what: str) -> Schema:
-    """What is in the file at `path`.
+    """Returns the content of the file at `path` as the type of the schema.
 
     Args:
-        schema: a dataclass, see `schema_fault`.
-        path: of the file.
-        error: that is raised.
-        what: the file should be, for the message: "a file of gains".
+        schema: Dataclass, see `schema_fault`.
+        path: Path of the file.
+        error: Type of error to raise.
+        what: Kind of file that is expected, for the message: "a file of gains".
 
     Raises:
-        DvrkDrakeError: of the type `error`; it cannot be read, is no YAML, or does not fit the schema.
+        DvrkDrakeError: Error of type `error`: the file cannot be read, is not YAML, or does not match the schema.
     """
     return typed_content(schema, load_yaml(path, error), str(path), error, what)
 
 
 def typed_content(schema: type[Schema], content: Any, where: str, error: type[DvrkDrakeError], what: str) -> Schema:
-    """The same of what was read already, with `where` it is from."""
+    """Converts content that was read already, see `load_typed_yaml`; `where` names its source."""
     content = with_current_keys(schema, content, where)
     if fault := schema_fault(schema, content, what):
         raise error(f"{where}: {fault}")
     try:
         return _converted(schema, content)
-    except DvrkDrakeError as cause:  # of a schema's own check
+    except DvrkDrakeError as cause:  # raised by the schema's own check
         raise error(f"{where}: {cause}") from cause
 
 
 def load_yaml(path: str | Path, error: type[DvrkDrakeError]) -> Any:
-    """What is in the file at `path`, whatever it is.
+    """Returns the content of the YAML file at `path`, without a schema.
 
     Raises:
-        DvrkDrakeError: of the type `error`; it cannot be read, or is no YAML.
+        DvrkDrakeError: Error of type `error`: the file cannot be read or is not YAML.
     """
     return parse_yaml(read_text_input(path, error), str(path), error)
 
 
 def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
-    """What a text says, with `where` it stands; None if it is empty.
+    """Returns the content of a YAML text, None if it is empty; `where` names its source.
 
-    Keys that begin with "_" are left out: they may hold anchors.
+    Keys that begin with "_" are omitted, because they may hold anchors.
 
     Raises:
-        DvrkDrakeError: of the type `error`; it is no YAML.
+        DvrkDrakeError: Error of type `error`: the text is not YAML.
     """
     try:
         if excess := _excess(text):
@@ -84,9 +84,9 @@ def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
     except DvrkDrakeError:
         raise
     except Exception as cause:
-        # Of many types; YAML's own know the line.
+        # Errors of various types; only those of YAML contain the line.
         mark, problem = getattr(cause, "problem_mark", None), getattr(cause, "problem", None)
-        # At the end of a text libyaml counts one line more.
+        # At the end of a text libyaml reports one line too many.
         line = "" if mark is None else f"line {min(mark.line, len(text.splitlines()) - 1) + 1}: "
         raise error(f"{where}: not YAML: {line}{problem or cause}") from cause
     if isinstance(content, dict):
@@ -95,11 +95,11 @@ def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
 
 
 def _excess(text: str) -> str:
-    """Says what of a text has no end in use: nesting, or aliases of aliases; "" if nothing.
+    """Returns a description of excessive nesting or excessive aliases in a text, or "".
 
-    The parser's events come one by one, so that this ends where the text begins to be too much.
+    The parser's events are examined one by one, so that the check stops as soon as a maximum is exceeded.
     """
-    # Per open collection, the number of values in it so far and its anchor.
+    # Number of values so far and anchor of each open collection.
     open_values: list[int] = [0]
     open_anchors: list[str | None] = []
     values_of: dict[str, int] = {}
@@ -128,7 +128,7 @@ def _excess(text: str) -> str:
 
 
 def _converted(schema: Any, value: Any) -> Any:
-    """A value in which `schema_fault` found nothing, as the schema's type."""
+    """Converts a value in which `schema_fault` found no fault to the type of the schema."""
     origin, arguments = get_origin(schema), get_args(schema)
     if origin in (Union, types.UnionType):
         (inner,) = (argument for argument in arguments if argument is not types.NoneType)

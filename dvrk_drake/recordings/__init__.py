@@ -1,1 +1,1 @@
-"""Recordings of arms: data, file formats, conversion."""
+"""Recordings of arms: data, file formats and conversion."""

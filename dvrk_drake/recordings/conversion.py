@@ -1,6 +1,7 @@
-"""Recordings converted to the CSV of this project: CSVs with a header, LCM logs, and public recordings of real arms.
+"""Converts recordings to this project's CSV: CSV files with a header, LCM logs, and public recordings of real arms.
 
-The public ones have two layouts, both of the WPI AIM lab; `docs/public_recordings.md` says how to obtain them.
+The public recordings are from the WPI AIM lab and have two layouts; `docs/public_recordings.md` explains how to obtain
+them.
 
 - "team-mat", https://github.com/WPI-AIM/dvrk_gravity_comp: a MATLAB array of 8 x 2 x N.
 - "wpi-csv", https://github.com/WPI-AIM/dvrk_dynamics_identification: a CSV of 21 columns without a header.
@@ -33,7 +34,7 @@ from dvrk_drake.recordings.recording import Coordinates, Recording, column_names
 
 Format = Literal["csv", "team-mat", "wpi-csv", "lcm-log"]
 
-#: Formats that say what their numbers are of. A CSV with a header does not.
+#: Coordinates of the formats that define them. A CSV with a header does not.
 DEFINED_COORDINATES: dict[str, Coordinates] = {"team-mat": "joint", "wpi-csv": "actuator", "lcm-log": "joint"}
 
 
@@ -48,28 +49,28 @@ def convert(
     arm: Arm | None = None,
     skip_invalid: bool = False,
 ) -> Recording:
-    """Reads a recording and writes it as the CSV that `read_recording` reads, at once or not at all.
+    """Reads a recording and writes it atomically as a CSV that `read_recording` reads.
 
-    Time stamps of the recording are kept as they are.
+    Time stamps of the recording are kept unchanged.
 
     Args:
-        path: the recording.
-        output: the CSV to write; an existing file is replaced.
-        format: None to look at the file.
-        coordinates: "csv": what q, qd and tau are of, which such a file does not say. Other formats define it.
-        variable: "team-mat": which variable; needed if several fit.
-        rate: of a CSV without time stamps: samples a second [Hz]. "wpi-csv": default 200; "csv": default no times.
-        arm: "csv", "wpi-csv": write joint coordinates of this arm; otherwise the file's own.
-            "lcm-log": the arm whose statuses are read; needed if there are several.
-        skip_invalid: leave out invalid rows (or poses) and count them, instead of refusing the file.
+        path: Path of the recording.
+        output: Path of the CSV to write; an existing file is replaced.
+        format: Format of the recording; None to detect it.
+        coordinates: Coordinates of q, qd and tau, for "csv", which does not define them. Other formats do.
+        variable: Name of the variable, for "team-mat"; required if several variables match.
+        rate: Sampling rate [Hz] of a CSV without time stamps. Default: 200 for "wpi-csv", no times for "csv".
+        arm: For "csv" and "wpi-csv": arm whose joint coordinates are written; None for the coordinates of the file. For
+            "lcm-log": arm whose statuses are read; required if there are several.
+        skip_invalid: Whether to omit and count invalid rows (or poses) instead of refusing the file.
 
     Returns:
-        The recording as written; `source`, `lines` and `notes` are of the original.
+        The recording as written; `source`, `lines` and `notes` refer to the original.
 
     Raises:
-        RecordingError: the file does not have the format's layout, its coordinates are not known, or an option is not
-            for its format.
-        DvrkDrakeError: the output cannot be written.
+        RecordingError: The file does not have the layout of the format, its coordinates are unknown, or an option does
+            not apply to its format.
+        DvrkDrakeError: The output cannot be written.
     """
     if format is not None and format not in get_args(Format):
         raise RecordingError(f'unknown format "{format}"; known formats: {", ".join(get_args(Format))}')
@@ -122,7 +123,7 @@ def convert(
 def _read_csv(
     path: Path, coordinates: Coordinates, rate: float | None, arm: Arm | None, skip_invalid: bool
 ) -> Recording:
-    """A CSV with a header that names q1.., with notes on its times and on what is not kept of it."""
+    """Reads a CSV with a header that contains q1, and adds notes on its times and its omitted columns."""
     recording = read_recording(path, arm, coordinates, skip_invalid=skip_invalid)
     if recording.t is not None:
         refuse_rate(path, rate)
@@ -144,12 +145,12 @@ def _read_csv(
 
 
 def detect_format(path: str | Path) -> Format:
-    """The format a file seems to have, from its first bytes: LCM, MATLAB or text, and there whether a header names q1.
+    """Returns the format of a file from its first bytes: LCM, MATLAB, or text with or without q1 in a header.
 
-    The reader judges the rest.
+    The content is checked later by the reader of the format.
 
     Raises:
-        RecordingError: no such file, or it is empty or none of them.
+        RecordingError: The file does not exist, is empty, or has none of the formats.
     """
     path = Path(path)
     if is_lcm_log(path):
@@ -164,12 +165,12 @@ def detect_format(path: str | Path) -> Format:
     return "csv" if "q1" in _header(content) else "wpi-csv"
 
 
-#: First bytes that are looked at, in which a header ends.
+#: Number of bytes that are examined for a header.
 _HEAD = 4096
 
 
 def _header(content: bytes) -> list[str]:
-    """The cells of the first line that is not blank."""
+    """Returns the cells of the first line that is not blank."""
     text = content[:_HEAD].decode("utf-8-sig", errors="replace")
     line = next((line for line in text.splitlines() if line.strip(" ,")), "")
     return [cell.strip() for cell in next(csv.reader([line]), [])]

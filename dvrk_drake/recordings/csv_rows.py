@@ -1,4 +1,4 @@
-"""Rows of CSV files: read with line numbers, and appended one by one to a file that stays whole."""
+"""Reads rows of CSV files with line numbers, and appends complete rows to a file."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.files import open_input, read_input
 
-#: A CSV is read in blocks of this size, and its lines have at most so many characters.
+#: Size of the blocks in which a CSV is read, and maximum number of characters of a line.
 _BLOCK, _MAX_LINE = 1 << 20, 1 << 20
-#: Largest file whose rows are kept as text [bytes].
+#: Maximum size of a file whose rows are kept as text [bytes].
 _MAX_ROWS = 64_000_000
 
 
 def read_bytes(path: Path) -> bytes:
-    """Everything in a file.
+    """Returns the content of a file.
 
     Raises:
-        RecordingError: there is no such file, it cannot be read, or it is too large.
+        RecordingError: The file does not exist, cannot be read, or is too large.
     """
     return read_input(path, RecordingError)
 
 
 class CsvReader:
-    """The rows of a CSV file, block by block, so that a large file needs little memory.
+    """Reads the rows of a CSV file in blocks, so that a large file needs little memory.
 
-    UTF-8 with or without a byte-order mark; lines end in LF, CRLF or CR. Each iteration goes on where the one before
-    stopped, and gives (line number, cells as they stand in the file) of rows that are not blank.
+    The file is UTF-8 with or without a byte-order mark. Lines end in LF, CRLF or CR. Each iteration continues where the
+    previous one stopped. It yields (line number, unmodified cells) of the rows that are not blank.
 
     Attributes:
-        has_underscore: whether an underscore was read so far, which Python takes as a part of numbers.
+        has_underscore: Whether an underscore was read so far; Python accepts underscores in numbers.
     """
 
     def __init__(self, path: Path, progress: Callable[[float], object] = lambda share: None) -> None:
-        """Of the file at `path`; `progress` is called with the share 0..1 that was read.
+        """Opens the file at `path`; `progress` is called with the completed share 0..1.
 
         Raises:
-            RecordingError: the file cannot be read.
+            RecordingError: The file cannot be read.
         """
         self._path, self._progress = path, progress
         self._file = open_input(path, RecordingError)
@@ -75,7 +75,7 @@ class CsvReader:
             raise RecordingError(f"{self._path}:{reader.line_num}: not CSV: {error}") from error
 
     def sha256(self) -> str:
-        """Of the file's bytes, when all rows have been read."""
+        """Returns the SHA-256 of the file; valid after all rows have been read."""
         return self._digest.hexdigest()
 
     def _check_commas(self, cells: list[str]) -> None:
@@ -108,7 +108,7 @@ class CsvReader:
                 text, is_start = text.removeprefix("\ufeff"), False
             text = rest + text
             num_read += len(block)
-            # Whole lines; a CR at the end may be half of a CRLF.
+            # Use complete lines only; a CR at the end may be the first half of a CRLF.
             end = max(text.rfind("\n"), text.rfind("\r", 0, -1)) + 1 if block else len(text)
             whole, rest = text[:end], text[end:]
             if len(rest) > _MAX_LINE:
@@ -121,12 +121,12 @@ class CsvReader:
 
 
 def read_rows(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
-    """(line number, stripped cells) of every row that is not blank, and the SHA-256 of the file's bytes.
+    """Returns (line number, stripped cells) of all rows that are not blank, and the SHA-256 of the file.
 
-    Needs about 15 times the file's size as memory; for files of numbers that may be large see `CsvReader`.
+    The required memory is about 15 times the file size. Use `CsvReader` for files of numbers that may be large.
 
     Raises:
-        RecordingError: the file cannot be read, is too large, is not text, or its cells are not separated by commas.
+        RecordingError: The file cannot be read, is too large, is not text, or its cells are not separated by commas.
     """
     open_input(path, RecordingError, _MAX_ROWS).close()
     with CsvReader(path) as reader:
@@ -135,19 +135,19 @@ def read_rows(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
 
 
 def listed(numbers: Iterable[int]) -> str:
-    """The first ten of them, in words."""
+    """Returns a text that lists the first ten numbers."""
     texts = list(map(str, numbers))
     return ", ".join(texts if len(texts) <= 10 else [*texts[:10], "..."])
 
 
 def skipped_note(skipped: NDArray[np.int_], count: int) -> str:
-    """The note on the lines that were left out of `count` rows."""
+    """Returns the note on the skipped lines of `count` rows."""
     return f"{len(skipped)} of {count} rows skipped (empty, NaN or infinite): lines {listed(skipped)}"
 
 
 def is_number(cell: str) -> bool:
-    """Whether `parse_number` reads `cell`."""
-    # Python's float() also reads 1_000, which no other program writes or reads as a number.
+    """Returns whether `parse_number` accepts `cell`."""
+    # Python's float() also accepts 1_000, which no other program writes or reads as a number.
     if "_" in cell:
         return False
     try:
@@ -158,14 +158,14 @@ def is_number(cell: str) -> bool:
 
 
 def parse_number(cell: str, where: str) -> float:
-    """The number in `cell`, NaN and infinities included.
+    """Returns the number in `cell`, which may be NaN or infinite.
 
     Args:
-        cell: text.
-        where: `file:line: column`, the start of the message.
+        cell: Text of the cell.
+        where: Beginning of the error message, `file:line: column`.
 
     Raises:
-        RecordingError: it is not a number.
+        RecordingError: The cell is not a number.
     """
     if not is_number(cell):
         raise RecordingError(f"{where} is empty" if not cell else f"{where} is not a number: {cell[:30]!r}")
@@ -173,12 +173,12 @@ def parse_number(cell: str, where: str) -> float:
 
 
 def parse_or_nan(cell: str, where: str) -> float:
-    """As `parse_number`, but an empty cell is NaN."""
+    """Returns the number in `cell` as `parse_number` does, or NaN for an empty cell."""
     return parse_number(cell, where) if cell else float("nan")
 
 
 def parse_finite(cell: str, where: str) -> float:
-    """As `parse_number`, but NaN and infinities are errors too."""
+    """Returns the number in `cell` as `parse_number` does; NaN and infinity are errors."""
     value = parse_number(cell, where)
     if not np.isfinite(value):
         raise RecordingError(f"{where} is {cell}; only finite numbers are allowed")
@@ -186,21 +186,21 @@ def parse_finite(cell: str, where: str) -> float:
 
 
 class GrowingFile:
-    """A file whose rows are one write of the operating system each, on an unbuffered file.
+    """File that is extended by one unbuffered write per row.
 
-    What was written survives a killed process; with `sync` it survives a power failure as well.
+    Written rows survive the termination of the process. With `sync` they also survive a power failure.
     """
 
     def __init__(self, path: str | Path, *, resume: bool = False, sync: bool = False) -> None:
-        """A new file, or with `resume` an existing one, cut back to its last whole line.
+        """Creates a new file, or with `resume` opens an existing one and truncates it after its last complete line.
 
         Args:
-            path: the file.
-            resume: whether it is there already.
-            sync: wait for the disk after each row, which may take many milliseconds.
+            path: Path of the file.
+            resume: Whether to continue an existing file.
+            sync: Whether to wait for the disk after each row, which may take many milliseconds.
 
         Raises:
-            RecordingError: it cannot be written, or is there although it must be new.
+            RecordingError: The file cannot be written, or it exists although `resume` is False.
         """
         self._path, self._sync = path, sync
         try:
@@ -215,7 +215,7 @@ class GrowingFile:
         """Writes one row.
 
         Raises:
-            RecordingError: it cannot be written; the file ends with the row before.
+            RecordingError: The row cannot be written; the file ends with the previous row.
         """
         end = self._file.tell()
         try:
@@ -229,5 +229,5 @@ class GrowingFile:
             raise RecordingError(f"{self._path}: cannot be written any more: no space left; ends here")
 
     def close(self) -> None:
-        """Ends the file."""
+        """Closes the file."""
         self._file.close()

@@ -1,9 +1,9 @@
-"""LCM logs: reads what is left of one, and the measurements of one arm in it.
+"""Reads LCM logs, including damaged ones, and the measurements of one arm in them.
 
-The format, https://lcm-proj.github.io/lcm/content/log-file-format.html: events one after the other, each big-endian
-with a magic number, its number, a time, two lengths, the channel and the data. The `lcm` package's own `EventLog` ends
-the process on a damaged length (a segmentation fault in lcm 1.5.3), and keeps the last events in memory until it is
-closed.
+The format is described at https://lcm-proj.github.io/lcm/content/log-file-format.html. A log is a sequence of events.
+Each event is big-endian and consists of a magic number, its number, a time, two lengths, the channel and the data.
+`EventLog` of the `lcm` package is not used. It crashes on a damaged length (segmentation fault in lcm 1.5.3), and does
+not write the last events before the log is closed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MAX_CHANNEL = 1000
 
 
 class LcmEvent(NamedTuple):
-    """One message: its number in the log, when it arrived [us since 1970], its channel and its bytes."""
+    """One message of a log: event number, time of arrival [us since 1970], channel and data."""
 
     number: int
     utime: int
@@ -42,18 +42,18 @@ class LcmEvent(NamedTuple):
 
 
 class LcmLogReader:
-    """The events of a log, in its order; what is damaged is skipped.
+    """Iterates over the events of a log in their order, and skips damaged ones.
 
     Attributes:
-        path: of the log.
-        notes: what was damaged, complete when the iteration is.
+        path: Path of the log.
+        notes: Descriptions of damage, complete after the iteration.
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Of the log at `path`, which begins with an event.
+        """Opens the log at `path`, which must begin with an event.
 
         Raises:
-            RecordingError: the file cannot be read, or does not begin as an LCM log does.
+            RecordingError: The file cannot be read, or does not begin like an LCM log.
         """
         if not is_lcm_log(path):
             raise RecordingError(f"{path}: is not an LCM log")
@@ -76,12 +76,12 @@ class LcmLogReader:
                     position = self._skip(content, position)
 
     def sha256(self) -> str:
-        """Of the file's bytes."""
+        """Returns the SHA-256 of the file."""
         with open_input(self.path, RecordingError) as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
     def _skip(self, content: mmap.mmap, damaged: int) -> int:
-        """The position of the next whole event after a damaged one, or the end of the file."""
+        """Returns the position of the next complete event after a damaged one, or the end of the file."""
         position = damaged
         while (position := content.find(_MAGIC, position + 1)) >= 0:
             if _end_of_event(content, position):
@@ -94,7 +94,7 @@ class LcmLogReader:
 
 
 def is_lcm_log(path: str | Path) -> bool:
-    """Whether the file begins as an LCM log does; False where there is no file to read."""
+    """Returns whether the file begins like an LCM log; False if it cannot be read."""
     try:
         with open_input(path, RecordingError) as file:
             return file.read(len(_MAGIC)) == _MAGIC
@@ -103,13 +103,16 @@ def is_lcm_log(path: str | Path) -> bool:
 
 
 def event_bytes(event: LcmEvent) -> bytes:
-    """An event as a log holds it; a log is nothing but these, numbered from 0."""
+    """Returns the encoding of an event in a log. A log is a sequence of encoded events, numbered from 0."""
     channel = event.channel.encode()
     return _HEADER.pack(_MAGIC, event.number, event.utime, len(channel), len(event.data)) + channel + event.data
 
 
 def _end_of_event(content: mmap.mmap, start: int) -> int:
-    """Where the event that begins at `start` ends; 0 if none does, or if something else than an event follows."""
+    """Returns the end of the event that begins at `start`, or 0.
+
+    The result is 0 if there is no event at `start`, or if it is not followed by another event.
+    """
     if start + _HEADER.size > len(content):
         return 0
     magic, _, _, channel_length, data_length = _HEADER.unpack_from(content, start)
@@ -124,7 +127,7 @@ def _event(content: mmap.mmap, start: int) -> LcmEvent:
     _, number, utime, channel_length, data_length = _HEADER.unpack_from(content, start)
     channel = start + _HEADER.size
     data = channel + channel_length
-    # A channel that is no UTF-8 is nobody's here; it must not stop the reading of others.
+    # A channel that is not UTF-8 is not used here, and must not prevent reading others.
     name = content[channel:data].decode("utf-8", "replace")
     return LcmEvent(number, utime, name, content[data : data + data_length])
 
@@ -137,19 +140,19 @@ _OFF = "with the motors off, whose efforts hold nothing"
 
 
 class StatusStream:
-    """Takes the messages of a status channel one by one.
+    """Processes the messages of a status channel one by one.
 
     Attributes:
-        arm_name: whose statuses count.
-        num_joints: how many joints they must have.
-        last: the newest status of the arm, whether it can be used or not, or None.
-        num_lost: statuses that are missing in the sequence.
-        num_taken: statuses that were used.
-        first_utime: of the first status that was used [us], the zero of a recording's t.
+        arm_name: Name of the arm whose statuses are used.
+        num_joints: Number of joints that the statuses must have.
+        last: Last status of the arm, usable or not, or None.
+        num_lost: Number of statuses missing in the sequence.
+        num_taken: Number of used statuses.
+        first_utime: Time of the first used status [us], which is the zero of a recording's t.
     """
 
     def __init__(self, arm_name: str, num_joints: int) -> None:
-        """Of that arm."""
+        """Creates a stream for the named arm."""
         self.arm_name, self.num_joints = arm_name, num_joints
         self.last: lcmt_dvrk_status | None = None
         self.num_lost, self.num_taken, self.first_utime = 0, 0, 0
@@ -157,10 +160,10 @@ class StatusStream:
         self._left_out: Counter[str] = Counter()
 
     def take(self, data: bytes) -> lcmt_dvrk_status | None:
-        """The status in a message, or None if it cannot be used as a measurement.
+        """Returns the status in a message, or None if it cannot be used as a measurement.
 
         Raises:
-            RecordingError: two arms of this name send at the same time.
+            RecordingError: Two arms of this name send at the same time.
         """
         status = decode(lcmt_dvrk_status, data)
         reason = _UNREADABLE if status is None else self._examine(status)
@@ -173,11 +176,11 @@ class StatusStream:
         return status
 
     def time(self, status: lcmt_dvrk_status) -> float:
-        """Of a status that was used, since the first that was [s]."""
+        """Returns the time of a used status since the first one [s]."""
         return 1e-6 * (status.utime - self.first_utime)
 
     def notes(self) -> list[str]:
-        """What was left out and lost, a line each."""
+        """Returns descriptions of omitted and lost statuses, one per line."""
         notes = [f"messages left out, {reason}: {count}" for reason, count in self._left_out.items()]
         if self.num_lost:
             notes.append(f"messages lost on the way, missing in the sequence: {self.num_lost}")
@@ -186,7 +189,7 @@ class StatusStream:
         return notes
 
     def _examine(self, status: lcmt_dvrk_status) -> str:
-        """Why a status cannot be used, or ""; the sequence is followed through those that cannot."""
+        """Returns the reason why a status cannot be used, or "". Unusable statuses also advance the sequence."""
         if status.arm_name != self.arm_name or status.num_joints != self.num_joints:
             return _FOREIGN
         continues = self._follow_session(status.session_id)
@@ -200,7 +203,7 @@ class StatusStream:
         return _OFF if status.guard_state == lcmt_dvrk_status.STATE_OFF else ""
 
     def _follow_session(self, session_id: int) -> bool:
-        """Whether this is the session of the message before; a session that comes back was never ended."""
+        """Returns whether the session is that of the previous message. A session that reappears had not ended."""
         if self._sessions and self._sessions[-1] == session_id:
             return True
         if session_id in self._sessions:
@@ -213,23 +216,23 @@ class StatusStream:
 
 
 def measurements(status: lcmt_dvrk_status) -> tuple[float, ...]:
-    """q, v, tau in one tuple (3n,), as measured."""
+    """Returns the measured q, v, tau in one tuple (3n,)."""
     return (*status.position, *status.velocity, *status.effort_measured)
 
 
-#: Most channels that a message lists.
+#: Maximum number of channels listed in a message.
 _LISTED = 8
 
 
 class StatusLog(NamedTuple):
-    """The measurements of one arm, in joint coordinates; SI.
+    """Measurements of one arm, in joint coordinates and SI units.
 
     Attributes:
-        t: (m,) the arm's own clock since the first row [s].
-        q, qd, tau: (m, n) measured positions, velocities and efforts.
-        events: (m,) number of each row's event in the log.
-        notes: what is damaged, missing or left out, a line each.
-        sha256: of the log's bytes.
+        t: Times (m,) since the first row, from the arm's clock [s].
+        q, qd, tau: Measured positions, velocities and efforts (m, n).
+        events: Event numbers (m,) of the rows in the log.
+        notes: Descriptions of damaged, missing and omitted parts, one per line.
+        sha256: SHA-256 of the log.
     """
 
     t: NDArray[np.float64]
@@ -242,17 +245,18 @@ class StatusLog(NamedTuple):
 
 
 def read_status_log(path: str | Path, arm: Arm | None = None) -> StatusLog:
-    """Reads an LCM log as lcm-logger or `dvrk-drake record` writes it; other channels in it do not matter.
+    """Reads an LCM log written by lcm-logger or `dvrk-drake record`; other channels are ignored.
 
-    Left out and noted are messages that cannot be read or are not of the arm, that are not later than the one before,
-    whose numbers are not finite, or that were sent with the motors off.
+    Some messages are omitted and noted: those that cannot be read or are not of the arm, that are not later than the
+    previous one, that contain numbers that are not finite, or that were sent with the motors off.
 
     Args:
-        path: the log.
-        arm: whose statuses; None if the log has only one arm's.
+        path: Path of the log.
+        arm: Arm whose statuses are read; None if the log has statuses of only one arm.
 
     Raises:
-        RecordingError: no LCM log, none or (without `arm`) several arms' statuses, or none that can be used.
+        RecordingError: The file is not an LCM log, has no usable status, or has (without `arm`) statuses of several
+            arms.
     """
     log = LcmLogReader(path)
     channel = status_channel(arm) if arm else _only_status_channel(log)

@@ -1,6 +1,6 @@
-"""Files of a collection: the poses to visit, as YAML, and the poses that were measured, as CSV.
+"""Files of a collection: the poses to visit (YAML) and the measured poses (CSV).
 
-No postponed annotations here: yaml_load_typed reads the types at run time.
+Postponed annotations are not used here because yaml_load_typed reads the types at run time.
 """
 
 import os
@@ -19,25 +19,26 @@ from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.recordings.csv_rows import GrowingFile, parse_finite, read_bytes, read_rows
 from dvrk_drake.recordings.recording import SAME_POSE, Recording, column_names
 
-#: A pose written with few digits may stand on a limit [rad, m].
+#: Tolerance of the limits, for poses written with few digits [rad, m].
 _ROUNDING = 1e-9
 
 
 @dataclass
 class PoseFile:
-    """Schema of a file of poses: of which arm, and one list of n joint positions [rad, m] a pose."""
+    """Schema of a file of poses: the name of the arm, and one list of n joint positions [rad, m] per pose."""
 
     format: str = "dvrk_drake poses 1"
     arm: str = ""
-    # `check_poses` has the limits of the arm.
+    # `check_poses` checks the limits of the arm.
     poses: list[list[float]] = field(default_factory=list, metadata=within(-1e4, 1e4, "rad or m"))
 
 
 def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
-    """The poses (m, n) in a file, all of them good to visit.
+    """Returns the poses (m, n) in a file after checking them.
 
     Raises:
-        CollectionError: no such file, not a file of poses, of another arm, or a pose that `check_poses` refuses.
+        CollectionError: The file does not exist, is not a file of poses, is of another arm, or has a pose that
+            `check_poses` refuses.
     """
     if not os.path.lexists(path):
         raise CollectionError(f"{path}: no such file of poses; --teach or --random makes one")
@@ -60,16 +61,17 @@ def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
 
 
 def check_poses(poses: NDArray[np.float64], arm: Arm, source: str) -> None:
-    """Refuses poses (m, n) that `arm` cannot take, or two that are one; `source` begins the message.
+    """Checks that `arm` can reach poses (m, n) and that no pose is repeated; `source` begins the message.
 
     Raises:
-        CollectionError: numbers that are not finite, degrees or millimetres, outside the limits, or a pose twice.
+        CollectionError: Numbers are not finite, in degrees or millimetres, or outside the limits, or a pose is
+            repeated.
     """
     for k, pose in enumerate(poses):
         if not np.all(np.isfinite(pose)):
             raise CollectionError(f"{source}: pose {k + 1} must be finite numbers; got {pose.tolist()}")
     try:
-        Recording(q=poses, source=source).check_fits(arm)  # knows degrees and millimetres when it sees them
+        Recording(q=poses, source=source).check_fits(arm)  # detects degrees and millimetres
     except RecordingError as error:
         raise CollectionError(str(error).replace(": row ", ": pose ")) from error
     for k, pose in enumerate(poses):
@@ -80,17 +82,17 @@ def check_poses(poses: NDArray[np.float64], arm: Arm, source: str) -> None:
 
 
 def same_pose(poses: NDArray[np.float64], pose: NDArray[np.float64], arm: Arm) -> int | None:
-    """Which of `poses` (m, n) is the same as `pose` (n,), or None."""
+    """Returns the index of `pose` (n,) in `poses` (m, n), or None."""
     rows = np.flatnonzero(np.all(np.abs(poses - pose) < arm.per_joint(*SAME_POSE), axis=1))
     return int(rows[0]) if len(rows) else None
 
 
 def save_poses(poses: NDArray[np.float64], arm: Arm, path: str | Path) -> None:
-    """Writes poses (m, n) at once or not at all, with every digit.
+    """Writes poses (m, n) atomically and with full precision.
 
     Raises:
-        CollectionError: as `check_poses`.
-        DvrkDrakeError: it cannot be written.
+        CollectionError: See `check_poses`.
+        DvrkDrakeError: The file cannot be written.
     """
     check_poses(poses, arm, str(path))
     with atomic_write(path) as stream:
@@ -100,29 +102,29 @@ def save_poses(poses: NDArray[np.float64], arm: Arm, path: str | Path) -> None:
 
 
 def load_poses_if_any(path: str | Path, arm: Arm) -> NDArray[np.float64]:
-    """As `load_poses`, but no poses (0, n) where there is no file yet."""
+    """Returns the poses as `load_poses` does, or no poses (0, n) if the file does not exist."""
     return load_poses(path, arm) if os.path.lexists(path) else np.empty((0, arm.num_joints))
 
 
 class CollectionFile:
-    """One row a finished pose, which is on the disk when `append` returns.
+    """CSV file with one row per finished pose. A row is on the disk when `append` returns.
 
-    Columns: q1..qn and tau1..taun as measured, as in every Recording; friction1..n, half of the difference between
-    the efforts from either side, where there are two; pose1..n, the pose that was asked for; arm; utime when the row
-    was written [us since 1970]. Joints in the arm's order [rad, N m; m, N on a prismatic joint].
+    The columns are q1..qn and tau1..taun, as measured and as in every Recording; friction1..n, half of the difference
+    between the efforts of the two approach directions, if both are used; pose1..n, the requested pose; arm; utime, when
+    the row was written [us since 1970]. Joints are in the arm's order [rad, N m; m, N for a prismatic joint].
     """
 
     def __init__(self, path: str | Path, arm: Arm, both_sides: bool) -> None:
-        """At `path`; what is there already must be rows of this kind.
+        """Opens the file at `path`. If it exists, it must have rows of this kind.
 
         Args:
-            path: of a CSV that is new or goes on.
-            arm: whose poses.
-            both_sides: whether each pose is measured from either side.
+            path: Path of a CSV that is created or continued.
+            arm: Arm of the poses.
+            both_sides: Whether each pose is measured from both approach directions.
 
         Raises:
-            CollectionError: it is no collection of this arm in this manner.
-            RecordingError: it cannot be read.
+            CollectionError: The file is not a collection of this arm with this setting of `both_sides`.
+            RecordingError: The file cannot be read.
         """
         self._path, self._arm, self._both_sides = Path(path), arm, both_sides
         self._header = [*self._names("q"), *self._names("tau"), *self._names("pose"), "arm", "utime"]
@@ -133,10 +135,10 @@ class CollectionFile:
         self._rows = self._read() if self._is_there else []
 
     def finished(self, poses: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(m,) which of `poses` (m, n) the file has already.
+        """Returns an array (m,) of bool that marks which of `poses` (m, n) are already in the file.
 
         Raises:
-            CollectionError: it has one that is none of them.
+            CollectionError: The file contains a pose that is not in `poses`.
         """
         done = np.zeros(len(poses), bool)
         for line, pose in self._rows:
@@ -156,10 +158,10 @@ class CollectionFile:
         tau: NDArray[np.float64],
         friction: NDArray[np.float64] | None = None,
     ) -> None:
-        """Adds the measured q, tau (n,) of a pose (n,), and the friction (n,) that the two sides tell.
+        """Appends the measured q, tau (n,) of a pose (n,), and the friction (n,) from the two approach directions.
 
         Raises:
-            RecordingError: it cannot be written; the rows before are whole.
+            RecordingError: The row cannot be written; the previous rows are complete.
         """
         if self._file is None:
             self._file = GrowingFile(self._path, resume=self._is_there, sync=True)
@@ -172,7 +174,7 @@ class CollectionFile:
         self._file.append((",".join(cells) + "\n").encode())
 
     def close(self) -> None:
-        """Ends the file."""
+        """Closes the file."""
         if self._file is not None:
             self._file.close()
 
@@ -180,10 +182,10 @@ class CollectionFile:
         return column_names(prefix, self._arm.num_joints)
 
     def _read(self) -> list[tuple[int, NDArray[np.float64]]]:
-        """(line, pose that was asked for) of each whole row."""
+        """Returns (line, requested pose) of each complete row."""
         rows, _ = read_rows(self._path)
         if not read_bytes(self._path).endswith(b"\n"):
-            rows = rows[:-1]  # a power failure cut it
+            rows = rows[:-1]  # incomplete after a power failure
         if not rows:
             return []
         (_, header), *rows = rows

@@ -1,7 +1,7 @@
-"""Public recordings of real arms: motions as CSVs of 21 columns, static poses as MATLAB arrays of 8 x 2 x N.
+"""Reads public recordings of real arms: motions as CSVs of 21 columns, static poses as MATLAB arrays of 8 x 2 x N.
 
-Of the WPI AIM lab, https://github.com/WPI-AIM/dvrk_dynamics_identification and
-https://github.com/WPI-AIM/dvrk_gravity_comp; `docs/public_recordings.md` says how to obtain them.
+The recordings are from the WPI AIM lab, https://github.com/WPI-AIM/dvrk_dynamics_identification and
+https://github.com/WPI-AIM/dvrk_gravity_comp; `docs/public_recordings.md` explains how to obtain them.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from dvrk_drake.recordings.csv_rows import (
 )
 from dvrk_drake.recordings.recording import Recording
 
-#: Nominal rate of the recordings [Hz].
+#: Nominal sampling rate of the recordings [Hz].
 WPI_RATE = 200.0
 
-#: Joints that are counted at the joint itself, although a disc drives them.
+#: Joints whose recorded coordinates are those of the joint itself, although a disc drives them.
 WPI_DIRECT_JOINTS = ("roll",)
 
 _NUM_JOINTS = 7
@@ -44,24 +44,24 @@ _WPI_LAYOUT = "21 numbers a row: q1..q7, qd1..qd7, tau1..tau7"
 
 
 def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: bool = False) -> Recording:
-    """A motion from a CSV without a header: q1..q7, qd1..qd7, tau1..tau7, in actuator coordinates.
+    """Reads a motion from a CSV without a header: q1..q7, qd1..qd7, tau1..tau7, in actuator coordinates.
 
-    Units are rad, rad/s and N m. Of a PSM, axis 3 is in m, m/s and N, and axis 7 is the jaw. The file has
-    no time stamps: t = row / rate. The CSV that `convert` wrote without an arm (header t, q1.., qd1.., tau1..) is
-    read as well. It keeps its time stamps.
+    Units are rad, rad/s and N m. For a PSM, axis 3 is in m, m/s and N, and axis 7 is the jaw. The file has no time
+    stamps: t = row / rate. The CSV that `convert` wrote without an arm (header t, q1.., qd1.., tau1..) is also
+    accepted. It keeps its time stamps.
 
     Format: https://github.com/WPI-AIM/dvrk_dynamics_identification, files
     `data/*/measured_trajectory/*_results.csv`.
 
     Args:
-        path: the CSV file.
-        rate: samples a second [Hz]; default: `WPI_RATE`.
-        skip_invalid: leave out rows with an empty cell, a NaN or an infinity instead of refusing the file; the other
-            rows keep their t.
+        path: Path of the CSV file.
+        rate: Sampling rate [Hz]; default: `WPI_RATE`.
+        skip_invalid: Whether to omit rows with an empty cell, a NaN or an infinity instead of refusing the file. The
+            other rows keep their t.
 
     Raises:
-        RecordingError: not such a file, fewer than two rows, a cell that is no finite number, or a rate for a file that
-            has time stamps.
+        RecordingError: The file does not have this layout, has fewer than two rows, or has a cell that is not a finite
+            number; or a rate is given for a file with time stamps.
     """
     path = Path(path)
     rows, sha256 = read_rows(path)
@@ -123,10 +123,10 @@ def refuse_rate(path: Path, rate: float | None) -> None:
 
 
 def made_times(rows: NDArray[np.intp], rate: float) -> tuple[NDArray[np.float64], str]:
-    """Times [s] for the numbers of rows of a file without time stamps, and the note that says so.
+    """Returns times [s] for the row numbers of a file without time stamps, and a note on them.
 
     Raises:
-        RecordingError: the rate is no positive number.
+        RecordingError: The rate is not a positive number.
     """
     if not (np.isfinite(rate) and rate > 0):
         raise RecordingError(f"rate must be a positive number of Hz, not {rate}")
@@ -134,7 +134,7 @@ def made_times(rows: NDArray[np.intp], rate: float) -> tuple[NDArray[np.float64]
 
 
 def time_notes(t: NDArray[np.float64], lines: NDArray[np.int_]) -> list[str]:
-    """What a user must know of time stamps (m,) that are kept; `lines` (m,) are those of the file."""
+    """Returns notes for the user on recorded time stamps (m,); `lines` (m,) are their lines in the file."""
     steps = np.diff(t)
     interval = f", median interval {1e3 * np.median(steps):.4g} ms" if len(steps) else ""
     notes = [f"{len(t)} rows, t from {t[0]:g} to {t[-1]:g} s as in the file{interval}"]
@@ -149,12 +149,13 @@ def time_notes(t: NDArray[np.float64], lines: NDArray[np.int_]) -> list[str]:
 
 
 def wpi_in_joint_coordinates(recording: Recording, arm: Arm) -> Recording:
-    """A "wpi-csv" recording of `arm`, in actuator coordinates, in joint coordinates.
+    """Converts a "wpi-csv" recording of `arm` from actuator to joint coordinates.
 
-    Its actuators are the dVRK's but for the roll of a PSM, which is the joint's own (Wang et al. 2019, PSM's table).
+    Its actuators are those of the dVRK, except for the roll of a PSM, which is recorded at the joint (Wang et al. 2019,
+    table of the PSM).
 
     Raises:
-        RecordingError: wrong number of joints, or poses that the arm cannot have taken.
+        RecordingError: The number of joints is wrong, or the arm cannot reach the poses.
     """
     J = arm.transmission.matrix.copy()
     for joint in set(WPI_DIRECT_JOINTS) & set(arm.joint_names):
@@ -174,28 +175,29 @@ _T = TypeVar("_T")
 
 
 def looks_like_matlab(path: Path, content: bytes) -> bool:
-    """Whether a file with this content is one of MATLAB's, by its first bytes or its name."""
+    """Returns whether a file with this content is a MATLAB file, from its first bytes or its name."""
     return content[126:128] in (b"IM", b"MI") or content[:8] == _HDF5_MAGIC or path.suffix.lower() == ".mat"
 
 
 def read_team_mat(path: str | Path, *, variable: str | None = None, skip_invalid: bool = False) -> Recording:
-    """Static poses from a MATLAB array of 8 x 2 x N: joint, position (first) or effort (second), pose.
+    """Reads static poses from a MATLAB array of 8 x 2 x N: joint, position (first) or effort (second), pose.
 
-    The first seven rows are the joints in the dVRK's order [rad, N m], in joint coordinates; the eighth, the
-    gripper, is not actuated and dropped. 8 x 2 is one pose, because MATLAB drops trailing dimensions of 1. A
-    pose is invalid if it has a NaN or an infinity in its first seven rows, or only zeros: the arrays are
-    allocated before they are filled. In messages and in `Recording.lines`, poses count from 1 as in MATLAB.
+    The first seven rows are the joints in the dVRK's order [rad, N m], in joint coordinates. The eighth row, the
+    gripper, is not actuated and is dropped. An array of 8 x 2 is one pose, because MATLAB drops trailing dimensions of
+    1. A pose is invalid if its first seven rows contain a NaN or an infinity, or only zeros: the arrays are allocated
+    before they are filled. In messages and in `Recording.lines`, poses are counted from 1 as in MATLAB.
 
     Format: https://github.com/WPI-AIM/dvrk_gravity_comp, `GettingTorques/GetData.m`. MATLAB files up to
-    version 7; version 7.3 (HDF5) is not supported.
+    version 7 are supported; version 7.3 (HDF5) is not.
 
     Args:
-        path: the `.mat` file.
-        variable: the array's name; None if the file has only one that fits.
-        skip_invalid: leave out invalid poses instead of refusing the file.
+        path: Path of the `.mat` file.
+        variable: Name of the array; None if only one array of the file matches.
+        skip_invalid: Whether to omit invalid poses instead of refusing the file.
 
     Raises:
-        RecordingError: not such a file, no or several variables fit, or a pose is invalid.
+        RecordingError: The file does not have this layout, no variable or several variables match, or a pose is
+            invalid.
     """
     path = Path(path)
     content = read_bytes(path)
@@ -226,7 +228,7 @@ def read_team_mat(path: str | Path, *, variable: str | None = None, skip_invalid
 
 
 def _team_array(path: Path, content: bytes, variable: str | None) -> tuple[str, NDArray[np.float64]]:
-    """The chosen variable and its name, always as (8, 2, N)."""
+    """Returns the selected variable as (8, 2, N), and its name."""
     if content[:8] == _HDF5_MAGIC or content[124:128] in _MATLAB_73:
         raise RecordingError(
             f"{path}: is a MATLAB v7.3 (HDF5) file, which is not supported; load it in MATLAB and save it with '-v7'"
@@ -263,7 +265,7 @@ def _matlab(path: Path, read: Callable[[], _T]) -> _T:
             warnings.simplefilter("error", UserWarning)
             return read()
     except Exception as error:
-        # A damaged file makes scipy raise anything: ValueError, OSError, MatReadError, zlib.error, ...
+        # For a damaged file scipy may raise any error: ValueError, OSError, MatReadError, zlib.error, ...
         text = " ".join(str(error).split())
         raise RecordingError(f"{path}: not a MATLAB file that can be read: {text}") from error
 

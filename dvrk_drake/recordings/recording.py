@@ -1,4 +1,4 @@
-"""A recording of an arm: positions and efforts over time or over poses, read from CSV or an LCM log, written to CSV."""
+"""Defines `Recording`: positions and efforts over time or poses, read from CSV or an LCM log, written to CSV."""
 
 from __future__ import annotations
 
@@ -26,34 +26,35 @@ from dvrk_drake.recordings.lcm_log_reader import is_lcm_log, read_status_log
 
 Coordinates = Literal["joint", "actuator"]
 
-#: A pose further than this outside the limits is refused [rad], [m]; nearer ones are real: stops give way.
+#: Tolerance of the position limits [rad], [m]; a pose further outside is refused. Joint stops are compliant, so real
+#: poses may exceed the limits slightly.
 LIMIT_TOLERANCE = 0.2, 0.02
-#: Most rows of a CSV; 15 min at 1 kHz. With these, `check` takes 1.5 GB.
+#: Maximum number of rows of a CSV; 15 min at 1 kHz. With these, `check` needs 1.5 GB.
 MAX_COUNT = 900_000
-#: Fewest rows of a motion, and the median interval below which rows are samples of one [s].
+#: Minimum number of rows of a motion, and maximum median sampling interval of a motion [s].
 MIN_ROWS, MAX_PERIOD = 100, 0.05
-#: RMS joint speed above which a recording counts as a motion [rad/s], [m/s].
+#: RMS joint velocity above which a recording is a motion [rad/s], [m/s].
 REST_SPEED = 0.05, 0.005
-#: Poses whose joints all agree this well are one pose [rad], [m].
+#: Maximum joint differences between samples of the same pose [rad], [m].
 SAME_POSE = 0.01, 0.001
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Positions of an arm with efforts, one row per sample or pose [rad, rad/s, N m, s; m, m/s, N if prismatic].
+    """Positions and efforts of an arm, one row per sample or pose [rad, rad/s, N m, s; m, m/s, N if prismatic].
 
-    Do not change the arrays in place, since conversions are kept: make a new one with `dataclasses.replace`.
+    Do not modify the arrays in place, because conversions are cached. Create a new object with `dataclasses.replace`.
 
     Attributes:
-        q: (m, n) positions.
-        tau: (m, n) efforts that the motors apply, or None.
-        qd: (m, n) velocities, or None.
-        t: (m,) time, or None for poses.
-        coordinates: whether q, qd and tau are of the joints or of the actuators.
-        source: where it came from, for messages.
-        lines: (m,) line of each row in the source, of an LCM log the event's number, for messages.
-        sha256: of the source's bytes, or "".
-        notes: what a user must know of how it was read, a line each: damage, messages left out.
+        q: Positions (m, n).
+        tau: Efforts (m, n) applied by the motors, or None.
+        qd: Velocities (m, n), or None.
+        t: Times (m,), or None for poses.
+        coordinates: Coordinates of q, qd and tau: "joint" or "actuator".
+        source: Source of the data, for messages.
+        lines: Line (m,) of each row in the source, for messages; the event number for an LCM log.
+        sha256: SHA-256 of the source, or "".
+        notes: Notes for the user on how the source was read, one per line: damage, omitted messages.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -72,7 +73,7 @@ class Recording:
     lines: NDArray[np.int_] | None = None
     sha256: str = ""
     notes: tuple[str, ...] = ()
-    # The same recording in the other coordinates, by transmission.
+    # Cache of this recording in the other coordinates, by transmission.
     _converted: dict[LinearMap, Recording] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -97,28 +98,29 @@ class Recording:
         return len(self.q)
 
     def where(self, row: int) -> str:
-        """`file:line` of a row, or the row's number where there is no file."""
+        """Returns `file:line` of a row, or the number of the row if there is no file."""
         source = self.source or "recording"
         return f"{source}:{self.lines[row]}" if self.lines is not None else f"{source}: row {row + 1}"
 
     @property
     def is_motion(self) -> bool:
-        """Whether its rows are samples of a motion: `MIN_ROWS` or more, closer than `MAX_PERIOD` in time.
+        """Whether the rows are samples of a motion: at least `MIN_ROWS`, at intervals shorter than `MAX_PERIOD`.
 
-        Times may go back, see `has_increasing_times`; whether the arm moves tells `motion`.
+        Times may decrease, see `has_increasing_times`. `motion` determines whether the arm moves.
         """
         t = self.t
         return t is not None and len(t) >= MIN_ROWS and float(np.median(np.abs(np.diff(t)))) < MAX_PERIOD
 
     @property
     def has_increasing_times(self) -> bool:
-        """Whether it has times, and each is later than the one before."""
+        """Whether there are times and each is later than the previous one."""
         return self.t is not None and bool(np.all(np.diff(self.t) > 0))
 
     def motion(self, arm: Arm) -> str:
-        """Which joint moves most and how fast, e.g. "joint 1 at 0.2 rad/s RMS"; empty if all rest, or nothing tells.
+        """Returns the joint that moves most and its speed, e.g. "joint 1 at 0.2 rad/s RMS".
 
-        From qd, or from q over t where samples follow within 0.1 s: between poses the arm may well have moved.
+        The text is empty if all joints are at rest, or if the speed is unknown. The speed is computed from qd, or from
+        q and t if samples are less than 0.1 s apart. At longer intervals the speed between poses is unknown.
         """
         if self.qd is not None:
             qd = self.qd
@@ -133,10 +135,10 @@ class Recording:
         return f"joint {joint + 1} at {speed[joint]:.2g} {unit} RMS" if share[joint] > 1 else ""
 
     def measured_effort(self) -> NDArray[np.float64]:
-        """tau (m, n).
+        """Returns tau (m, n).
 
         Raises:
-            RecordingError: the recording has none.
+            RecordingError: The recording has no efforts.
         """
         if self.tau is None:
             raise RecordingError(
@@ -145,18 +147,18 @@ class Recording:
         return self.tau
 
     def in_joint_coordinates(self, arm: Arm) -> Recording:
-        """The same recording with q, qd and tau of the arm's joints.
+        """Returns the same recording with q, qd and tau in joint coordinates of the arm.
 
         Raises:
-            RecordingError: wrong number of joints.
+            RecordingError: The number of joints is wrong.
         """
         return self._in_coordinates("joint", arm)
 
     def in_actuator_coordinates(self, arm: Arm) -> Recording:
-        """The same recording with q, qd and tau of the arm's actuators.
+        """Returns the same recording with q, qd and tau in actuator coordinates of the arm.
 
         Raises:
-            RecordingError: wrong number of joints.
+            RecordingError: The number of joints is wrong.
         """
         return self._in_coordinates("actuator", arm)
 
@@ -164,7 +166,7 @@ class Recording:
         self._check_joint_count(arm)
         if self.coordinates == coordinates:
             return self
-        # Mountings of an arm share their transmission.
+        # The same arm with another mounting has the same transmission.
         if arm.transmission not in self._converted:
             to_other = arm.transmission if coordinates == "actuator" else arm.transmission.inverse
             converted = self._converted[arm.transmission] = replace(
@@ -178,10 +180,11 @@ class Recording:
         return self._converted[arm.transmission]
 
     def check_fits(self, arm: Arm) -> None:
-        """Refuses poses that `arm` cannot have taken.
+        """Checks that `arm` can reach the poses.
 
         Raises:
-            RecordingError: wrong number of joints, a unit suspected to be wrong, or a pose far outside the limits.
+            RecordingError: The number of joints is wrong, a unit is probably wrong, or a pose is far outside the
+                limits.
         """
         self._check_sizes()
         q = self.in_joint_coordinates(arm).q
@@ -197,7 +200,8 @@ class Recording:
         outside = np.mean(np.any(excess > 1, axis=1))
         shares = np.max(np.abs(q) / np.maximum(-arm.position_lower, arm.position_upper), axis=0)
         turning = np.max(shares[~arm.prismatic])
-        # Another arm or other coordinates exceed the limits by a factor of 2 or 3, degrees by up to 57.
+        # With another arm or other coordinates, positions exceed the limits by a factor of 2 or 3; in degrees by up to
+        # 57.
         if outside > 0.3 and turning > 4 and np.radians(turning) <= 1.2:
             message += "; are these degrees, or is it another arm? Positions must be in rad (m on a prismatic joint)"
         elif arm.prismatic[joint] and shares[joint] > 4:
@@ -209,7 +213,7 @@ class Recording:
         raise RecordingError(message)
 
     def _exchanges_within_limits(self, arm: Arm) -> list[str]:
-        """Pairs of columns, such as "q1 and q4", that put all poses within the limits if they are exchanged."""
+        """Returns pairs of columns, such as "q1 and q4", whose exchange moves all poses within the limits."""
         pairs, tolerance = [], arm.per_joint(*LIMIT_TOLERANCE)
         for i, j in combinations(range(arm.num_joints), 2):
             order = np.arange(arm.num_joints)
@@ -245,25 +249,25 @@ def read_recording(
     skip_invalid: bool = False,
     progress: Progress | None = None,
 ) -> Recording:
-    """Reads a CSV, or an LCM log with the DVRK_STATUS messages of an arm; the file's first bytes tell which.
+    """Reads a CSV, or an LCM log with the DVRK_STATUS messages of an arm; the file content selects the format.
 
-    A CSV has a header: q1..qn, optionally t, qd1..qdn and tau1..taun, in any order; others are ignored. What is read of
-    a log: `read_status_log`.
+    A CSV has a header with q1..qn and optionally t, qd1..qdn and tau1..taun, in any order. Other columns are ignored.
+    `read_status_log` describes what is read from a log.
 
     Args:
-        path: the CSV or log.
-        arm: whose joints are counted and named in messages, and whose statuses are read of a log; without it a CSV has
-            7 joints, as all arms have so far, and a log statuses of one arm only.
-        coordinates: what q, qd and tau are of; a log's are of the joints.
-        skip_invalid: leave out rows of a CSV with an empty cell, a NaN or an infinity, and note them, instead of
+        path: Path of the CSV or log.
+        arm: Arm that defines the number and the names of the joints, and whose statuses are read from a log. Without
+            it, a CSV must have 7 joints, and a log must have statuses of only one arm.
+        coordinates: Coordinates of q, qd and tau in a CSV. A log contains joint coordinates.
+        skip_invalid: Whether to omit and note rows of a CSV with an empty cell, a NaN or an infinity, instead of
             refusing the file.
-        progress: called with the step, "reading", and the share 0..1 of a CSV that was read.
+        progress: Callback that receives the step, "reading", and the completed share 0..1 of a CSV.
 
     Returns:
-        The recording, with its SHA-256 and with line numbers for messages; `notes` state what was left out.
+        The recording, with its SHA-256 and with line numbers for messages; `notes` list what was omitted.
 
     Raises:
-        RecordingError: names the file, the line and the column of what is wrong.
+        RecordingError: The file cannot be read as a recording. The message names the file, line and column.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -314,7 +318,7 @@ def _read_csv(
 
 
 def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joints: int) -> dict[str, list[int]]:
-    """Prefix -> the columns in which a header has q, qd, tau and t."""
+    """Returns a mapping from a prefix (q, qd, tau, t) to its columns in the header."""
     if all(is_number(cell) for cell in header):
         raise RecordingError(
             f"{where}: has no header; the first line must name the columns, "
@@ -346,7 +350,7 @@ def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joint
 def _read_numbers(
     path: Path, reader: CsvReader, header: list[str], blocks: dict[str, list[int]], skip_invalid: bool
 ) -> tuple[dict[str, array], array, list[int]]:
-    """Prefix -> the numbers in its columns, row by row; the line of each row; the lines that are skipped."""
+    """Returns the numbers of each prefix row by row, the line of each row, and the skipped lines."""
     skipped: list[int] = []
     values, lines = {prefix: array("d") for prefix in blocks}, array("q")
     parts = [(values[prefix], columns) for prefix, columns in blocks.items()]
@@ -379,19 +383,19 @@ def _read_numbers(
 
 
 def column_names(prefix: str, num_joints: int) -> list[str]:
-    """The columns of q, qd, tau, or t in a CSV."""
+    """Returns the column names of q, qd, tau, or t in a CSV."""
     return ["t"] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(num_joints)]
 
 
 def write_recording(recording: Recording, path: str | Path) -> None:
-    """Writes the CSV that `read_recording` reads, at once or not at all, with every digit of every number.
+    """Writes the CSV that `read_recording` reads, atomically and with full precision.
 
     Args:
-        recording: in the coordinates that the file shall have; a CSV does not state them.
-        path: the file; an existing one is replaced.
+        recording: Recording in the coordinates to write; a CSV does not state them.
+        path: Path of the file; an existing one is replaced.
 
     Raises:
-        DvrkDrakeError: the folder does not exist or cannot be written.
+        DvrkDrakeError: The folder does not exist or cannot be written.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -413,10 +417,10 @@ def write_recording(recording: Recording, path: str | Path) -> None:
 
 
 def write_csv(path: str | Path, header: list[str], values: NDArray[np.float64]) -> None:
-    """Writes a table of numbers at once or not at all; every digit is kept.
+    """Writes a table of numbers atomically and with full precision.
 
     Raises:
-        DvrkDrakeError: the folder does not exist or cannot be written.
+        DvrkDrakeError: The folder does not exist or cannot be written.
     """
     with atomic_write(path) as stream:
         writer = csv.writer(stream, lineterminator="\n")

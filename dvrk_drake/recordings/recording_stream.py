@@ -1,6 +1,6 @@
-"""Recordings that are written while they are made: whatever ends the process, the file is whole up to its last row.
+"""Writes recordings while they are received. If the process ends, the file is complete up to its last row.
 
-What was written survives a killed process; the last moments before a power failure are the disk's.
+Written rows survive the termination of the process. The last rows before a power failure may be lost.
 """
 
 from __future__ import annotations
@@ -18,34 +18,35 @@ from dvrk_drake.recordings.csv_rows import GrowingFile
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, StatusStream, event_bytes, measurements
 from dvrk_drake.recordings.recording import column_names
 
-#: Columns of a CSV behind those of a Recording, to find a row again elsewhere.
+#: Additional columns of a CSV after those of a Recording, which identify the status of each row.
 _ORIGIN = ("utime", "sequence", "guard_state")
 
 
 class RecordingFile(Protocol):
-    """A new file that grows message by message."""
+    """New file that is extended message by message."""
 
     def write(self, data: bytes, utime: int, status: lcmt_dvrk_status | None) -> None:
-        """Takes a message of the status channel that arrived at `utime` [us since 1970].
+        """Processes a message of the status channel that arrived at `utime` [us since 1970].
 
         Args:
-            data: the message.
-            utime: when it came.
-            status: what it says, None if that cannot be used.
+            data: Received message.
+            utime: Time of arrival.
+            status: Decoded status, None if it cannot be used.
 
         Raises:
-            RecordingError: the file cannot be written any more; it ends with its last whole row.
+            RecordingError: The file can no longer be written; it ends with its last complete row.
         """
 
     def close(self) -> None:
-        """Ends the file."""
+        """Closes the file."""
 
 
 def check_stream_output(path: str | Path) -> None:
-    """Refuses a path that a recording cannot be made at.
+    """Checks that a recording can be created at a path.
 
     Raises:
-        RecordingError: it exists, its folder does not or is not to be written in, or it ends in neither .csv nor .log.
+        RecordingError: The file exists, its folder does not exist or is not writable, or it ends in neither .csv nor
+            .log.
     """
     path = Path(path)
     if path.suffix not in (".csv", ".log"):
@@ -62,10 +63,10 @@ def check_stream_output(path: str | Path) -> None:
 
 
 def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> RecordingFile:
-    """Makes the file at `path`: .csv for the statuses that `stream` takes, .log for every message as it came.
+    """Creates the file at `path`: .csv for the statuses that `stream` uses, .log for every message as received.
 
     Raises:
-        RecordingError: as `check_stream_output`, or it cannot be written.
+        RecordingError: See `check_stream_output`; additionally if the file cannot be written.
     """
     check_stream_output(path)
     return _CsvFile(path, stream) if Path(path).suffix == ".csv" else _LogFile(path, status_channel(arm))

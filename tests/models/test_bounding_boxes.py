@@ -1,4 +1,4 @@
-"""Where the mass of links can be: boxes around shapes, and what fits them."""
+"""Tests bounding boxes of link masses and their use as bounds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dvrk_drake.models.arm_schema import BoundingShapes, BoxCorners
 
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
-def test_the_sdfs_own_links_fit_their_boxes(name):
+def test_links_of_the_sdf_fit_their_boxes(name):
     arm = load_arm(name)
     boxes = bounding_boxes(arm)
     assert list(boxes) == [link.link for link in link_inertias(arm)]
@@ -23,7 +23,7 @@ def test_the_sdfs_own_links_fit_their_boxes(name):
         assert np.all(room_in_box(link.parameters, boxes[link.link]) > 0.05), link.link
 
 
-def test_a_box_is_around_the_collision_shapes_and_the_margin_is_that_of_its_file():
+def test_box_encloses_collision_shapes_with_margin_of_its_file():
     boxes = bounding_boxes(load_arm("psm"))
     # One box each in the SDF: 0.028 x 0.536 x 0.02 m about (0, 0.258, 0) in psm.sdf.
     np.testing.assert_allclose(boxes["bottom_bar_link"].lower, [-0.054, -0.05, -0.05], atol=1e-9)
@@ -38,8 +38,8 @@ def point_mass(mass, p):
     return mass * np.concatenate([[1.0], p, moments, products])
 
 
-def test_the_room_of_a_point_is_by_its_distance_from_the_middle():
-    """1 - (d / w)^2 along each axis; a body is the sum of its points, so what is inside has room."""
+def test_margin_of_a_point_depends_on_distance_from_centre():
+    """Checks the margin 1 - (d / w)^2 along each axis. Bodies inside the box have a positive one."""
     box = BoundingBox(np.array([-0.1, 0.0, 0.2]), np.array([0.3, 0.2, 0.3]))
     p = np.array([0.2, 0.1, 0.32])
     expected = 1 - ((p - box.center) / box.half_width) ** 2
@@ -49,7 +49,7 @@ def test_the_room_of_a_point_is_by_its_distance_from_the_middle():
     assert np.all(room_in_box(body, box) >= 0)
 
 
-def test_bounds_that_are_reached_are_named():
+def test_active_bounds_are_named():
     box = BoundingBox(np.full(3, -0.1), np.full(3, 0.1))
     nominal = LinkInertia("link", point_mass(1.0, np.zeros(3)))
     assert reached_bounds(nominal.parameters, nominal, box) == []
@@ -62,7 +62,7 @@ def with_shapes(arm, shapes):
     return dataclasses.replace(arm, identification=dataclasses.replace(arm.identification, bounding_shapes=(shapes,)))
 
 
-def test_links_whose_place_nobody_states_are_refused():
+def test_links_without_bounds_are_refused():
     arm = load_arm("mtmr")
     with pytest.raises(ArmError, match=r"motor_4_link has no <collision> in its SDF.*give it a box"):
         bounding_boxes(with_shapes(arm, BoundingShapes()))

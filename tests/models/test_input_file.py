@@ -1,4 +1,4 @@
-"""Files that are none, too large, too deep, or not readable: every reader gives one line and does not wait."""
+"""Tests input files that are missing, too large, too deeply nested or unreadable: each reader fails with one line."""
 
 import math
 import os
@@ -58,7 +58,7 @@ NO_FILES = {
 
 @pytest.mark.parametrize("kind", NO_FILES)
 @pytest.mark.parametrize("name", READERS)
-def test_what_is_no_file_is_refused_in_one_line(name, kind, tmp_path):
+def test_non_files_are_refused_in_one_line(name, kind, tmp_path):
     path = f"{tmp_path}/{name}"
     NO_FILES[kind](path)
     with pytest.raises(DvrkDrakeError) as refusal:
@@ -69,7 +69,7 @@ def test_what_is_no_file_is_refused_in_one_line(name, kind, tmp_path):
 
 
 @pytest.mark.parametrize("name", sorted(READERS.keys() - {"collection.csv"}))
-def test_names_that_no_file_has_are_refused(name, tmp_path):
+def test_invalid_file_names_are_refused(name, tmp_path):
     for stem in ("x" * 300, "a\0b"):
         with pytest.raises(DvrkDrakeError):
             READERS[name](f"{tmp_path}/{stem}{name}")
@@ -77,7 +77,7 @@ def test_names_that_no_file_has_are_refused(name, tmp_path):
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
 @pytest.mark.parametrize("name", READERS)
-def test_a_file_that_may_not_be_read_is_refused(name, tmp_path):
+def test_unreadable_file_is_refused(name, tmp_path):
     path = tmp_path / name
     path.write_text("")
     path.chmod(0)
@@ -86,7 +86,7 @@ def test_a_file_that_may_not_be_read_is_refused(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["model.yaml", "gc.json", "arm.sdf"])
-def test_a_file_larger_than_any_in_use_is_refused(name, tmp_path):
+def test_too_large_file_is_refused(name, tmp_path):
     path = tmp_path / name
     with path.open("wb") as stream:
         stream.truncate(MAX_TEXT + 1)
@@ -94,7 +94,7 @@ def test_a_file_larger_than_any_in_use_is_refused(name, tmp_path):
         READERS[name](str(path))
 
 
-def test_deep_files_are_refused_where_they_get_deep(tmp_path):
+def test_deeply_nested_files_are_refused_with_their_line(tmp_path):
     for text in ("[" * 100_000, "{a: " * 100_000, "- " * 100):
         with pytest.raises(ArmError, match="line 2: nested deeper than 50 levels"):
             parse_yaml(f"# deep\n{text}", "here", ArmError)
@@ -117,7 +117,7 @@ def test_aliases_of_aliases_are_refused():
 
 
 def own_arm(folder, change):
-    """An MTM as files of one's own, whose SDF has `change` (regular expression, new) made everywhere."""
+    """Writes the files of an MTM whose SDF is changed everywhere by `change` (regular expression, new text)."""
     mechanism = (MODELS_FOLDER / "mechanisms/mtm.yaml").read_text()
     url = next(line.split()[1] for line in mechanism.splitlines() if line.startswith("sdf:"))
     (folder / "mechanism.yaml").write_text(mechanism.replace(url, "own.sdf"))
@@ -151,7 +151,7 @@ def own_arm(folder, change):
         (("base_link", "bottom_link"), r"own\.yaml: the SDF has no link base_link"),
     ],
 )
-def test_an_sdf_that_makes_no_arm_is_refused(change, message, tmp_path):
+def test_sdf_without_a_valid_arm_is_refused(change, message, tmp_path):
     with pytest.raises(ArmError, match=message):
         load_arm(own_arm(tmp_path, change))
 
@@ -181,7 +181,7 @@ def test_limits_in_degrees_are_refused(key, tmp_path):
 
 @pytest.mark.parametrize("key", ["base_parameters[3].value", "joints[2].feedforward_scale", "joints[0].rms_fit"])
 @pytest.mark.parametrize("number", [math.nan, math.inf])
-def test_a_model_with_a_number_that_is_none_is_refused(key, number, tmp_path, capsys):
+def test_model_with_an_invalid_number_is_refused(key, number, tmp_path, capsys):
     model = IdentifiedModel.from_arm(ARM)
     name, _, rest = key.partition("[")
     index, _, attribute = rest.partition("].")
@@ -219,7 +219,7 @@ def test_a_model_with_a_missing_key_is_refused(key, tmp_path):
 # A large CSV.
 
 
-def test_a_large_csv_needs_little_more_than_its_numbers(tmp_path, monkeypatch):
+def test_memory_for_a_large_csv_is_small(tmp_path, monkeypatch):
     monkeypatch.setattr(csv_rows, "_BLOCK", 1 << 16)
     path = tmp_path / "recording.csv"
     path.write_text(f"{HEADER}\n" + f"{ROW}\n" * 20_000)
@@ -238,7 +238,7 @@ def test_a_large_csv_needs_little_more_than_its_numbers(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 @pytest.mark.parametrize("block", [1, 7, 64])
-def test_blocks_do_not_change_what_is_read(block, end, tmp_path, monkeypatch):
+def test_block_size_does_not_change_the_rows(block, end, tmp_path, monkeypatch):
     original = random_recording(9)
     path = tmp_path / "recording.csv"
     write_recording(original, path)
@@ -253,7 +253,7 @@ def test_blocks_do_not_change_what_is_read(block, end, tmp_path, monkeypatch):
         read_recording(path)
 
 
-def test_a_csv_with_too_many_rows_or_too_long_lines_is_refused(tmp_path, monkeypatch):
+def test_csv_with_too_many_rows_or_too_long_lines_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "recording.csv"
     path.write_text(f"{HEADER}\n" + f"{ROW}\n" * 4)
     monkeypatch.setattr(recording, "MAX_COUNT", 3)

@@ -1,4 +1,4 @@
-"""An instrument of one's own: other links, other joints, files outside of the package."""
+"""Tests a custom instrument: other links, other joints, files outside the package."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_an_instrument_of_ones_own_hangs_on_the_arm(folder):
+def test_custom_instrument_is_attached_to_the_arm(folder):
     arm = load_arm(str(folder / "arm.yaml"))
     assert arm.joint_names == ("yaw", "pitch", "insertion", "roll")
     plant = make_arm_plant(arm)
@@ -60,7 +60,7 @@ def test_an_instrument_of_ones_own_hangs_on_the_arm(folder):
 
 
 @pytest.mark.parametrize("name", ["arm.yaml", "bare.yaml"])
-def test_it_is_simulated_and_touches_its_arm_as_little_as_the_arm_does(folder, name):
+def test_custom_instrument_is_simulated_without_self_collision(folder, name):
     station = ArmStation(load_arm(str(folder / name)), closure="ball")
     context = station.CreateDefaultContext()
     query = station.GetOutputPort("query_object").Eval(context)
@@ -75,13 +75,13 @@ def test_it_is_simulated_and_touches_its_arm_as_little_as_the_arm_does(folder, n
         ("[0.2]", r"is \[0\.2\]; allowed: \[lower, upper\]"),
     ],
 )
-def test_limits_that_are_none_or_in_millimetres_are_refused(folder, limits, message):
+def test_invalid_limits_or_limits_in_millimetres_are_refused(folder, limits, message):
     (folder / "bad.yaml").write_text((folder / "arm.yaml").read_text().replace("[0.0, 0.24]", limits))
     with pytest.raises(ArmError, match=f"position_limits.insertion.*{message}"):
         load_arm(str(folder / "bad.yaml"))
 
 
-def test_an_instrument_file_that_is_not_there_is_named(folder):
+def test_missing_instrument_file_is_named(folder):
     (folder / "bad.yaml").write_text((folder / "arm.yaml").read_text().replace("probe.yaml", "gone.yaml"))
     with pytest.raises(ArmError, match=r"bad\.yaml: instrument .*gone\.yaml: no such file"):
         load_arm(str(folder / "bad.yaml"))

@@ -1,4 +1,4 @@
-"""The committed Python of the LCM types is what lcm-gen makes of the .lcm files, and survives the wire."""
+"""Tests that the committed Python of the LCM types equals the output of lcm-gen, and encodes and decodes correctly."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ FOLDER = Path(lcmtypes.__file__).parent
 LCM_GEN = Path(sys.executable).with_name("lcm-gen")
 
 
-def test_committed_python_is_what_lcm_gen_makes(tmp_path):
+def test_committed_python_equals_output_of_lcm_gen(tmp_path):
     if not LCM_GEN.exists():
         pytest.skip(f"no {LCM_GEN}: the lcm wheel ships it")
     sources = sorted(str(path) for path in FOLDER.glob("*.lcm"))

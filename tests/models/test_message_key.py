@@ -1,4 +1,4 @@
-"""Keys of messages: which files are keys, what is signed, and what is not authentic."""
+"""Tests keys of messages: accepted key files, signatures, and rejected messages."""
 
 import hashlib
 import os
@@ -23,7 +23,7 @@ def write(path, content, mode=0o600):
 
 
 @pytest.mark.parametrize("message", [Command(), Status()])
-def test_a_signed_message_is_verified_and_read_as_ever(message):
+def test_signed_message_is_verified_and_decoded(message):
     key, message.utime, message.arm_name = MessageKey(KEY), 12345, "MTML"
     data = message.encode()
     signed = key.sign(data)
@@ -84,12 +84,12 @@ def test_bad_keys_are_refused_in_one_line(tmp_path, content, mode, message, caps
         assert said.startswith("dvrk-drake: error: ") and said.count("\n") == 1 and "a.key: " in said
 
 
-def test_a_folder_is_no_key(tmp_path):
+def test_folder_is_refused_as_key(tmp_path):
     with pytest.raises(KeyFileError, match="is not a file but a folder"):
         MessageKey.load(tmp_path)
 
 
-def test_the_command_makes_a_key_that_is_not_overwritten(tmp_path, capsys):
+def test_command_creates_a_key_and_does_not_overwrite_it(tmp_path, capsys):
     first, second = tmp_path / "a.key", tmp_path / "b.key"
     before = os.umask(0)
     try:
@@ -108,7 +108,7 @@ def test_the_command_makes_a_key_that_is_not_overwritten(tmp_path, capsys):
         create_key_file(tmp_path / "no" / "a.key")
 
 
-def test_a_drivers_key_is_found_beside_its_file(tmp_path):
+def test_key_path_is_relative_to_the_driver_file(tmp_path):
     write(tmp_path / "a.key", KEY)
     (tmp_path / "driver.yaml").write_text('key_file: a.key\ncontrol_modes: [position, "off"]\n')
     driver = load_driver(tmp_path / "driver.yaml")

@@ -1,4 +1,4 @@
-"""A left arm's wrist mirrors a right arm's: in the equations, in files of real arms, in what is written."""
+"""Tests mirrored wrists of left and right arms: equations, files of real arms, exported models."""
 
 import dataclasses
 import xml.etree.ElementTree as ElementTree
@@ -51,7 +51,7 @@ def test_left_and_right_are_mirror_images():
 
 
 @pytest.mark.slow
-def test_the_wrists_brackets_are_on_the_sides_that_files_of_real_arms_say(shared_data):
+def test_wrist_brackets_are_on_the_sides_of_real_arms(shared_data):
     folder = shared_data / "gc_json"
     if not folder.is_dir():
         pytest.skip(f"needs {folder}")
@@ -62,7 +62,7 @@ def test_the_wrists_brackets_are_on_the_sides_that_files_of_real_arms_say(shared
 
 @pytest.mark.slow
 def test_the_papers_recording_is_of_a_right_arm(shared_data):
-    """A model of another right arm predicts it better as it is than as its mirror image."""
+    """Checks that a model of another right arm predicts the recording better unchanged than mirrored."""
     model = identify_static(
         read_recording(shared_data / "mtm_static/mtmr_2017_coupled12_may10.csv"), load_arm(PAPER_ARM)
     ).model
@@ -73,7 +73,7 @@ def test_the_papers_recording_is_of_a_right_arm(shared_data):
         assert as_it_is.rms_error_included < 0.5 * as_mirrored.rms_error_included
 
 
-def test_a_file_of_a_real_right_arm_mirrored_predicts_real_left_arms(shared_data):
+def test_mirrored_file_of_a_right_arm_predicts_left_arms(shared_data):
     folder = shared_data / "gc_json"
     if not folder.is_dir():
         pytest.skip(f"needs {folder}")
@@ -92,7 +92,7 @@ def stock(name):
     return IdentifiedModel.from_arm(load_arm(name))
 
 
-def test_compare_gc_refuses_a_file_that_names_another_arm(tmp_path, capsys):
+def test_compare_gc_refuses_a_file_of_another_arm(tmp_path, capsys):
     path = tmp_path / "gc.json"
     file = compensation_from_model(stock("mtml"), CompensationOptions(tolerance=0.01))
     file.save(path, "MTML", "test")
@@ -109,7 +109,7 @@ def test_compare_gc_refuses_a_file_that_names_another_arm(tmp_path, capsys):
     assert not messages(capsys.readouterr().err)
 
 
-def test_a_file_without_arm_is_of_that_in_its_file_name(tmp_path):
+def test_arm_is_taken_from_the_file_name_if_missing(tmp_path):
     file = compensation_from_model(stock("mtml"), CompensationOptions(tolerance=0.01))
     for name, arm in (("gc-MTML-12345.json", "MTML"), ("gc-mtmr.json", "MTMR"), ("gc.json", "")):
         file.save(tmp_path / name, "", "test")
@@ -124,7 +124,7 @@ REAL_FILES = [("MTML-22723", "mtml"), ("MTML-34863", "mtml"), ("MTMR-32336", "mt
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("serial", "side"), REAL_FILES)
-def test_the_numbers_of_a_real_file_tell_its_side(shared_data, serial, side):
+def test_side_is_detected_from_the_parameters_of_a_real_file(shared_data, serial, side):
     path = shared_data / "gc_json" / f"gc-{serial}.json"
     if not path.is_file():
         pytest.skip(f"needs {path}")
@@ -135,7 +135,7 @@ def test_the_numbers_of_a_real_file_tell_its_side(shared_data, serial, side):
         assert comparison.other_side == (name != side)
 
 
-def test_twice_mirrored_is_as_before_and_shapes_follow():
+def test_mirroring_twice_is_identity_and_mirrors_shapes():
     def read():
         return ElementTree.parse(MODELS_FOLDER / "sdf" / "mtm.sdf").getroot()
 
@@ -155,7 +155,7 @@ def test_twice_mirrored_is_as_before_and_shapes_follow():
     assert mesh.findtext("scale").split() == ["1", "1", "1"]
 
 
-def test_what_cannot_be_mirrored_is_named():
+def test_links_that_cannot_be_mirrored_are_named():
     root = ElementTree.fromstring('<sdf><model><link name="a"><visual><pose>1 2 3</pose></visual></link></model></sdf>')
     with pytest.raises(ArmError, match=r'x\.sdf: has no link "b" to mirror; its links: a'):
         mirror_links(root, ["b"], "x.sdf")

@@ -1,4 +1,4 @@
-"""The model files with Drake's own parser, without this package's code: the same arms as `load_arm` composes."""
+"""Tests the model files with Drake's own parser against the arms that `load_arm` composes."""
 
 import re
 import runpy
@@ -19,7 +19,7 @@ PSM = "package://dvrk_drake/directives/psm.dmd.yaml"
 
 
 def add_models(parser: Parser, name: str) -> None:
-    """Adds an arm to the parser's plant as docs/models_in_drake.md says."""
+    """Adds an arm to the parser's plant as described in docs/models_in_drake.md."""
     parser.package_map().AddMap(package_map())
     if name == "psm":
         parser.AddModels(url=PSM)
@@ -40,7 +40,7 @@ def plain_plant(name: str) -> MultibodyPlant:
 
 
 def positions(plant: MultibodyPlant, arm: Arm, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions of the plant at the arm's pose, and the index of each of the arm's tree joints."""
+    """Returns positions of the plant at the arm's pose, and the index of each of the arm's tree joints."""
     index = np.array([plant.GetJointByName(joint).position_start() for joint in arm.tree_joint_names])
     q_plant = np.zeros(plant.num_positions())
     q_plant[index] = arm.linkage.position(q)
@@ -48,7 +48,7 @@ def positions(plant: MultibodyPlant, arm: Arm, q: np.ndarray) -> tuple[np.ndarra
 
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
-def test_drakes_parser_gives_the_arm_that_load_arm_composes(name):
+def test_drake_parser_and_load_arm_give_the_same_arm(name):
     arm = load_arm(name)
     ours, plain = make_arm_plant(arm), plain_plant(name)
     assert plain.num_positions() == ours.num_positions() == len(arm.tree_joint_names)
@@ -76,7 +76,7 @@ def test_limits_are_those_of_the_arm(name):
 
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
-def test_links_do_not_touch_each_other_and_the_linkage_follows_in_a_simulation(name):
+def test_simulated_links_do_not_collide_and_linkage_follows(name):
     arm = load_arm(name)
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
@@ -105,7 +105,7 @@ def test_model_directives_can_be_processed():
 
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr"])
-def test_files_of_the_masters_are_those_that_the_tool_makes(name):
+def test_mtm_files_equal_the_output_of_the_tool(name):
     tool = runpy.run_path(str(ROOT / "tools/make_master_sdfs.py"))
     assert (MODELS_FOLDER / "sdf" / f"{name}.sdf").read_text() == tool["master_sdf"](load_arm(name))
 

@@ -1,4 +1,4 @@
-"""The MTM's SDF against the dVRK's DH table, the paper's Table I, and mechanics."""
+"""Tests the MTM's SDF against the dVRK's DH table, the paper's Table I, and mechanics."""
 
 import numpy as np
 import pytest
@@ -93,7 +93,7 @@ def test_crank_follows_the_forearm_and_coupler_the_upper_arm(arm, plant):
     np.testing.assert_allclose(rotation("coupler_link"), rotation("upper_arm_link"), atol=1e-12)
 
 
-def test_inertias_are_possible_and_centres_of_mass_are_not_at_the_joints(plant):
+def test_inertias_are_consistent_and_centres_of_mass_off_joints(plant):
     for index in plant.GetBodyIndices(plant.GetBodyByName("base_link").model_instance()):
         body = plant.get_body(index)
         if body.name() == "base_link":
@@ -112,7 +112,7 @@ def test_inertias_are_possible_and_centres_of_mass_are_not_at_the_joints(plant):
 
 
 def test_motor_4_couples_elbow_and_platform(arm, plant):
-    """Rotor 4 turns with 0.6697 q3 + q4: its inertia enters G' M G as J_4' I J_4, off-diagonal included."""
+    """Checks that the inertia of rotor 4, which turns with 0.6697 q3 + q4, enters G' M G as J_4' I J_4."""
     context = plant.CreateDefaultContext()
     G = np.zeros((plant.num_velocities(), 7))
     G[tree_selector(plant, arm)] = arm.linkage.matrix
@@ -146,8 +146,8 @@ def test_holding_torque_is_the_gradient_of_potential_energy(arm, plant):
         np.testing.assert_allclose(holding_torque(plant, context, arm), gradient, atol=1e-8)
 
 
-def test_loop_closed_by_a_pin_needs_the_same_holding_torque(arm, plant):
-    """The variant without mimics on the loop: statics by the null space of its numerical constraint Jacobian."""
+def test_pinned_loop_has_the_same_holding_torque(arm, plant):
+    """Compares the variant without loop mimics: statics by the null space of its numerical constraint Jacobian."""
     loop_plant = make_arm_plant(arm, closure="ball")
     assert loop_plant.num_constraints() == plant.num_constraints()  # two mimics less; a pin and a length more
     (loop,) = arm.loop_closures
@@ -221,7 +221,7 @@ def test_left_and_right_share_the_mechanism_and_differ_in_limits():
 
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr"])
-def test_arm_limits_lie_inside_what_the_sdf_allows(name):
+def test_arm_limits_are_within_sdf_limits(name):
     arm = load_arm(name)
     plant = make_arm_plant(arm)
     from pydrake.multibody.parsing import Parser
@@ -246,7 +246,7 @@ def test_sampled_poses_respect_all_limits(arm):
     assert arm.limit_violations([0, 1.0, 0.5, 0, 0, 0, 0]) == ["parallelogram = 1.5 is outside -0.33..0.68"]
 
 
-def test_an_arm_whose_box_misses_its_coupled_limit_is_refused(arm):
+def test_arm_that_cannot_meet_its_coupled_limit_is_refused(arm):
     import dataclasses
 
     lower = arm.position_lower.copy()
@@ -255,7 +255,7 @@ def test_an_arm_whose_box_misses_its_coupled_limit_is_refused(arm):
         dataclasses.replace(arm, position_lower=lower)
 
 
-def test_an_arm_whose_box_hardly_meets_its_coupled_limit_cannot_be_sampled(arm):
+def test_sampling_fails_if_coupled_limit_is_rarely_met(arm):
     import dataclasses
 
     lower = arm.position_lower.copy()

@@ -1,4 +1,4 @@
-"""Every number of every file and setting has a range; NaN, infinity and what is outside are refused, with the key."""
+"""Tests that every number of every file and setting has a range, and that NaN, infinity and outliers are refused."""
 
 import dataclasses
 import math
@@ -80,14 +80,14 @@ def key_of(path) -> str:
 
 
 def nested(path, value):
-    """Content of a file that has nothing but `value` at `path`."""
+    """Returns the content of a file that contains only `value` at `path`."""
     for part in reversed(path):
         value = [value] if part == 0 else {part: value}
     return value
 
 
 def outside(allowed: Range) -> float:
-    """The nearest number above the range."""
+    """Returns the smallest number above the range."""
     return allowed.high + 1 if isinstance(allowed.high, int) else float(np.nextafter(allowed.high, np.inf))
 
 
@@ -95,7 +95,7 @@ IN_FILES = {f"{schema.__name__}.{key_of(p)}": (schema, p, f, k) for schema in FI
 IN_OBJECTS = {f"{schema.__name__}.{key_of(p)}": (p, f) for schema in OBJECTS for p, f, _ in numbers_of(schema)}
 
 
-def test_no_schema_is_passed_over():
+def test_all_schemas_are_covered():
     assert len(IN_FILES) > 120
     assert len(IN_OBJECTS) > 50
     assert {"ModelFile.joints[0].feedforward_scale", "DvrkDriver.guard.expiry", "Mechanism.gains.kp[0]"} <= set(
@@ -138,7 +138,7 @@ def test_an_arm_with_a_number_outside_its_range_is_refused(name, value):
 
 
 def changed(owner, path, value):
-    """`owner` with `value` at `path`."""
+    """Returns `owner` with `value` at `path`."""
     if not path:
         return np.full_like(owner, value) if isinstance(owner, np.ndarray) else value
     first, *rest = path
@@ -186,7 +186,7 @@ def test_gains_are_compared_with_the_effort_limit_and_the_range():
 
 @pytest.fixture
 def own_psm(tmp_path):
-    """Writes the PSM as files of one's own, with changes; returns the path of the arm."""
+    """Writes modified files of a PSM; returns the path of the arm file."""
 
     def write(changes=(), sdf=()):
         for kind, name in (("arm", "psm"), ("mechanism", "psm"), ("instrument", "large_needle_driver")):
@@ -297,7 +297,7 @@ def test_absurd_numbers_in_an_sdf_are_refused(element, value, message, own_psm, 
     assert refusal(capsys.readouterr().err)
 
 
-def test_a_pose_in_degrees_that_says_so_is_read(own_psm):
+def test_pose_with_degrees_attribute_is_read(own_psm):
     path = own_psm(sdf=("<pose>[^<]*", '<pose degrees="true">0 0 0 90 0 0'))
     assert load_arm(str(path)).num_joints == 7
 
@@ -345,7 +345,7 @@ def test_units_in_the_file_of_a_driver_are_checked(text, message, tmp_path):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 0.0, -1.0])
 @pytest.mark.parametrize("name", ["effort_limits", "position_upper", "kp"])
-def test_a_guard_refuses_an_arm_that_was_changed_after_it_was_made(name, value):
+def test_guard_refuses_an_arm_changed_after_creation(name, value):
     arm = load_arm("mtml")
     arm = dataclasses.replace(
         arm,
@@ -359,7 +359,7 @@ def test_a_guard_refuses_an_arm_that_was_changed_after_it_was_made(name, value):
         CommandGuard(arm, 1, Weightless())
 
 
-def test_other_numbers_of_an_arm_made_in_python_are_refused():
+def test_invalid_numbers_of_an_arm_made_in_python_are_refused():
     arm = load_arm("mtml")
     never = CoupledLimit("never", {"outer_yaw": 0.0}, 0.0, 1.0)
     for changes, message in (
@@ -376,7 +376,7 @@ def test_other_numbers_of_an_arm_made_in_python_are_refused():
             dataclasses.replace(arm, **changes)
 
 
-def test_what_a_range_says():
+def test_messages_of_ranges():
     assert str(Range(0.5, 2.0, "s")) == "0.5..2 s"
     assert str(Range(0.5, 2.0, also=(0.0,), either_sign=True)) == "0 or 0.5..2 of either sign"
     assert str(Range(0, 10**6)) == "0..1000000"
@@ -398,7 +398,7 @@ class Outer:
     free: float = 0.0
 
 
-def test_the_first_number_in_an_object_that_is_refused_is_named():
+def test_first_refused_number_of_an_object_is_named():
     good = Outer(Inner({"a": [0.5]}), np.zeros((2, 2)))
     assert number_fault(good) == ""
     assert (

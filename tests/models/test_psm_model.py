@@ -1,4 +1,4 @@
-"""The PSM's SDF against the dVRK's DH table, and its linkage: closed, with a still remote centre of motion."""
+"""Tests the PSM's SDF against the dVRK's DH table, and its linkage with a fixed remote centre of motion."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def plant(arm):
 
 @pytest.fixture(scope="module")
 def box(arm):
-    """Random poses and the corners of the first three joints' box."""
+    """Returns random poses and the corners of the limits of the first three joints."""
     poses = np.random.default_rng(0).uniform(arm.position_lower, arm.position_upper, (200, 7))
     corners = np.array(np.meshgrid(*zip(arm.position_lower[:3], arm.position_upper[:3], strict=True))).reshape(3, -1).T
     poses[: len(corners), :3] = corners
@@ -64,7 +64,7 @@ def test_forward_kinematics_equals_the_dvrks_table(arm, plant, box):
             )
 
 
-def test_linkage_is_closed_and_the_remote_centre_stands_still(arm, plant, box):
+def test_linkage_is_closed_and_remote_centre_is_fixed(arm, plant, box):
     context = plant.CreateDefaultContext()
     assert len(arm.loop_closures) == 2
     for q in box:
@@ -76,7 +76,7 @@ def test_linkage_is_closed_and_the_remote_centre_stands_still(arm, plant, box):
         assert np.linalg.norm(center) < 1e-12
 
 
-def test_fingers_stand_at_plus_and_minus_half_of_the_jaw(arm, plant):
+def test_fingers_are_at_plus_and_minus_half_of_the_jaw(arm, plant):
     context = plant.CreateDefaultContext()
     set_arm_positions(plant, context, arm, [0.1, 0.2, 0.1, 0.3, 0.4, 0.5, 0.8])
     wrist = plant.GetBodyByName("wrist_yaw_link").EvalPoseInWorld(context).rotation()
@@ -111,7 +111,7 @@ def test_holding_torque_is_the_gradient_of_potential_energy(arm, plant, box):
         np.testing.assert_allclose(holding_torque(plant, context, arm), gradient, atol=1e-8)
 
 
-def test_inertias_are_possible(plant):
+def test_inertias_are_physically_consistent(plant):
     for index in plant.GetBodyIndices(plant.GetBodyByName("base_link").model_instance()):
         body = plant.get_body(index)
         if body.name() != "base_link":

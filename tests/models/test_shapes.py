@@ -1,4 +1,4 @@
-"""Visual geometry: every link has some, it is small, and neighbours meet at their pivots."""
+"""Tests visual geometry: every link has small meshes, and neighbouring links meet at their joints."""
 
 import json
 import re
@@ -25,7 +25,7 @@ MESHES = sorted((SDF / "meshes").glob("*/*.gltf"))
 
 
 def vertices(mesh):
-    """Vertices (n, 3) [m] in the link's frame, Z up."""
+    """Returns the vertices (n, 3) [m] in the link's frame, Z up."""
     document = json.loads(mesh.read_text())
     data = b64decode(document["buffers"][0]["uri"].partition(",")[2])
     parts = []
@@ -43,7 +43,7 @@ def plant():
 
 @pytest.fixture(scope="module")
 def psm_vertices():
-    """Link of the PSM or its instrument -> all vertices drawn on it."""
+    """Returns a mapping from each link of the PSM or its instrument to all its drawn vertices."""
     found = {}
     for link in compose_sdf(load_arm("psm").sdf).iter("link"):
         meshes = [Path(str(uri.text).replace("package://dvrk_drake", str(MODELS_FOLDER))) for uri in link.iter("uri")]
@@ -64,7 +64,7 @@ def test_every_mesh_is_used_and_small():
         assert sum(sizes) < 2.5e6
 
 
-def test_every_link_of_psm_and_instrument_is_drawn_and_has_a_collision_shape():
+def test_psm_links_have_visual_and_collision_shapes():
     arm = load_arm("psm")
     plant, scene_graph = MultibodyPlant(1e-3), SceneGraph()
     plant.RegisterAsSourceForSceneGraph(scene_graph)
@@ -118,7 +118,7 @@ def test_links_on_shafts_and_slides_touch_at_both_ends(plant, psm_vertices, pare
         assert (low.max(axis=0) < high.min(axis=0)).all()
 
 
-def test_shaft_and_cannula_hold_the_remote_centre_at_every_pose(plant, psm_vertices):
+def test_shaft_and_cannula_pass_through_the_remote_centre(plant, psm_vertices):
     arm, context = load_arm("psm"), plant.CreateDefaultContext()
     poses = np.random.default_rng(1).uniform(arm.position_lower, arm.position_upper, (50, 7))
     poses[:, 2] = np.maximum(poses[:, 2], 0.02)  # above, the wrist is inside the cannula
@@ -146,8 +146,8 @@ NEIGHBOURS = (
 )
 
 
-def test_links_keep_apart_over_the_joint_box():
-    """With the collision shapes and without the filter that an arm has; Drake leaves out links that a joint joins."""
+def test_links_do_not_collide_within_the_joint_limits():
+    """Checks collision shapes without the arm's collision filters. Drake excludes pairs of links that share a joint."""
     arm = load_arm("psm")
     root = compose_sdf(arm.sdf, arm.mirrored_links)
     (model,) = root.findall("model")
@@ -175,18 +175,18 @@ def test_links_keep_apart_over_the_joint_box():
 
 
 def limits(arm):
-    """Lower and upper, the jaw from closed on: below, its fingers press on each other."""
+    """Returns lower and upper limits. The jaw starts closed, because below that its fingers press on each other."""
     return np.append(arm.position_lower[:6], 0.0), arm.position_upper
 
 
 def box_corners(arm):
-    """Corners of the box of yaw, pitch and insertion."""
+    """Returns the corners of the limits of yaw, pitch and insertion."""
     corners = np.zeros((8, 7))
     corners[:, :3] = list(product(*zip(arm.position_lower[:3], arm.position_upper[:3], strict=True)))
     return corners
 
 
-def test_an_instrument_gives_the_arms_links_shapes_only(tmp_path):
+def test_instrument_adds_only_shapes_to_links_of_the_arm(tmp_path):
     instrument = tmp_path / "instrument.sdf"
     shape = "<geometry><sphere><radius>0.01</radius></sphere></geometry>"
     text = '<sdf version="1.9"><model name="i"><link name="insertion_link">{}</link></model></sdf>'

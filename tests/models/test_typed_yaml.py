@@ -1,4 +1,4 @@
-"""Files of settings: what does not fit is named with its key, its value and what is allowed, however deep it stands."""
+"""Tests settings files: errors name the key, its value and the accepted values at any depth."""
 
 from dataclasses import dataclass, field
 
@@ -14,7 +14,7 @@ from dvrk_drake.models.typed_yaml import load_typed_yaml, parse_yaml, typed_cont
 
 
 def own_psm(folder):
-    """The PSM as three files of one's own in `folder`."""
+    """Writes the three files of a PSM into `folder`."""
     for kind, name in (("arm", "psm"), ("mechanism", "psm"), ("instrument", "large_needle_driver")):
         text = (MODELS_FOLDER / f"{kind}s" / f"{name}.yaml").read_text()
         text = text.replace("mechanism: psm", "mechanism: mechanism.yaml")
@@ -66,7 +66,7 @@ def test_the_files_themselves_are_read(tmp_path):
         ("instrument", ("sdf:", "sdf: [\n"), "instrument.yaml:"),
     ],
 )
-def test_a_slip_is_named_with_its_file_and_what_is_allowed(file, change, message, tmp_path):
+def test_error_names_file_and_accepted_values(file, change, message, tmp_path):
     arm, path = own_psm(tmp_path), tmp_path / f"{file}.yaml"
     text = path.read_text()
     assert change[0] in text
@@ -105,8 +105,8 @@ class Outer:
         *("table: {a: [1]}", "table: {a: [b]}", "table: [1]", "table:", "inner: {number: x}", "inner:"),
     ],
 )
-def test_reads_and_refuses_what_drake_does(line):
-    """The texts are ours, what is allowed is Drake's to say, except that numbers must be finite."""
+def test_accepts_the_same_content_as_drake(line):
+    """Checks that the same content is accepted as by Drake, except that numbers must be finite."""
     try:
         expected = yaml_load_typed(schema=Outer, data=line)
     except Exception:
@@ -118,19 +118,19 @@ def test_reads_and_refuses_what_drake_does(line):
         assert typed_content(Outer, content, "here", ArmError, "a test") == expected
 
 
-def test_what_drake_takes_letter_by_letter_is_refused():
+def test_text_in_place_of_a_list_is_refused():
     assert yaml_load_typed(schema=Outer, data="sizes: '12'").sizes == [1.0, 2.0]
     assert schema_fault(Outer, {"sizes": "12"}, "a test") == 'sizes is "12"; allowed: a list of numbers, e.g. [12]'
 
 
-def test_a_key_that_stands_twice_is_refused():
+def test_duplicate_key_is_refused():
     for text, line in (("a: 1\nb: 2\na: 3\n", 3), ("b:\n  c: {d: 1, d: 2}\n", 2)):
         with pytest.raises(ArmError, match=rf'own.yaml: not YAML: line {line}: key "[ad]" is there twice'):
             parse_yaml(text, "own.yaml", ArmError)
     assert parse_yaml("a: &x {c: 1}\nb: {<<: *x, c: 2}\n", "own.yaml", ArmError)["b"] == {"c": 2}
 
 
-def test_files_that_are_no_text_or_not_there_are_refused(tmp_path):
+def test_missing_and_binary_files_are_refused(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_bytes(b"name: \xff")
     for where, message in (

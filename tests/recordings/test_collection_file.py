@@ -1,4 +1,4 @@
-"""The file of a collection grows by whole rows, and is gone on with whatever ended it."""
+"""Tests that the file of a collection grows by complete rows and can be continued after any interruption."""
 
 import signal
 import subprocess
@@ -41,7 +41,7 @@ def test_a_collection_is_a_recording_and_goes_on(name, both_sides, tmp_path):
 
 
 @pytest.mark.parametrize("cut", [1, 50, 10_000])
-def test_a_row_that_a_power_failure_cut_is_measured_again(cut, tmp_path):
+def test_incomplete_last_row_is_measured_again(cut, tmp_path):
     arm, path = load_arm("mtml"), tmp_path / "o.csv"
     poses = random_poses(arm, 3)
     append_all(path, arm, poses)
@@ -57,7 +57,7 @@ def test_a_row_that_a_power_failure_cut_is_measured_again(cut, tmp_path):
     assert rows == [line.rsplit(",", 8)[0] for line in whole.decode().splitlines()]
 
 
-def test_an_output_of_something_else_is_refused_and_stays(tmp_path):
+def test_other_existing_output_is_refused_and_unchanged(tmp_path):
     arm, path = load_arm("mtml"), tmp_path / "o.csv"
     poses = random_poses(arm, 3)
     append_all(path, arm, poses)
@@ -78,8 +78,8 @@ def test_an_output_of_something_else_is_refused_and_stays(tmp_path):
     path.write_bytes(before)
 
 
-def test_all_that_was_written_survives_kill(tmp_path):
-    """A process that appends until it is killed: whole rows, in order, no gap."""
+def test_written_rows_survive_kill(tmp_path):
+    """Kills a process that appends rows: rows are complete, in order and without gaps."""
     code = (
         "import sys\nfrom dvrk_drake.recordings.csv_rows import GrowingFile\n"
         "file, k = GrowingFile(sys.argv[1], sync=True), 0\n"

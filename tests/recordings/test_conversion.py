@@ -1,4 +1,4 @@
-"""Public recordings become ours: exactly, by the right reader, and never over a file that is needed."""
+"""Tests the conversion of public recordings: exact values, format detection, protection of existing files."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ TIMED = "t,q1,q2,q3,q4,q5,q6,q7,qd1,qd2,qd3,qd4,qd5,qd6,qd7,tau1,tau2,tau3,tau4,
 
 
 def write_timed(folder, times, header=TIMED):
-    """A CSV with a header, one row for each text in `times`; every other number is known."""
+    """Writes a CSV with a header, one row for each text in `times`; all other numbers are known."""
     rows = wpi_rows(len(times))
     lines = [",".join([str(t), *(repr(float(x)) for x in row)]) for t, row in zip(times, rows, strict=True)]
     return write_text(folder, "\n".join([header, *lines]) + "\n"), rows
@@ -121,7 +121,7 @@ def write_timed(folder, times, header=TIMED):
 
 @pytest.mark.parametrize("coordinates", ["joint", "actuator"])
 def test_our_csv_keeps_time_stamps_columns_and_coordinates(tmp_path, coordinates):
-    """100 Hz over a minute: 59.98 s stay 59.98 s."""
+    """Checks a minute at 100 Hz: 59.98 s remains 59.98 s."""
     path, rows = write_timed(tmp_path, [0.01 * k for k in range(5999)])
     recording = convert(path, tmp_path / "out.csv", coordinates=coordinates)
     assert recording.coordinates == coordinates
@@ -133,7 +133,7 @@ def test_our_csv_keeps_time_stamps_columns_and_coordinates(tmp_path, coordinates
     assert any("pass --coordinates actuator" in note for note in recording.notes) == (coordinates == "actuator")
 
 
-def test_unknown_coordinates_are_asked_for_not_guessed(tmp_path):
+def test_coordinates_are_required_if_undefined(tmp_path):
     path, _ = write_timed(tmp_path, [0, 0.01])
     for format in (None, "csv"):
         assert_refused(
@@ -173,7 +173,7 @@ def test_a_rate_is_refused_where_the_file_has_time_stamps(tmp_path):
 
 
 def test_our_csv_is_read_as_wpi_csv_with_its_times(tmp_path):
-    """As converted before without --arm: of a PSM only this format says what its roll is."""
+    """Reads a file converted without --arm. For a PSM only this format defines the coordinate of the roll."""
     path, rows = write_timed(tmp_path, [0, 0.011, 0.019])
     recording = convert(path, tmp_path / "out.csv", format="wpi-csv")
     assert recording.coordinates == "actuator"

@@ -1,4 +1,4 @@
-"""LCM logs as recordings: the numbers, what is left out and said, and every damage that a log can have."""
+"""Tests LCM logs as recordings: values, notes on omitted messages, and damaged logs."""
 
 import resource
 
@@ -91,8 +91,8 @@ def test_a_damaged_event_is_left_out_and_the_rest_is_read(tmp_path, begin, repla
     assert recording.notes[1] == f"messages lost on the way, missing in the sequence: {10 - len(kept)}"
 
 
-def test_no_damage_stops_the_reader_or_lets_wrong_numbers_through_unseen(tmp_path):
-    """Bytes of a number may change unseen, an LCM log has no checksum; but rows stay in order and of one arm."""
+def test_damaged_logs_are_read_or_refused(tmp_path):
+    """Damages logs. Changed numbers can go undetected without a checksum, but rows stay in order and of one arm."""
     whole = log_bytes(statuses(12))
     generator, read = np.random.default_rng(3), 0
     for _ in range(300):
@@ -118,7 +118,7 @@ def test_no_damage_stops_the_reader_or_lets_wrong_numbers_through_unseen(tmp_pat
 
 
 def changed(k, **changes):
-    """Statuses of which the k-th is changed."""
+    """Returns statuses of which the k-th is changed."""
     result = statuses()
     for name, value in changes.items():
         setattr(result[k], name, value)
@@ -139,7 +139,7 @@ def changed(k, **changes):
         ([*statuses()[:7], *statuses()[8:]], "messages lost on the way, missing in the sequence: 1"),
     ],
 )
-def test_what_cannot_be_used_is_left_out_and_noted(tmp_path, messages, note):
+def test_unusable_statuses_are_omitted_and_noted(tmp_path, messages, note):
     recording = read_recording(write_log(tmp_path / "a.log", messages), ARM)
     assert_same_numbers(recording, [*statuses()[:7], *statuses()[8:]])
     assert any(n.startswith(note) for n in recording.notes), recording.notes
@@ -174,7 +174,7 @@ def test_the_arm_is_chosen_among_several(tmp_path):
         ([b""], "is empty"),
     ],
 )
-def test_a_log_without_the_arm_says_what_it_has(tmp_path, parts, message):
+def test_log_without_the_arm_lists_its_arms(tmp_path, parts, message):
     with pytest.raises(RecordingError, match=message):
         read_recording(write_log(tmp_path / "a.log", *parts), ARM)
 
@@ -188,7 +188,7 @@ def test_a_log_is_in_joint_coordinates(tmp_path):
 
 
 def test_commands_read_a_log_as_they_read_a_csv(tmp_path, capsys):
-    """One status a pose, a second apart: a log of poses at rest."""
+    """Uses one status per pose, one second apart: a log of static poses."""
     truth = IdentifiedModel.from_arm(ARM)
     messages = statuses(40)
     for k, status in enumerate(messages):
@@ -213,8 +213,8 @@ def test_commands_read_a_log_as_they_read_a_csv(tmp_path, capsys):
     assert "has no status of PSM (channel DVRK_STATUS_PSM); it has DVRK_STATUS_MTML (40)" in capsys.readouterr().err
 
 
-def test_a_log_of_a_moving_arm_identifies_it_by_its_rests(tmp_path, capsys):
-    """At 1 kHz from pose to pose, with a friction on the way that would spoil a model."""
+def test_log_of_a_moving_arm_is_identified_by_static_segments(tmp_path, capsys):
+    """Identifies from a log at 1 kHz with motions between poses, whose friction would falsify a model."""
     generator = np.random.default_rng(5)
     recording = motion_with_pauses(ARM, ARM.sample_poses(16, generator, margin=0.05), generator, 1.0, 1.0, 1000.0)
     messages = []
@@ -262,7 +262,7 @@ def test_a_growing_file_is_whole_after_every_message(tmp_path, suffix):
         open_recording_file(path, ARM, stream)
 
 
-def test_a_recording_is_refused_where_it_cannot_be(tmp_path):
+def test_unwritable_outputs_are_refused(tmp_path):
     for name, message in {"a.txt": r"must end in \.csv or \.log", "no/a.csv": "its folder does not exist"}.items():
         with pytest.raises(RecordingError, match=message):
             open_recording_file(tmp_path / name, ARM, StatusStream("MTML", N))

@@ -1,4 +1,4 @@
-"""Files of poses: what is written comes back, what is wrong is said in one line."""
+"""Tests files of poses: exact round trip, and errors of one line."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ GOOD = "0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5"
         ("arm: MTML\nposes:\n- [0.1, 0.7, 0.3, 0, 0, 0, 0]", "pose 1: parallelogram = 1 is outside"),
     ],
 )
-def test_bad_files_of_poses_are_one_line(text, message, tmp_path, capsys):
+def test_bad_files_of_poses_are_refused_in_one_line(text, message, tmp_path, capsys):
     path, output = tmp_path / "p.yaml", tmp_path / "o.csv"
     path.write_text(text)
     with pytest.raises(CollectionError, match=message):
@@ -66,7 +66,7 @@ def test_millimetres_are_suspected(tmp_path):
         load_poses(tmp_path / "p.yaml", load_arm("psm"))
 
 
-def test_random_poses_are_added_and_the_seed_says_which(tmp_path):
+def test_random_poses_are_appended_and_depend_on_the_seed(tmp_path):
     path, arm = tmp_path / "p.yaml", load_arm("psm")
     command = ["collect", "--arm", "psm", "--poses", str(path), "--random"]
     assert main([*command, "5", "--seed", "3"]) == 0

@@ -1,4 +1,4 @@
-"""The lines of Python that docs/public_recordings.md offers."""
+"""Tests the Python code in docs/public_recordings.md."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def document_functions() -> dict[str, object]:
     return namespace
 
 
-def test_the_document_writes_measured_js_as_a_recording_that_reads_back(tmp_path):
+def test_documented_code_for_measured_js(tmp_path):
     q, qd, tau = np.random.default_rng(4).normal(size=(3, 6, 8))
     messages = [
         SimpleNamespace(
@@ -41,7 +41,7 @@ def test_the_document_writes_measured_js_as_a_recording_that_reads_back(tmp_path
 
 
 @pytest.mark.parametrize("average", [False, True])
-def test_the_document_writes_the_2017_pairs_as_a_recording_that_reads_back(tmp_path, average):
+def test_documented_code_for_2017_pairs(tmp_path, average):
     position, effort = np.random.default_rng(5).normal(size=(2, 8, 10, 4))
     effort[:, :, 3] = 0
     document_functions()["write_2017"](position, effort, tmp_path / "poses.csv", average)

@@ -1,4 +1,4 @@
-"""Recordings as CSV: what is read and refused."""
+"""Tests reading recordings from CSV."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_blank_lines_do_not_shift_line_numbers(tmp_path):
         read_recording(path)
 
 
-def test_reads_positions_only_and_says_so_when_efforts_are_wanted(tmp_path):
+def test_missing_efforts_are_reported_when_required(tmp_path):
     path = write_text(tmp_path, ",".join(Q_NAMES) + "\n" + ",".join(["0"] * 7) + "\n")
     recording = read_recording(path)
     with pytest.raises(RecordingError, match=r"recording\.csv: has no efforts; needs columns tau1\.\.tau7"):
@@ -126,7 +126,7 @@ def test_six_joints(tmp_path):
         read_recording(write_text(tmp_path, f"{HEADER}\n{ROW}"), arm=six_joint_arm())
 
 
-def test_files_that_are_none(tmp_path):
+def test_non_files_are_refused(tmp_path):
     with pytest.raises(RecordingError, match=r"absent\.csv: no such file"):
         read_recording(tmp_path / "absent.csv")
     with pytest.raises(RecordingError, match="is not a file"):

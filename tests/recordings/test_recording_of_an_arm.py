@@ -1,4 +1,4 @@
-"""Whether a recording fits an arm, in whatever coordinates, and real ones that do."""
+"""Tests whether recordings, including real ones, match an arm in joint or actuator coordinates."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_prismatic_joint_in_millimetres_is_suspected():
         Recording(q=q).check_fits(arm)
 
 
-def test_a_prismatic_joint_is_given_millimetres_of_tolerance_where_others_have_milliradians():
+def test_tolerance_of_a_prismatic_joint_is_in_millimetres():
     arm = load_arm("psm")
     q = np.zeros((1, 7))
     q[0, 2] = 0.25
@@ -63,7 +63,7 @@ def test_motion_is_judged_by_the_joints_own_kind():
     assert Recording(q=np.zeros((10, 7)), qd=qd[:, ::-1][:, [0, 1, 2, 4, 3, 5, 6]]).motion(arm) == ""
 
 
-def test_one_bad_pose_is_named_and_not_taken_for_degrees():
+def test_one_bad_pose_is_not_reported_as_degrees():
     q = np.zeros((10, 7))
     q[3, 1] = 1.5
     recording = Recording(q=q, source="day.csv", lines=np.arange(2, 12))
@@ -72,7 +72,7 @@ def test_one_bad_pose_is_named_and_not_taken_for_degrees():
         recording.check_fits(load_arm("mtmr"))
 
 
-def test_a_right_arm_is_not_a_left_arm():
+def test_recording_of_a_right_arm_does_not_fit_a_left_arm():
     q = np.zeros((3, 7))
     q[:, 3] = 3.4
     Recording(q=q).check_fits(load_arm("mtmr"))

@@ -1,4 +1,4 @@
-"""Writing at once or not at all, and reading back exactly what was written."""
+"""Tests atomic writing and exact round trips."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_what_is_written_reads_back_exactly(tmp_path, absent):
     assert (tmp_path / "out.csv").read_bytes().count(b"\r") == 0
 
 
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
+def test_failed_write_keeps_the_old_file(tmp_path):
     path = tmp_path / "out.csv"
     write_csv(path, ["a"], np.ones((1, 1)))
     before = path.read_bytes()
@@ -45,7 +45,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_write_that_fails_makes_no_file(tmp_path):
+def test_failed_write_creates_no_file(tmp_path):
     with pytest.raises(ZeroDivisionError), atomic_write(tmp_path / "out.csv") as stream:
         stream.write("half")
         stream.flush()
@@ -66,14 +66,14 @@ def test_places_that_cannot_be_written(tmp_path):
     assert stat.S_ISCHR(os.stat(os.devnull).st_mode)
 
 
-def test_a_full_disk_is_an_error_of_ours(tmp_path):
+def test_full_disk_raises_a_package_error(tmp_path):
     match = r"out\.csv: cannot be written: No space left"
     with pytest.raises(DvrkDrakeError, match=match), atomic_write(tmp_path / "out.csv"):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_other_errors_of_the_caller_stay_what_they_are(tmp_path):
+def test_other_errors_of_the_caller_are_unchanged(tmp_path):
     with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "out.csv"):
         (tmp_path / "absent").read_text()
 
@@ -102,7 +102,7 @@ def test_links_and_permissions_survive(tmp_path):
     assert stat.S_IMODE(path.stat().st_mode) == 0o640
 
 
-def test_a_new_file_has_the_permissions_that_the_user_wants(tmp_path):
+def test_new_file_has_the_permissions_of_the_umask(tmp_path):
     old = os.umask(0o027)
     try:
         with atomic_write(tmp_path / "out.bin", "wb") as stream:

@@ -1,4 +1,4 @@
-"""Arrays of 8 x 2 x N in MATLAB's files: what is read, and what can be wrong with them."""
+"""Tests reading arrays of 8 x 2 x N from MATLAB files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dvrk_drake.recordings.public_formats import read_team_mat
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_team_mat_takes_joints_from_axis_0_and_position_and_effort_from_axis_1(tmp_path, compressed):
+def test_team_mat_axes(tmp_path, compressed):
     path = tmp_path / "poses.mat"
     scipy.io.savemat(path, {"any_name": team_array(), "n": 5, "label": "x"}, do_compression=compressed)
     recording = read_team_mat(path)
@@ -47,13 +47,13 @@ def test_team_mat_of_matlab_4_has_no_signature_but_its_name(tmp_path):
     assert len(read_team_mat(path)) == 1
 
 
-def test_team_mat_with_several_candidates_lists_them_and_takes_a_choice(tmp_path):
+def test_team_mat_with_several_candidates_requires_a_choice(tmp_path):
     path = write_mat(tmp_path, data=team_array(10), saved_data=team_array(3), n=10)
     assert_refused(r"poses\.mat: several variables fit: data, saved_data; .*--variable NAME", read_team_mat, path)
     assert len(read_team_mat(path, variable="saved_data")) == 3
 
 
-def test_team_mat_refuses_a_variable_that_is_absent_or_does_not_fit(tmp_path):
+def test_team_mat_refuses_absent_or_unsuitable_variables(tmp_path):
     path = write_mat(tmp_path, a=team_array(), b=np.ones((8, 10, 4)))
     assert_refused(r"has no variable c; it has: a \(8 x 2 x 5 double\)", read_team_mat, path, variable="c")
     assert_refused(r"variable b must be 8 x 2 x N .* b \(8 x 10 x 4 double\)", read_team_mat, path, variable="b")
@@ -92,7 +92,7 @@ def test_team_mat_of_version_7_3_is_refused_with_a_remedy(tmp_path):
 
 
 def test_team_mat_with_numbers_of_another_machine_is_refused(tmp_path):
-    """MATLAB 4 on a VAX: scipy warns that what it returns may be corrupt."""
+    """Uses the MATLAB 4 format of a VAX, for which scipy warns that returned data may be corrupt."""
     path = tmp_path / "data.mat"
     path.write_bytes(struct.pack("<5i", 2000, 8, 2, 0, 2) + b"a\0" + bytes(8 * 2 * 8))
     with warnings.catch_warnings():
@@ -119,7 +119,7 @@ def test_team_mat_that_is_damaged_is_refused(tmp_path, damage):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_team_mat_refuses_invalid_poses_or_skips_and_counts_them(tmp_path, value):
+def test_team_mat_refuses_or_skips_invalid_poses(tmp_path, value):
     array = team_array(6)
     array[4, 1, 2] = value
     array[0, 0, 5] = np.nan
@@ -147,7 +147,7 @@ def test_team_mat_refuses_poses_that_were_never_recorded(tmp_path):
     assert_refused("variable a has no valid pose among its 3", read_team_mat, nothing, skip_invalid=True)
 
 
-def test_team_mat_does_not_mind_the_gripper(tmp_path):
+def test_team_mat_ignores_the_gripper(tmp_path):
     array = team_array()
     array[7] = np.nan
     assert len(read_team_mat(write_mat(tmp_path, a=array))) == 5

@@ -1,4 +1,4 @@
-"""CSV of 21 columns without a header: what is read, and what can be wrong with it."""
+"""Tests reading CSVs of 21 columns without a header."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_wpi_csv_refuses_other_rates(tmp_path, rate):
     assert_refused("rate must be a positive number of Hz", read_wpi_csv, write_wpi(tmp_path, wpi_rows()), rate=rate)
 
 
-def test_wpi_csv_skips_invalid_rows_and_keeps_the_time_of_the_others(tmp_path):
+def test_wpi_csv_skips_invalid_rows_and_keeps_times(tmp_path):
     rows = wpi_rows(5)
     rows[1, 3] = np.nan
     rows[3, 20] = np.inf
