@@ -78,23 +78,13 @@ class Range:
 
 def within(
     low: float, high: float, unit: str = "", *, also: tuple[float, ...] = (), either_sign: bool = False
-<<<<<<< HEAD
 ) -> dict[str, object]:
-    """Metadata of a field whose numbers must be in a range, see `Range`."""
-    return {RANGE: Range(low, high, unit, also, either_sign)}
-
-
-def formerly(name: str) -> dict[str, object]:
-    """Metadata of a field that files of earlier versions call `name`; `with_current_keys` renames it."""
-=======
-) -> dict[str, Range]:
     """Returns metadata of a field whose numbers must be in a range, see `Range`."""
     return {RANGE: Range(low, high, unit, also, either_sign)}
 
 
-def formerly(name: str) -> dict[str, str]:
+def formerly(name: str) -> dict[str, object]:
     """Returns metadata of a field that files of earlier versions call `name`; `with_current_keys` renames it."""
->>>>>>> c718567e99a44f47fb9babdc48cdbfec9b1a9ccc
     return {FORMERLY: name}
 
 
