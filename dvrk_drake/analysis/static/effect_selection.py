@@ -82,8 +82,8 @@ class StaticProblem:
 def candidate_effects(problem: StaticProblem) -> list[list[ActuatorEffect]]:
     """Returns groups of candidate effects per joint that the poses can identify: an offset, a cable, a spring.
 
-    A spring is a candidate if the arm file lists it for the joint's drive (`motion.known_effects`). Other coordinates of
-    the transmission are not candidates, because they slightly increase the error on other MTM recordings.
+    A spring is a candidate if the arm file lists it for the joint's drive (`motion.known_effects`). Other coordinates
+    of the transmission are not candidates, because they slightly increase the error on other MTM recordings.
     """
     arm, groups = problem.arm, []
     for joint in arm.joint_names:
@@ -139,7 +139,7 @@ def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
 
 
 def _says_the_same(effect: ActuatorEffect, chosen: Sequence[ActuatorEffect]) -> bool:
-    """Returns whether the chosen effects have a cable for this spring, or a spring for this cable, at the same joint."""
+    """Returns whether `chosen` has a cable for this spring, or a spring for this cable, at the same joint."""
     joint = effect.coordinate.partition(".")[2]
     laws = {e.kind.partition(" ")[0] for e in chosen if e.coordinate.partition(".")[2] == joint}
     return (effect.kind == "spring" and "cable" in laws) or (effect.kind.startswith("cable") and "spring" in laws)
