@@ -183,7 +183,7 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
 def predict_other_phases(
     model: IdentifiedModel, recording: Recording, parts: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the relative errors (n,) of the model, and of the model with friction refitted to other parts of the motion.
+    """Returns the relative errors (n,) of the model before and after refitting its friction to other phases.
 
     A periodic motion is divided by its phase, so that no part is predicted from its own repetition. All actuators that
     move in both directions are refitted.
@@ -197,7 +197,7 @@ def predict_other_phases(
 
 
 class _Fit:
-    """Least squares for friction scales (k,) and offsets (n,), with the model's values as prior: x is (scales, offsets)."""
+    """Least squares for x = (friction scales, offsets), with the values of the model as prior."""
 
     def __init__(self, model: DynamicModel, recording: Recording, folds: int = FOLDS) -> None:
         grid = motion_grid(recording, model.arm, model.section.signals)
@@ -240,7 +240,10 @@ class _Fit:
         return np.asarray(np.sqrt(squares / np.maximum(size, np.finfo(float).tiny)))
 
     def solve(self, free: NDArray[np.bool_], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Returns x (k + n,). Friction and offsets of actuators that are not free, and friction that they share, are constant."""
+        """Returns x (k + n,).
+
+        Offsets and friction of actuators that are not free are constant, and so is friction that they share.
+        """
         k, n = len(self.keys), len(self.names)
         known = np.concatenate([np.any(self._loads & ~free, axis=1), ~free])
         size = np.sqrt(np.mean(self.tau**2, axis=0))

@@ -111,8 +111,8 @@ class LowSpeedSegments(NamedTuple):
 def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
     """Extracts low-speed segments of a motion as static poses, per joint, averaged with their repetitions.
 
-    The torques contain two errors: inertial torques from the motion of other joints, and dry friction of either sign. If
-    possible, dynamic identification for a motion, or poses at which the whole arm rests (`static_poses`).
+    The torques contain two errors: inertial torques from the motion of other joints, and dry friction of either sign.
+    If possible, use dynamic identification for a motion, or poses at which the whole arm rests (`static_poses`).
 
     Raises:
         RecordingError: The recording has no efforts, or is of another arm.

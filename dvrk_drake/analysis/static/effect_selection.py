@@ -152,7 +152,7 @@ def _loss(problem: StaticProblem, fit: RobustFit, sigma: NDArray[np.float64]) ->
 
 @cache
 def _largest_base_parameters(model: StaticModel) -> NDArray[np.float64]:
-    """Returns the size (b,) at which each base parameter alone reaches the effort limit of a joint in some pose."""
+    """Returns the size (b,) at which each base parameter alone reaches a joint's effort limit in some pose."""
     arm = model.gravity.arm
     q = np.random.default_rng(0).uniform(arm.position_lower, arm.position_upper, (3000, arm.num_joints))
     largest = np.abs(model.regressor(q)).max(axis=0)
@@ -175,7 +175,7 @@ def _is_gravity_too(model: StaticModel, effect: ActuatorEffect) -> bool:
 
 
 def effect_column(arm: Arm, effect: ActuatorEffect, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the joint torques (m, n) of a position-dependent effect at poses q (m, n), per unit of its coefficient."""
+    """Returns the joint torques (m, n) of a position-dependent effect at poses q (m, n), for a coefficient of 1."""
     x = position_along(arm, effect.coordinate, q)
     return effect.column(x, 0 * x)[:, None] * joint_row(arm, effect.coordinate)
 
