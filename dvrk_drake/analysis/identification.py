@@ -1,4 +1,4 @@
-"""Identification of an arm's model from a recording, whether it is one of poses or of a motion."""
+"""Identifies a model of an arm from a recording of poses or of a motion."""
 
 from __future__ import annotations
 
@@ -27,26 +27,27 @@ def identify(
     low_speed_segments: bool = False,
     progress: Progress | None = None,
 ) -> StaticIdentification | DynamicIdentification:
-    """Checks a recording and identifies the arm's model from it: what `dvrk-drake identify` does.
+    """Checks a recording and identifies the arm's model from it, as `dvrk-drake identify` does.
 
-    A recording of poses gives a static model: gravity, cables and springs, which hold the arm at rest. So does a motion
-    in which the arm rests often enough. A motion without rests gives the full dynamics: inertial parameters that are
-    physically consistent, rotors and friction.
+    A recording of poses gives a static model with gravity, cables and springs. A motion in which the arm rests often
+    enough also gives a static model. A motion without rests gives the full dynamics: physically consistent inertial
+    parameters, rotors and friction.
 
     Args:
-        recording: poses with efforts (m, n), or a motion with times and efforts, in joint or actuator coordinates.
-        arm: which was recorded, mounted as it was: see `Arm.with_gravity`.
-        method: for poses: "robust", or "paper" for the least squares of Rutfield et al. (2015).
-        low_speed_segments: take the low-speed segments of a motion without rests as poses.
-        progress: called with the step, "checking the recording" or "identifying", and its finished share 0..1.
+        recording: Poses with efforts (m, n), or a motion with times and efforts, in joint or actuator coordinates.
+        arm: Arm that was recorded, with its mounting, see `Arm.with_gravity`.
+        method: Method for poses: "robust", or "paper" for the least squares of Rutfield et al. (2015).
+        low_speed_segments: Use the low-speed segments of a motion without rests as poses.
+        progress: Callback that receives the step, "checking the recording" or "identifying", and its finished share,
+            0 to 1.
 
     Returns:
-        The model as `model`, the prepared recording as `recording`, warnings as `warnings`, and what tables and figures
-        show; `save` writes the model file.
+        Result with the model as `model`, the prepared recording as `recording`, warnings as `warnings`, and the data of
+        tables and figures. Its method `save` writes the model file.
 
     Raises:
-        RecordingError: the recording does not fit the arm, or `check` refuses it: see `findings` of the error.
-        IdentificationError: the recording does not determine a model.
+        RecordingError: The recording does not fit the arm, or `check` rejects it, see `findings` of the error.
+        IdentificationError: The recording does not determine a model.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np

@@ -1,4 +1,4 @@
-"""An identified model on another day: friction and offsets of its drive from a short recording, all else as it was."""
+"""Updates friction and offsets of an identified model from a short recording, without changing other parameters."""
 
 from __future__ import annotations
 
@@ -26,30 +26,31 @@ from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
-#: Parts of the motion, cut by its phase where it repeats, each predicted from the others to decide what is kept.
+#: Folds of the motion, divided by its phase if it repeats. Each is predicted from the others to decide what is kept.
 FOLDS = 4
-#: A friction scale may well differ from 1 by this, an offset by this share of the RMS effort.
+#: Prior deviations of a friction scale from 1, and of an offset as a share of the RMS effort.
 SCALE_DEVIATION, OFFSET_DEVIATION = 0.5, 0.3
-#: Relative error that the efforts are weighed with.
+#: Relative error for weighting the efforts.
 _RELATIVE_ERROR = 0.1
-#: An actuator must move in both directions for at least this share of the time.
+#: Least share of the time for which an actuator must move in each direction.
 MIN_SHARE = 0.1
-#: A recording that leaves a larger share of the efforts unexplained, on average, is of another arm.
+#: Largest mean relative error of a recording of this arm.
 MAX_ERROR = 0.7
 
 
 @dataclass(frozen=True)
 class RecalibratedActuator:
-    """One actuator, errors as |tau_f - tau_hat| / |tau_f|.
+    """Recalibration of one actuator. Errors are |tau_f - tau_hat| / |tau_f|.
 
     Attributes:
-        name: of the joint whose actuator it is.
-        before: error of the model as it was.
-        after: error of parts of the motion that are predicted with friction and offset from the other parts.
-        kept: whether the new model has them.
-        reason: why not, or "".
-        dry, viscous: scales of the actuator's own friction, from the whole recording; None where it has none.
-        offset: change of the offset [N m, N].
+        name: Name of the joint of the actuator.
+        before: Error of the model before recalibration.
+        after: Error of held-out parts of the motion, predicted with friction and offset from the other parts.
+        kept: True if the new model contains the new friction and offset.
+        reason: Reason if they are not kept, or "".
+        dry: Scale of the actuator's dry friction, from the whole recording; None if it has none.
+        viscous: Scale of the actuator's viscous friction, from the whole recording; None if it has none.
+        offset: Change of the offset [N m, N].
     """
 
     name: str
@@ -64,12 +65,12 @@ class RecalibratedActuator:
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Recalibration(ModelResult):
-    """A model with new friction.
+    """Model with new friction.
 
     Attributes:
-        actuators: in the arm's order.
-        shared: scales of friction at places that several actuators move, e.g. "finger_1 dry".
-        seconds: of the motion that were used, a second at each end left out.
+        actuators: Recalibration of the actuators, in the arm's order.
+        shared: Scales of friction at coordinates that several actuators move, e.g. "finger_1 dry".
+        seconds: Duration of the motion that was used, without one second at each end.
     """
 
     actuators: list[RecalibratedActuator]
@@ -78,21 +79,22 @@ class Recalibration(ModelResult):
 
 
 def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progress | None = None) -> Recalibration:
-    """Checks a short motion and refits a model's friction and offsets to it: what `dvrk-drake recalibrate` does.
+    """Checks a short motion and refits a model's friction and offsets to it, as `dvrk-drake recalibrate` does.
 
-    The gain is for motions like that one; at other positions and speeds it can be much smaller.
+    The improvement applies to similar motions. At other positions and speeds it can be much smaller.
 
     Args:
-        model: identified from a motion.
-        recording: a motion with efforts (m, n), in joint or actuator coordinates, of another day.
-        progress: called with the step, "checking the recording" or "refitting friction", and its finished share 0..1.
+        model: Model identified from a motion.
+        recording: Motion with efforts (m, n) from another day, in joint or actuator coordinates.
+        progress: Callback that receives the step, "checking the recording" or "refitting friction", and its finished
+            share, 0 to 1.
 
     Returns:
-        The new model as `model`, each actuator's error before and after as `actuators`, and `warnings`.
+        Result with the new model as `model`, each actuator's error before and after as `actuators`, and `warnings`.
 
     Raises:
-        RecordingError: `check` refuses the recording, it is of another arm, or no actuator moves both ways.
-        ModelError: the model has no dynamics.
+        RecordingError: `check` rejects the recording, it is of another arm, or no actuator moves in both directions.
+        ModelError: The model has no dynamics.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -117,16 +119,16 @@ def recalibrate(model: IdentifiedModel, recording: Recording, *, progress: Progr
 
 
 def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibration:
-    """Fits one scale of dry and one of viscous friction at every coordinate of the drive, and an offset an actuator.
+    """Fits a scale of dry and of viscous friction for every coordinate of the drive, and an offset per actuator.
 
-    Rigid bodies, springs and cables stay. Each of `FOLDS` parts of the motion is predicted from the others: where an
-    actuator's error does not fall, its offset and friction, and those that it shares, stay as they were, and the others
-    are fitted again; what is kept is then fitted to all of the recording.
+    Rigid bodies, springs and cables do not change. Each of `FOLDS` parts of the motion is predicted from the others. If
+    the error of an actuator does not decrease, its offset and friction keep their values, and so does friction that it
+    shares. The others are then fitted again. Finally, the kept terms are fitted to the whole recording.
 
     Raises:
-        RecordingError: it is no motion of this arm, it is of another arm, efforts have the wrong sign, or no actuator
-            moves both ways.
-        ModelError: the model has no dynamics.
+        RecordingError: The recording is not a motion of this arm, efforts have the wrong sign, or no actuator moves in
+            both directions.
+        ModelError: The model has no dynamics.
     """
     fit = _Fit(model.dynamic_model, recording)
     excited = fit.excited
@@ -181,21 +183,21 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
 def predict_other_phases(
     model: IdentifiedModel, recording: Recording, parts: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Relative errors (n,) of the model, and with the friction of each part of the motion refitted to the other parts.
+    """Returns the relative errors (n,) of the model before and after refitting its friction to other phases.
 
-    The parts are cut by the phase of a motion that repeats, so no refit has seen a phase that it is judged on. All
-    actuators that move both ways are refitted.
+    A periodic motion is divided by its phase, so that no part is predicted from its own repetition. All actuators that
+    move in both directions are refitted.
 
     Raises:
-        RecordingError: it is no motion of this arm.
-        ModelError: the model has no dynamics.
+        RecordingError: The recording is not a motion of this arm.
+        ModelError: The model has no dynamics.
     """
     fit = _Fit(model.dynamic_model, recording, parts)
     return fit.error(fit.nothing), fit.left_out_error(fit.excited)
 
 
 class _Fit:
-    """Least squares for friction scales and offsets about what the model has: x is (scales - 0 ... , offsets)."""
+    """Least squares for x = (friction scales, offsets), with the values of the model as prior."""
 
     def __init__(self, model: DynamicModel, recording: Recording, folds: int = FOLDS) -> None:
         grid = motion_grid(recording, model.arm, model.section.signals)
@@ -215,11 +217,11 @@ class _Fit:
         self.nothing = np.concatenate([np.ones(len(self.keys)), np.zeros(len(self.names))])
 
     def error(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n,) relative error."""
+        """Returns the relative error (n,)."""
         return self._relative(np.sum(self._left(x) ** 2, axis=0))
 
     def left_out_error(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """(n,) relative error of parts of the motion that are predicted from the others, less what is beside them."""
+        """Returns the relative error (n,) on held-out parts, predicted from the others without the adjoining edges."""
         squares = np.zeros(len(self.names))
         for fold in range(self._folds):
             own = self._fold == fold
@@ -238,7 +240,10 @@ class _Fit:
         return np.asarray(np.sqrt(squares / np.maximum(size, np.finfo(float).tiny)))
 
     def solve(self, free: NDArray[np.bool_], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """x (k + n,); friction and offsets of actuators that are not free stay, and friction that they share."""
+        """Returns x (k + n,).
+
+        Offsets and friction of actuators that are not free are constant, and so is friction that they share.
+        """
         k, n = len(self.keys), len(self.names)
         known = np.concatenate([np.any(self._loads & ~free, axis=1), ~free])
         size = np.sqrt(np.mean(self.tau**2, axis=0))
@@ -246,7 +251,7 @@ class _Fit:
         H, b = np.diag(deviation**-2.0), self.nothing / deviation**2
         for i in range(n):
             X = np.hstack([self.friction[rows, i], np.tile(np.eye(n)[i], (int(np.sum(rows)), 1))])
-            # A row is not an independent measurement: what friction does not explain stays for a while.
+            # Rows are not independent, because unmodelled errors are correlated over about 0.1 s.
             weight = 1 / (_RELATIVE_ERROR * size[i]) ** 2 / (self.rate * 0.1)
             H += weight * X.T @ X
             b += weight * X.T @ (self.tau - self.other)[rows, i]
@@ -258,12 +263,12 @@ class _Fit:
         return x
 
     def scale(self, x: NDArray[np.float64], coordinate: str, part: FrictionPart) -> float | None:
-        """Of one part of the friction at a coordinate, None if the model has none there."""
+        """Returns the scale of one part of the friction at a coordinate, None if the model has none there."""
         return float(x[self.keys.index((coordinate, part))]) if (coordinate, part) in self.keys else None
 
 
 def _moves_both_ways(model: DynamicModel, grid: MotionGrid) -> NDArray[np.bool_]:
-    """(n,) which actuators do, for long and fast enough."""
+    """Returns a mask (n,) of the actuators that move in both directions for long enough and fast enough."""
     v = model.arm.transmission.velocity(grid.v)
     share = np.minimum(np.mean(v > 0, axis=0), np.mean(v < 0, axis=0))
     speed = np.sqrt(np.mean(v**2, axis=0))
@@ -271,7 +276,7 @@ def _moves_both_ways(model: DynamicModel, grid: MotionGrid) -> NDArray[np.bool_]
 
 
 def _section(section: DynamicSection, fit: _Fit, x: NDArray[np.float64]) -> DynamicSection:
-    """The section with its friction scaled, and with the offsets' changes added."""
+    """Returns the section with scaled friction and changed offsets."""
     scales = dict(zip(fit.keys, x[: len(fit.keys)], strict=True))
     offsets = {f"actuator.{name}": float(c) for name, c in zip(fit.names, x[len(fit.keys) :], strict=True) if c}
     effects = []

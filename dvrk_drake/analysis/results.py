@@ -19,11 +19,11 @@ from dvrk_drake.recordings.recording import Recording
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class ModelResult:
-    """A model and the warnings about it.
+    """Model with warnings.
 
     Attributes:
-        model: the new model.
-        warnings: what makes the model less reliable, found in the recording or in the fit; `str` of each is one line.
+        model: New model.
+        warnings: Findings in the recording or in the fit that make the model less reliable; `str` of each is one line.
     """
 
     model: IdentifiedModel
@@ -33,14 +33,14 @@ class ModelResult:
         return f"<{type(self).__name__} of {self.model.arm.name}: {len(self.warnings)} warnings>"
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Writes the model file, at once or not at all.
+        """Writes the model file atomically.
 
         Args:
-            path: the YAML file to write.
-            overwrite: replace an existing file.
+            path: YAML file to write.
+            overwrite: Replace an existing file.
 
         Raises:
-            DvrkDrakeError: the file exists, or cannot be written.
+            DvrkDrakeError: The file exists, or cannot be written.
         """
         refuse_existing(path, overwrite)
         self.model.save(path)
@@ -51,9 +51,9 @@ class Identification(ModelResult):
     """Result of `identify`: a `StaticIdentification` or a `DynamicIdentification`.
 
     Attributes:
-        recording: the prepared recording: distinct poses in joint coordinates, or the motion as recorded.
-        note: which rows were taken as poses, or "".
-        num_rows: of the recording, or of the poses that were found in it; repeated poses are averaged.
+        recording: Prepared recording: distinct poses in joint coordinates, or the motion as recorded.
+        note: Origin of the poses, or "".
+        num_rows: Number of rows of the recording, or of poses found in it, before repeated poses are averaged.
     """
 
     recording: Recording
@@ -66,10 +66,10 @@ class Validation(ABC):
     """Result of `validate`: a `StaticValidation` or a `DynamicValidation`.
 
     Attributes:
-        model: which was compared.
-        recording: which it was compared with, as prepared: poses, or the motion as recorded.
-        warnings: what the errors do not show, found in the recording or in the comparison; `str` of each is one line.
-        note: which rows were taken as poses, or "".
+        model: Model that was compared.
+        recording: Prepared recording for the comparison: poses, or the motion as recorded.
+        warnings: Findings in the recording or in the comparison that the errors do not show; `str` of each is one line.
+        note: Origin of the poses, or "".
     """
 
     model: IdentifiedModel
@@ -85,11 +85,11 @@ class Validation(ABC):
     @property
     @abstractmethod
     def relative_errors(self) -> dict[str, float | None]:
-        """RMS error / RMS effort of each joint, without outliers [1]; None where nothing was measured."""
+        """RMS error / RMS effort of each joint without excluded measurements [1]; None if nothing was measured."""
 
     @property
     def verdict(self) -> Verdict:
-        """The least favourable of the verdicts."""
+        """Least favourable of the verdicts."""
         return worst(self.verdicts)[0]
 
     def __repr__(self) -> str:
@@ -106,19 +106,19 @@ class Validation(ABC):
 
     @property
     def of_same_recording(self) -> bool:
-        """Whether the model was identified from this recording, so that the errors are those of the fit."""
+        """True if the model was identified from this recording, so that the errors are those of the fit."""
         return bool(self.recording.sha256) and self.recording.sha256 == self.model.provenance.sha256
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Writes the model with these verdicts; `dvrk-drake run` warns of a model without them.
+        """Writes the model with these verdicts. `dvrk-drake run` warns of a model without verdicts.
 
         Args:
-            path: the model's own file, or a new one.
-            overwrite: replace verdicts that the model has from another recording, or another file.
+            path: File of the model, or a new file.
+            overwrite: Replace verdicts from another recording, or another file.
 
         Raises:
-            ModelError: the model was identified from this recording, or has verdicts already.
-            DvrkDrakeError: the file exists and is not of this model.
+            ModelError: The model was identified from this recording, or already has verdicts.
+            DvrkDrakeError: The file exists and is not of this model.
         """
         source = self.recording.source or "recording"
         if self.of_same_recording:
@@ -145,7 +145,7 @@ class Prediction:
 
     Attributes:
         tau: (m, n) efforts at the rows of the recording, in its coordinates [N m; N].
-        warnings: what `check` found in the recording; `str` of each is one line.
+        warnings: Findings of `check` in the recording; `str` of each is one line.
     """
 
     tau: NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Comparison of a model with a recording that it was not identified from, and efforts that a model predicts."""
+"""Validates a model on a recording that it was not identified from, and predicts efforts."""
 
 from __future__ import annotations
 
@@ -21,23 +21,24 @@ from dvrk_drake.recordings.recording import Recording
 def validate(
     model: IdentifiedModel, recording: Recording, *, low_speed_segments: bool = False, progress: Progress | None = None
 ) -> StaticValidation | DynamicValidation:
-    """Compares a model's efforts with those of a recording: what `dvrk-drake validate` does.
+    """Compares a model's efforts with those of a recording, as `dvrk-drake validate` does.
 
-    A motion is compared behind the low-pass of the model's identification if the model has dynamics; otherwise, and for
-    poses, holding torques are compared.
+    For a motion and a model with dynamics, efforts are compared after the low-pass filter of the identification.
+    Otherwise holding torques are compared.
 
     Args:
-        model: from `identify`, or `IdentifiedModel.load`.
-        recording: poses or a motion with efforts (m, n), which the model was not identified from.
-        low_speed_segments: take the low-speed segments of a motion without rests as poses.
-        progress: called with the step, "checking the recording" or "validating", and its finished share 0..1.
+        model: Model from `identify` or `IdentifiedModel.load`.
+        recording: Poses or a motion with efforts (m, n) that the model was not identified from.
+        low_speed_segments: Use the low-speed segments of a motion without rests as poses.
+        progress: Callback that receives the step, "checking the recording" or "validating", and its finished share, 0
+            to 1.
 
     Returns:
-        `verdict`, `verdicts` and `relative_errors` of the joints, `warnings`, and the errors in detail.
+        Result with `verdict`, `verdicts` and `relative_errors` of the joints, `warnings`, and detailed errors.
 
     Raises:
-        RecordingError: the recording does not fit the model's arm, or `check` refuses it: see `findings` of the error.
-        IdentificationError: `low_speed_segments` finds none.
+        RecordingError: The recording does not fit the model's arm, or `check` rejects it, see `findings` of the error.
+        IdentificationError: `low_speed_segments` is set, and there are none.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -77,19 +78,21 @@ def _motion(motion: str, source: str) -> tuple[Finding, ...]:
 
 
 def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress | None = None) -> Prediction:
-    """Predicts the efforts at the rows of a recording: what `dvrk-drake predict` does.
+    """Predicts the efforts at the rows of a recording, as `dvrk-drake predict` does.
 
     Args:
-        model: from `identify`, or `IdentifiedModel.load`.
-        recording: poses or a motion; it needs no efforts.
-        progress: called with the step, "checking the recording" or "predicting", and its finished share 0..1.
+        model: Model from `identify` or `IdentifiedModel.load`.
+        recording: Poses or a motion. Efforts are not required.
+        progress: Callback that receives the step, "checking the recording" or "predicting", and its finished share, 0
+            to 1.
 
     Returns:
-        `tau` (m, n) [N m; N] in the recording's coordinates, and `warnings`. For a motion, if the model has dynamics,
-        all efforts of the motors, behind the low-pass of the model's identification; otherwise what holds each pose.
+        Result with `tau` (m, n) [N m; N] in the recording's coordinates, and `warnings`. For a motion and a model with
+        dynamics, `tau` contains the total motor efforts after the low-pass filter of the identification. Otherwise it
+        contains the holding torques.
 
     Raises:
-        RecordingError: the recording does not fit the model's arm, or `check` refuses it: see `findings` of the error.
+        RecordingError: The recording does not fit the model's arm, or `check` rejects it, see `findings` of the error.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -100,7 +103,7 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
         (3, 7)
     """
     arm = model.arm
-    # What finds and checks a motion needs efforts.
+    # The functions that find and check a motion require efforts.
     measured = recording if recording.tau is not None else replace(recording, tau=np.zeros_like(recording.q))
     if model.dynamics is None or not find_poses(measured, arm).moves:
         step_progress(progress, "predicting")(0.0)

@@ -1,6 +1,6 @@
-"""Verdict on each joint of a model: may its torque be commanded, judged by the error on a recording.
+"""Verdict on whether the torque of each joint of a model may be commanded, based on the error on a recording.
 
-This module holds the thresholds, the rule and its text. docs/identification.md gives the evidence for the thresholds.
+This module contains the thresholds, the rule and its text. docs/identification.md has the evidence for the thresholds.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 
 Requirement = Literal["good", "usable"]
 
-#: Largest ratio of the error to the measured effort (RMS both) of a joint that is "good".
+#: Largest ratio of the RMS error to the RMS measured effort of a joint that is "good".
 GOOD_RATIO = 0.35
-#: Largest ratio of one that is "usable", at rest: the error of commanding nothing.
+#: Largest ratio of a joint that is "usable", at rest. A ratio of 1 is the error of commanding zero torque.
 USABLE_RATIO_AT_REST = 1.0
-#: The same in motion, where friction is part of the model.
+#: Largest ratio of a joint that is "usable", in motion, where friction is part of the model.
 USABLE_RATIO_IN_MOTION = 0.5
-#: An error below this share of the effort limit is "usable" at any ratio: friction holds it.
+#: Errors below this share of the effort limit are "usable" at any ratio, because friction supports the joint.
 SMALL_ERROR = 0.02
 
 
@@ -29,11 +29,11 @@ def judge(effort: float, error: float, effort_limit: float, *, in_motion: bool, 
     """Returns the verdict on one joint.
 
     Args:
-        effort: RMS of the measured effort, which is the error of commanding nothing [N m; N]; 0 if none was measured.
+        effort: RMS of the measured effort, equal to the error of commanding zero torque [N m; N]; 0 if not measured.
         error: RMS of measured minus predicted effort [N m; N]; NaN if it is not known.
-        effort_limit: of the joint [N m; N].
-        in_motion: The recording is a motion, and the model has dynamics.
-        commanded: The model predicts an effort for this joint; False where identification switched it off.
+        effort_limit: Effort limit of the joint [N m; N].
+        in_motion: True if the recording is a motion and the model has dynamics.
+        commanded: True if the model predicts an effort for this joint; False if identification disabled it.
     """
     if not commanded:
         return "off"
@@ -46,7 +46,7 @@ def judge(effort: float, error: float, effort_limit: float, *, in_motion: bool, 
 
 
 def rule_text(in_motion: bool) -> str:
-    """The rule of `judge` in words, with its numbers."""
+    """Returns the rule of `judge` as text, with its thresholds."""
     good, usable, zero = (
         f"{100 * ratio:g} %" if in_motion else f"{ratio:g}"
         for ratio in (GOOD_RATIO, USABLE_RATIO_IN_MOTION if in_motion else USABLE_RATIO_AT_REST, 1.0)
@@ -59,13 +59,13 @@ def rule_text(in_motion: bool) -> str:
 
 
 def worst(verdicts: Mapping[str, Verdict]) -> tuple[Verdict, list[str]]:
-    """The least favourable verdict and the joints that have it."""
+    """Returns the least favourable verdict and the joints that have it."""
     last = max(verdicts.values(), key=get_args(Verdict).index)
     return last, [name for name, verdict in verdicts.items() if verdict == last]
 
 
 def unfit(verdicts: Mapping[str, str], required: Requirement) -> list[str]:
-    """Joints that do not fulfil a requirement, each with its verdict. A joint without torque fulfils all."""
+    """Returns the joints that do not meet a requirement, with their verdicts. A joint without torque meets all."""
     accepted = ("good", "off") if required == "good" else ("good", "usable", "off")
     return [f"{name} ({verdict})" for name, verdict in verdicts.items() if verdict not in accepted]
 
@@ -74,7 +74,7 @@ def unexplained_effort(errors: Mapping[str, float | None]) -> tuple[Finding, ...
     """Returns a warning that names the joints in motion whose efforts the model does not explain.
 
     Args:
-        errors: relative error of each joint [1]; None where nothing was measured.
+        errors: Relative error of each joint [1]; None if nothing was measured.
     """
     bad = [f"{name} ({e:.0%})" for name, e in errors.items() if e is not None and e > USABLE_RATIO_IN_MOTION]
     if not bad:
@@ -84,9 +84,9 @@ def unexplained_effort(errors: Mapping[str, float | None]) -> tuple[Finding, ...
 
 
 def cross_validated_verdicts(model: IdentifiedModel) -> dict[str, Verdict]:
-    """The verdict on each joint by the errors that identification stored: those of held-out poses or phases.
+    """Returns the verdict on each joint from the cross-validated errors that identification stored.
 
-    The held-out data are of the same recording. Another recording is the stronger test.
+    The held-out data are from the same recording. Another recording is a stronger test.
     """
     limits = model.arm.effort_limits
     if model.dynamics is not None:

@@ -46,7 +46,7 @@ def errors(model, recording):
 
 
 @pytest.mark.parametrize("name", ["psm", "mtmr"])
-def test_friction_and_offsets_of_the_second_day_are_found(name):
+def test_friction_and_offsets_of_another_day_are_estimated(name):
     model, truth, generator = days(name)
     result = refit_friction(model, motion(truth, generator))
     other = motion(truth, generator, seconds=16.0, seed=6)
@@ -64,7 +64,7 @@ def test_friction_and_offsets_of_the_second_day_are_found(name):
     np.testing.assert_allclose(found, expected, atol=0.1)
 
 
-def test_rigid_bodies_stay_and_offsets_count_in_motion_alone():
+def test_rigid_bodies_and_holding_torques_are_unchanged():
     model, truth, generator = days("psm")
     result = refit_friction(model, motion(truth, generator))
     new, arm = result.model, model.arm
@@ -79,7 +79,7 @@ def test_rigid_bodies_stay_and_offsets_count_in_motion_alone():
     np.testing.assert_allclose(moved[0], offsets, atol=1e-12)
 
 
-def test_on_the_same_day_nothing_gets_worse():
+def test_errors_do_not_increase_on_the_same_day():
     model, _, generator = days("psm")
     same = model.dynamic_model
     result = refit_friction(model, motion(same, generator))
@@ -88,7 +88,7 @@ def test_on_the_same_day_nothing_gets_worse():
     assert all(a.dry == pytest.approx(1, abs=0.1) and a.viscous == pytest.approx(1, abs=0.1) for a in result.actuators)
 
 
-def test_a_joint_that_rests_is_left_alone():
+def test_joint_at_rest_is_unchanged():
     model, truth, generator = days("psm")
     t, q, v, vd = fourier_motion(truth.arm, np.random.default_rng(5), 8.0, 10.0, 1000.0)
     q[:, 0], v[:, 0], vd[:, 0] = q[0, 0], 0.0, 0.0
@@ -100,7 +100,7 @@ def test_a_joint_that_rests_is_left_alone():
     assert before == after
 
 
-def test_a_motion_in_one_direction_is_refused():
+def test_motion_in_one_direction_is_rejected():
     model, truth, generator = days("psm")
     t = np.arange(10_000) / 1000.0
     start, v = truth.arm.sample_poses(1, generator, margin=0.4)[0], truth.arm.per_joint(0.06, 0.006)
@@ -110,14 +110,14 @@ def test_a_motion_in_one_direction_is_refused():
 
 
 @pytest.mark.parametrize(("ours", "theirs"), [("psm", "mtmr"), ("mtmr", "psm")])
-def test_another_arm_is_refused(ours, theirs):
+def test_another_arm_is_rejected(ours, theirs):
     model, *_ = days(ours)
     _, truth, generator = days(theirs)
     with pytest.raises(RecordingError, match=r"is it of this arm|outside|limits"):
         refit_friction(model, motion(truth, generator))
 
 
-def test_efforts_of_something_else_are_refused():
+def test_unrelated_efforts_are_rejected():
     model, truth, generator = days("psm")
     recording = motion(truth, generator)
     noise = generator.normal(size=recording.tau.shape) * np.std(recording.tau, axis=0)
@@ -127,7 +127,7 @@ def test_efforts_of_something_else_are_refused():
 
 
 @pytest.mark.parametrize(("name", "seconds"), [("psm", 6.0), ("mtmr", 8.0)])
-def test_an_effort_of_the_wrong_sign_is_refused_however_short_the_recording(name, seconds):
+def test_wrong_sign_is_rejected_in_short_recordings(name, seconds):
     model, truth, generator = days(name)
     recording = motion(truth, generator, seconds).in_actuator_coordinates(truth.arm)
     for j, joint in enumerate(truth.arm.joint_names):
@@ -138,7 +138,7 @@ def test_an_effort_of_the_wrong_sign_is_refused_however_short_the_recording(name
     assert refit_friction(model, recording).seconds > 0
 
 
-def test_the_error_after_is_of_parts_that_were_not_fitted():
+def test_error_after_is_from_held_out_parts():
     """Friction that goes wild in one part of the motion can be fitted there, but not predicted from the other parts."""
     model, truth, generator = days("psm")
     recording = motion(truth, generator).in_actuator_coordinates(truth.arm)
@@ -152,7 +152,7 @@ def test_the_error_after_is_of_parts_that_were_not_fitted():
     assert result.actuators[3].after > 0.3
 
 
-def test_a_refit_is_judged_on_phases_that_it_has_not_seen():
+def test_refit_is_validated_on_held_out_phases():
     """Friction that differs in one half of the phases alone is no gain for the other half."""
     model, truth, generator = days("psm")
     recording = motion(truth, generator, seconds=16.0)

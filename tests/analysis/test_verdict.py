@@ -51,13 +51,13 @@ from dvrk_drake.recordings.recording import Recording, read_recording, write_rec
         (1.0, float("nan"), "not judged", "not judged"),
     ],
 )
-def test_the_rule(effort, error, at_rest, in_motion):
+def test_rule_of_the_verdict(effort, error, at_rest, in_motion):
     assert judge(effort, error, 10.0, in_motion=False) == at_rest
     assert judge(effort, error, 10.0, in_motion=True) == in_motion
     assert judge(effort, error, 10.0, in_motion=False, commanded=False) == "off"
 
 
-def test_the_printed_rule_has_the_numbers_of_the_rule():
+def test_printed_rule_contains_the_thresholds():
     for number in (f"{GOOD_RATIO:g}", f"{USABLE_RATIO_AT_REST:g}", f"{100 * SMALL_ERROR:g} %"):
         assert f"up to {number}" in rule_text(in_motion=False)
     for ratio in (GOOD_RATIO, USABLE_RATIO_IN_MOTION, SMALL_ERROR):
@@ -76,7 +76,7 @@ def test_the_worst_verdict_and_the_joints_that_fail():
 
 
 @pytest.mark.parametrize("name", ["mtmr", "psm"])
-def test_a_small_error_is_noise_or_held_by_friction(name):
+def test_small_error_is_below_friction_and_above_noise(name):
     """Below the dry friction of each joint but the PSM's roll, ten times above the noise of measured efforts."""
     arm = load_arm(name)
     friction = dict.fromkeys(arm.joint_names, 0.0)
@@ -109,7 +109,7 @@ def wrong_model(truth):
     return dataclasses.replace(truth, joints=joints)
 
 
-def test_a_switched_off_joint_is_off_and_a_wrong_one_fails(truth):
+def test_disabled_joint_is_off_and_a_wrong_one_fails(truth):
     recording = poses(truth)
     tau = truth.holding_torque(recording.q)
     tau[:, 1] *= 0.3
@@ -128,7 +128,7 @@ def test_a_switched_off_joint_is_off_and_a_wrong_one_fails(truth):
     assert validate_static(model, dataclasses.replace(recording, tau=tau)).verdicts["wrist_pitch"] == "not judged"
 
 
-def test_measurements_at_a_stop_do_not_count(truth):
+def test_measurements_at_a_stop_are_excluded(truth):
     """One pose presses on the shoulder's stop with ten times its weight: no model predicts that."""
     recording = poses(truth)
     q = recording.q.copy()
@@ -143,7 +143,7 @@ def test_measurements_at_a_stop_do_not_count(truth):
     assert shoulder.verdict == "good"
 
 
-def test_actuators_that_off_joints_do_not_drive_are_judged(truth):
+def test_actuators_not_driving_off_joints_are_judged(truth):
     recording = poses(truth)
     tau = truth.holding_torque(recording.q)
     given = Recording(q=recording.q, tau=tau).in_actuator_coordinates(ARM)
@@ -184,7 +184,7 @@ def test_require_sets_the_exit_code_and_names_the_joints(files, tmp_path, capsys
         assert [j["verdict"] for j in found["joints"]] == ["off", "do not use", "good", "good", "good", "good", "off"]
 
 
-def test_a_closed_pipe_neither_passes_nor_loses_the_verdicts(files):
+def test_closed_pipe_fails_and_keeps_the_verdicts(files):
     """`validate ... | head -1` with pipefail: the pipe is closed before anything is written."""
     model, _, bad = files
     read, write = os.pipe()
@@ -197,7 +197,7 @@ def test_a_closed_pipe_neither_passes_nor_loses_the_verdicts(files):
     assert IdentifiedModel.load(model).validation.verdicts["shoulder_pitch"] == "do not use"
 
 
-def test_the_recording_of_the_identification_validates_nothing(files, tmp_path, capsys):
+def test_identification_recording_gives_no_saved_verdicts(files, tmp_path, capsys):
     model, good, _ = files
     loaded = IdentifiedModel.load(model)
     provenance = dataclasses.replace(loaded.provenance, sha256=read_recording(good).sha256)
@@ -210,7 +210,7 @@ def test_the_recording_of_the_identification_validates_nothing(files, tmp_path, 
     assert (tmp_path / "model.yaml").read_bytes() == before
 
 
-def test_saved_verdicts_are_those_that_run_warns_of(files, capsys):
+def test_run_warns_of_saved_verdicts(files, capsys):
     model, good, bad = files
     loaded = IdentifiedModel.load(model)
     assert "no other recording has validated this model; cross-validated: " in model_warning(model, loaded)
@@ -225,7 +225,7 @@ def test_saved_verdicts_are_those_that_run_warns_of(files, capsys):
     assert model_warning(model, IdentifiedModel.load(model)) == ""
 
 
-def test_saved_verdicts_are_of_all_joints(truth, tmp_path):
+def test_saved_verdicts_include_all_joints(truth, tmp_path):
     with pytest.raises(ModelError, match=r"validation\.verdicts must name these joints: outer_yaw"):
         dataclasses.replace(truth, validation=ValidationSummary("a.csv", "", {"outer_yaw": "good"})).check()
     verdicts = {joint.name: "good" for joint in truth.joints} | {"wrist_roll": "splendid"}
@@ -233,7 +233,7 @@ def test_saved_verdicts_are_of_all_joints(truth, tmp_path):
         dataclasses.replace(truth, validation=ValidationSummary("a.csv", "", verdicts)).check()
 
 
-def test_run_warns_before_it_looks_for_the_arm(files, monkeypatch, capsys):
+def test_run_warns_before_connecting_to_the_arm(files, monkeypatch, capsys):
     """`ready_controller`, which run and collect share, up to where it would open the network."""
     from dvrk_drake.cli import lcm
 
@@ -252,7 +252,7 @@ def test_run_warns_before_it_looks_for_the_arm(files, monkeypatch, capsys):
         assert capsys.readouterr().err.count("shoulder_pitch (do not use)") == warnings
 
 
-def test_cross_validation_gives_verdicts_by_the_same_rule(truth):
+def test_cross_validated_verdicts_use_the_same_rule(truth):
     def statistics(j, effort, error, feedforward_scale):
         changes = {
             "rms_zero_torque_included": effort,

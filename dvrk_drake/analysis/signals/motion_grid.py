@@ -58,8 +58,8 @@ def motion_signals(
     """Resamples a motion to an even grid of its true times and differentiates it.
 
     Rows that repeat the row before are omitted, and the times of the others are corrected (`true_time`). The signals
-    are then interpolated at `rate`, and q and v are filtered at `cut_off`. The acceleration vd is the central difference
-    of v, filtered at `acceleration_cut_off`.
+    are then interpolated at `rate`, and q and v are filtered at `cut_off`. The acceleration vd is the central
+    difference of v, filtered at `acceleration_cut_off`.
 
     Args:
         recording: Motion with t and tau, in the coordinates that the signals shall have.

@@ -70,7 +70,7 @@ def smooth_velocity(recording: Recording) -> NDArray[np.float64]:
 def stationary_runs(
     still: NDArray[np.bool_], q: NDArray[np.float64], same: NDArray[np.float64], least: int
 ) -> Iterator[NDArray[np.int_]]:
-    """Yields runs of `least` or more rows in which `still` (m,) holds and q (m, n) stays within `same` (n,) of its start.
+    """Yields runs of `least` or more rows with `still` (m,) True and q (m, n) within `same` (n,) of its start.
 
     A run ends where q leaves this range, and the next run begins there.
     """
@@ -111,8 +111,8 @@ class LowSpeedSegments(NamedTuple):
 def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
     """Extracts low-speed segments of a motion as static poses, per joint, averaged with their repetitions.
 
-    The torques contain two errors: inertial torques from the motion of other joints, and dry friction of either sign. If
-    possible, use dynamic identification for a motion, or poses at which the whole arm rests (`static_poses`).
+    The torques contain two errors: inertial torques from the motion of other joints, and dry friction of either sign.
+    If possible, use dynamic identification for a motion, or poses at which the whole arm rests (`static_poses`).
 
     Raises:
         RecordingError: The recording has no efforts, or is of another arm.

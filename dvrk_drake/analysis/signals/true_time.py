@@ -110,8 +110,8 @@ class TrueTime(NamedTuple):
 def true_time(recording: Recording) -> TrueTime:
     """Returns the times of the distinct rows, reconstructed from q and qd if the recorded times jitter.
 
-    The interval dt_i between two rows maximises the posterior of dq_ij = qd_ij dt_i + noise_j over the joints j whose qd
-    agrees with dq/dt (`velocity_agreement`), with the mean interval as the prior:
+    The interval dt_i between two rows maximises the posterior of dq_ij = qd_ij dt_i + noise_j over the joints j whose
+    qd agrees with dq/dt (`velocity_agreement`), with the mean interval as the prior:
 
         dt_i = (sum_j dq_ij qd_ij / s_j^2 + dt_0 / s^2) / (sum_j qd_ij^2 / s_j^2 + 1 / s^2)
 
@@ -201,5 +201,5 @@ def _intervals(
 def _left(
     dq: NDArray[np.float64], qd: NDArray[np.float64], intervals: NDArray[np.float64], noise: NDArray[np.float64]
 ) -> float:
-    """Returns the median over rows of the squared residual of dq - qd dt in units of the noise. It is robust to spikes."""
+    """Returns the median over rows of the squared residual of dq - qd dt in units of the noise, robust to spikes."""
     return float(np.median(np.sum((dq - qd * intervals[:, None]) ** 2 / noise, axis=1)))

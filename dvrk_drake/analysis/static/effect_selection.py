@@ -82,8 +82,8 @@ class StaticProblem:
 def candidate_effects(problem: StaticProblem) -> list[list[ActuatorEffect]]:
     """Returns groups of candidate effects per joint that the poses can identify: an offset, a cable, a spring.
 
-    A spring is a candidate if the arm file lists it for the joint's drive (`motion.known_effects`). Other coordinates of
-    the transmission are not candidates, because they slightly increase the error on other MTM recordings.
+    A spring is a candidate if the arm file lists it for the joint's drive (`motion.known_effects`). Other coordinates
+    of the transmission are not candidates, because they slightly increase the error on other MTM recordings.
     """
     arm, groups = problem.arm, []
     for joint in arm.joint_names:
@@ -139,7 +139,7 @@ def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
 
 
 def _says_the_same(effect: ActuatorEffect, chosen: Sequence[ActuatorEffect]) -> bool:
-    """Returns whether the chosen effects have a cable for this spring, or a spring for this cable, at the same joint."""
+    """Returns whether `chosen` has a cable for this spring, or a spring for this cable, at the same joint."""
     joint = effect.coordinate.partition(".")[2]
     laws = {e.kind.partition(" ")[0] for e in chosen if e.coordinate.partition(".")[2] == joint}
     return (effect.kind == "spring" and "cable" in laws) or (effect.kind.startswith("cable") and "spring" in laws)
@@ -152,7 +152,7 @@ def _loss(problem: StaticProblem, fit: RobustFit, sigma: NDArray[np.float64]) ->
 
 @cache
 def _largest_base_parameters(model: StaticModel) -> NDArray[np.float64]:
-    """Returns the size (b,) at which each base parameter alone reaches the effort limit of a joint in some pose."""
+    """Returns the size (b,) at which each base parameter alone reaches a joint's effort limit in some pose."""
     arm = model.gravity.arm
     q = np.random.default_rng(0).uniform(arm.position_lower, arm.position_upper, (3000, arm.num_joints))
     largest = np.abs(model.regressor(q)).max(axis=0)
@@ -175,7 +175,7 @@ def _is_gravity_too(model: StaticModel, effect: ActuatorEffect) -> bool:
 
 
 def effect_column(arm: Arm, effect: ActuatorEffect, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the joint torques (m, n) of a position-dependent effect at poses q (m, n), per unit of its coefficient."""
+    """Returns the joint torques (m, n) of a position-dependent effect at poses q (m, n), for a coefficient of 1."""
     x = position_along(arm, effect.coordinate, q)
     return effect.column(x, 0 * x)[:, None] * joint_row(arm, effect.coordinate)
 

@@ -35,7 +35,7 @@ def find_excluded(
     Args:
         recording: Recording in joint coordinates, with efforts.
         arm: Arm with the limits.
-        measured: (m, n) False where an effort is not a holding torque and need not be excluded. By default all are True.
+        measured: (m, n) False where an effort is not a holding torque and need not be excluded. By default all are.
     """
     excluded = []
     A, lower, upper = arm.limit_matrix()

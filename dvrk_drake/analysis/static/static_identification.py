@@ -36,8 +36,8 @@ Method = Literal["robust", "paper"]
 
 #: Fewest distinct poses for an identification.
 MIN_POSES = 8
-#: Least measured torque of a joint, as a share of its effort limit, for using its model. A joint below it is used only if
-#: its leave-one-out error is below the second share of its torque.
+#: Least measured torque of a joint, as a share of its effort limit, for using its model. A joint below it is used only
+#: if its leave-one-out error is below the second share of its torque.
 MIN_TORQUE, CLEAR_GAIN_RATIO = 0.02, 0.5
 #: Least travel of a joint, as a share of its range, for using its model. Elsewhere its torque would be extrapolated.
 MIN_MOTION = 0.02
@@ -77,20 +77,22 @@ def identify_static(
     Method "paper" is unweighted least squares on the base parameters, eq. 9-10 of the paper.
 
     Method "robust" (default) weights each joint by its residual variance. It excludes measurements at joint stops and
-    outliers. Effects are chosen by leave-one-out cross-validation. A prior from the effort limits shrinks all parameters
-    toward zero. The feedforward scale of a joint is reduced if its leave-one-out error is no better than that of zero
-    torque, or if the joint hardly moved. Repeated samples of one pose are not independent, so they are averaged first.
+    outliers. Effects are chosen by leave-one-out cross-validation. A prior from the effort limits shrinks all
+    parameters toward zero. The feedforward scale of a joint is reduced if its leave-one-out error is no better than
+    that of zero torque, or if the joint hardly moved. Repeated samples of one pose are not independent, so they are
+    averaged first.
 
     Args:
         recording: Poses with efforts, in joint or actuator coordinates.
         arm: Arm that was recorded.
         method: "robust" or "paper".
         progress: Callback that receives the finished share, 0 to 1.
-        measured: (m, n) False where an effort is not a holding torque, from `low_speed_segments`. By default all are True.
+        measured: (m, n) False where an effort is not a holding torque, from `low_speed_segments`. By default all are.
 
     Raises:
         RecordingError: The recording does not fit the arm or has no efforts.
-        IdentificationError: There are too few poses, the recording is a motion, or the rank is too low (method "paper").
+        IdentificationError: There are too few poses, the recording is a motion, or (method "paper") the rank is too
+            low.
     """
     from dvrk_drake.dynamics.static_model import compile_static_model  # sympy takes 0.3 s, and motions need none
 
@@ -182,7 +184,7 @@ def usable_poses(recording: Recording, arm: Arm, averaged: bool = True) -> Recor
 
 
 def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:
-    """Averages repeated poses to one row per pose. Joints of a repeated pose agree with its first row within `SAME_POSE`."""
+    """Averages repeated poses, whose joints agree with the first row within `SAME_POSE`, to one row per pose."""
     same = arm.per_joint(*SAME_POSE)
     groups: list[list[int]] = []
     for row, q in enumerate(recording.q):
@@ -260,7 +262,7 @@ def _segments_support(
 
 
 def _cross_validate(problem: StaticProblem, progress: Callable[[float], object]) -> NDArray[np.float64]:
-    """Returns the residuals (m, n) of ten-fold cross-validation, with effects and feedforward scales estimated per fold."""
+    """Returns the residuals (m, n) of ten-fold cross-validation, with a new selection and fit in every fold."""
     poses = len(problem.q)
     folds = np.random.default_rng(0).permutation(poses) % min(FOLDS, poses)
     residuals = np.empty_like(problem.tau)

@@ -30,7 +30,7 @@ def of(effects, coordinate):
     return {(e.kind, e.scale if "cable" in e.kind else 0.0) for e in effects if e.coordinate == coordinate}
 
 
-def test_what_an_arms_file_knows_is_always_there_and_no_candidate():
+def test_effects_of_the_arm_file_are_mandatory():
     arm = arm_that_knows(pitch=["cable 1"], jaw=["asymmetric friction"])
     always, candidates = drive_effects(arm, moving(arm)), optional_effects(arm, moving(arm))
     assert not set(always) & set(candidates)
@@ -54,7 +54,7 @@ def test_what_an_arms_file_knows_is_always_there_and_no_candidate():
         ({"insertion": ["cable 1"]}, "cable sine is of an angle, and actuator.insertion slides"),
     ],
 )
-def test_what_no_arm_can_know_is_refused(known, message):
+def test_invalid_known_effects_are_rejected(known, message):
     arm = arm_that_knows(**known)
     with pytest.raises(ArmError, match=message):
         drive_effects(arm, moving(arm))
@@ -68,7 +68,7 @@ def equations(generator, true):
     return X, tau, fold, np.column_stack([place < 0.1, place >= 0.9])
 
 
-def test_parts_are_left_out_with_the_rows_that_touch_them():
+def test_held_out_folds_exclude_adjoining_rows():
     X, tau, fold, edge = equations(np.random.default_rng(0), np.ones(3))
     whole = NormalEquations.of([(np.arange(3), X)], 3, tau[:, None], fold, edge)
     for first in (0, 4, 10, 11):
@@ -89,7 +89,7 @@ def test_parts_are_left_out_with_the_rows_that_touch_them():
         np.testing.assert_allclose(second.dense()[0], kept.T @ kept, atol=1e-9)
 
 
-def test_an_effect_that_is_there_is_chosen_and_noise_is_not():
+def test_present_effects_are_selected_and_noise_is_not():
     """One column always, one that explains half of the effort, twenty of nothing; also without two of the parts."""
     true = np.zeros(22)
     true[:2] = 1.0

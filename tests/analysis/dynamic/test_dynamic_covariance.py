@@ -29,7 +29,7 @@ def independent_measurements(covariance):
     return float(count**2 * covariance[0] ** 2 / max(np.sum(pairs * covariance**2), 1e-300))
 
 
-def test_low_passed_white_noise_has_two_independent_values_a_period_of_the_cut_off():
+def test_independent_values_of_filtered_white_noise():
     counts = [
         independent_measurements(error_covariance(column, column, RATE, PERIOD))
         for column in noise(np.random.default_rng(0), 20).T
@@ -76,7 +76,7 @@ def test_standard_errors_are_the_spread_of_repeated_fits(repeating):
     assert np.mean(mean / spread) == pytest.approx(1.0, abs=0.1)
 
 
-def test_what_the_motion_does_not_tell_keeps_the_priors_variance():
+def test_uninformed_parameters_keep_the_prior_variance():
     X = np.zeros((len(T), 2))
     X[:, 0] = np.sin(T)
     tau = noise(np.random.default_rng(3))

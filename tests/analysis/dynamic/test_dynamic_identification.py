@@ -51,7 +51,7 @@ def test_another_motion_is_predicted_below_the_noise(case):
     assert validation.mean_relative_error < NOISE / 3
 
 
-def test_cross_validation_promises_no_more_than_the_noise_allows(case):
+def test_cross_validated_error_is_at_least_the_noise(case):
     _, _, _, result = case
     for a in result.model.dynamics.actuators:
         # What the low-pass leaves of white noise, and little more; the fit cannot be below the repeatability floor.
@@ -105,7 +105,7 @@ def test_true_friction_is_found(case):
     assert np.all(share < 0.2), "what a spring or weight could also be is told apart by the other phases only"
 
 
-def test_all_links_can_exist_and_no_motion_has_negative_energy(case):
+def test_links_are_consistent_and_energy_is_positive(case):
     arm, _, _, result = case
     assert min(link.least_eigenvalue for link in result.model.dynamics.links) > 0
     M = result.model.dynamic_model.mass_matrix(arm.sample_poses(300, np.random.default_rng(3)))
@@ -113,7 +113,7 @@ def test_all_links_can_exist_and_no_motion_has_negative_energy(case):
     assert np.min(np.linalg.eigvalsh(M)) > 0
 
 
-def test_the_links_hold_the_arm_as_the_base_parameters_do(case):
+def test_links_and_base_parameters_give_equal_holding_torques(case):
     arm, _, _, result = case
     model = result.model.dynamic_model
     q = arm.sample_poses(50, np.random.default_rng(4))
@@ -122,7 +122,7 @@ def test_the_links_hold_the_arm_as_the_base_parameters_do(case):
     np.testing.assert_allclose(tau, model.regressor.torque(q, 0 * q, 0 * q, model.parameters), atol=1e-9)
 
 
-def test_the_model_file_keeps_all_of_it(case, tmp_path):
+def test_model_file_round_trip(case, tmp_path):
     _, _, recording, result = case
     result.model.save(tmp_path / "model.yaml")
     loaded = IdentifiedModel.load(tmp_path / "model.yaml")
@@ -143,7 +143,7 @@ def test_the_model_file_keeps_all_of_it(case, tmp_path):
         IdentifiedModel.load(tmp_path / "bad.yaml")
 
 
-def test_verbs_check_a_motion_first_and_refuse_it(case, tmp_path, capsys):
+def test_commands_reject_an_invalid_motion(case, tmp_path, capsys):
     """One effort of 500 N m, as a torn line of a file gives: neither identified from, nor compared, nor predicted."""
     arm, _, recording, result = case
     tau = recording.tau.copy()
@@ -163,7 +163,7 @@ def test_verbs_check_a_motion_first_and_refuse_it(case, tmp_path, capsys):
     assert main(["validate", paths["good.csv"], "--model", paths["model.yaml"]]) == 0
 
 
-def test_a_motion_without_efforts_is_predicted_but_not_compared(case, tmp_path, capsys):
+def test_motion_without_efforts_is_predicted_not_validated(case, tmp_path, capsys):
     """Efforts follow from positions alone: the same with and without those that were measured."""
     _, _, recording, result = case
     paths = {name: str(tmp_path / name) for name in ("with.csv", "without.csv", "model.yaml")}
@@ -181,7 +181,7 @@ def test_a_motion_without_efforts_is_predicted_but_not_compared(case, tmp_path, 
     assert "has no efforts; needs columns tau1..tau7" in capsys.readouterr().err
 
 
-def test_in_actuator_coordinates_it_is_the_same_model(case):
+def test_actuator_coordinates_give_the_same_dynamic_model(case):
     arm, _, recording, result = case
     mirrored = recording.in_actuator_coordinates(arm)
     a, b = (validate_motion(result.model, r) for r in (recording, mirrored))
@@ -190,7 +190,7 @@ def test_in_actuator_coordinates_it_is_the_same_model(case):
     )
 
 
-def test_plants_inverses_and_conversions_are_made_once(case, monkeypatch):
+def test_plants_and_conversions_are_computed_once(case, monkeypatch):
     """A plant for each mounting: as expected, and as the motion shows it."""
     arm, _, recording, _ = case
     made = Counter()
@@ -213,7 +213,7 @@ def test_plants_inverses_and_conversions_are_made_once(case, monkeypatch):
     assert recording.in_actuator_coordinates(arm).in_joint_coordinates(arm) is recording
 
 
-def test_what_is_no_motion_is_refused():
+def test_recordings_that_are_not_motions_are_rejected():
     arm = load_arm("mtmr")
     q = np.tile(arm.sample_poses(1, np.random.default_rng(0)), (400, 1))
     with pytest.raises(RecordingError, match="has no times"):

@@ -55,7 +55,7 @@ def percent(model, which):
     return np.array([100 * getattr(a, which) / a.rms_effort for a in model.dynamics.actuators])
 
 
-def test_phases_predict_each_other_better_than_the_published_model_another_motion(case):
+def test_cross_validated_error_is_below_the_published_error(case):
     """By models that know nothing of them: neither parameters nor effects nor how the base leans."""
     name, _, _, model, _ = case
     error = percent(model, "rms_cross_validation")
@@ -63,19 +63,19 @@ def test_phases_predict_each_other_better_than_the_published_model_another_motio
     assert np.all(error <= PUBLISHED[name])
 
 
-def test_the_floor_is_the_one_in_the_data(case):
+def test_repeatability_floor_matches_the_data(case):
     name, _, _, model, _ = case
     np.testing.assert_allclose(percent(model, "rms_repeatability"), FLOOR[name], atol=0.15)
 
 
-def test_the_arm_can_exist_and_be_simulated(case):
+def test_identified_arm_is_consistent_and_can_be_simulated(case):
     _, arm, _, model, _ = case
     assert min(link.least_eigenvalue for link in model.dynamics.links) > 0
     M = model.dynamic_model.mass_matrix(arm.sample_poses(300, np.random.default_rng(0)))
     assert np.min(np.linalg.eigvalsh(M)) > 0
 
 
-def test_the_fit_is_what_validation_finds(case):
+def test_validation_reproduces_the_fit_error(case):
     _, _, recording, model, _ = case
     validation = validate_motion(model, recording)
     # The tilt enters the fit to first order, and effects of no weight are left out of the model.
@@ -83,7 +83,7 @@ def test_the_fit_is_what_validation_finds(case):
     np.testing.assert_allclose([100 * a.relative_error for a in validation.actuators], fitted, rtol=0.02, atol=0)
 
 
-def test_the_verbs_take_a_real_motion(case, tmp_path):
+def test_commands_accept_a_real_motion(case, tmp_path):
     name, arm, recording, _, folder = case
     path, model = folder / "motion.csv", folder / "model.yaml"
     errors, tau = tmp_path / "errors.json", tmp_path / "tau.csv"
@@ -98,7 +98,7 @@ def test_the_verbs_take_a_real_motion(case, tmp_path):
     assert np.all(ratio < 1)
 
 
-def test_effects_that_hold_an_arm_make_no_joint_worse(case, shared_data):
+def test_holding_effects_do_not_increase_static_errors(case, shared_data):
     """On poses of other years: an offset of a motion where weight acts is none at rest."""
     name, _, _, model, _ = case
     if name != "mtmr":
@@ -131,7 +131,7 @@ def errors(model, recording):
     return np.array([a.relative_error for a in validate_motion(model, recording).actuators])
 
 
-def test_another_day_keeps_the_rigid_body(another_day):
+def test_rigid_body_is_valid_on_another_day(another_day):
     """A wrist's cables are not the same on another day; the weight that the first joints carry is."""
     model, other = another_day
     validation = validate_motion(model, other)
@@ -141,7 +141,7 @@ def test_another_day_keeps_the_rigid_body(another_day):
     assert all(a.friction_like > a.position_dependent for a in validation.actuators[3:])
 
 
-def test_a_third_of_another_day_recalibrates_the_rest_of_it(another_day):
+def test_recalibration_on_a_third_improves_the_rest(another_day):
     """The wrist's errors fall from 21..30 % to at most 20 % on the two thirds of the recording that were not used."""
     model, whole = another_day
     third = len(whole) // 3

@@ -61,7 +61,7 @@ def case(request):
     return model_of_all_effects(name, np.array(tilt))
 
 
-def test_the_holding_torque_is_the_dynamics_at_rest(case):
+def test_holding_torque_equals_the_dynamics_at_rest(case):
     """But for offsets where weight acts and no cable's cosine does: of all these, only the PSM's insertion has one."""
     arm, model, dynamics = case
     kept = [e for e in dynamics.section.effects if (e.coordinate, e.kind) != ("actuator.insertion", "offset")]
@@ -73,7 +73,7 @@ def test_the_holding_torque_is_the_dynamics_at_rest(case):
     np.testing.assert_allclose(model.holding_torque(q), at_rest, rtol=0, atol=1e-10)
 
 
-def test_an_offset_holds_where_no_weight_acts():
+def test_offset_is_a_holding_torque_without_gravity_load():
     """The MTM's outer yaw is vertical as it is expected to be mounted, also if a motion shows that it leans."""
     _, model, _ = model_of_all_effects("mtmr", np.array([0.4, 0.2, 0.0]))
     offsets = [e for e in model.dynamics.effects if e.kind == "offset" and e.coordinate.startswith("actuator.")]
@@ -83,7 +83,7 @@ def test_an_offset_holds_where_no_weight_acts():
     assert [offsets[i].coordinate for i in holding] == ["actuator.outer_yaw"]
 
 
-def test_of_a_loaded_file_too_and_what_contradicts_itself_is_refused(case, tmp_path):
+def test_loaded_model_is_equal_and_conflicts_are_rejected(case, tmp_path):
     arm, model, _ = case
     model.save(tmp_path / "model.yaml")
     q = arm.sample_poses(20, np.random.default_rng(1))
@@ -97,7 +97,7 @@ def test_of_a_loaded_file_too_and_what_contradicts_itself_is_refused(case, tmp_p
         dataclasses.replace(model, dynamics=dynamics).check()
 
 
-def test_poses_are_fitted_with_the_columns_that_a_motion_is_fitted_with(case):
+def test_poses_and_motions_use_the_same_columns(case):
     arm = case[0]
     effects = all_effects(arm)
     q = arm.sample_poses(50, np.random.default_rng(2))
@@ -110,7 +110,7 @@ def test_poses_are_fitted_with_the_columns_that_a_motion_is_fitted_with(case):
         np.testing.assert_allclose(column, arm.transmission.pull_back_effort(in_motion), atol=1e-12)
 
 
-def test_no_effect_runs_away_outside_of_what_was_recorded():
+def test_effects_are_bounded_outside_the_recorded_range():
     x = np.linspace(-50, 50, 2001)
     for kind in POSITION_KINDS:
         assert np.abs(ActuatorEffect("joint.yaw", kind, 0.7).column(x, 0 * x)).max() <= 1.0
@@ -120,7 +120,7 @@ def test_no_effect_runs_away_outside_of_what_was_recorded():
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_coordinates_that_move_alike_are_asked_for_once(name):
+def test_identical_coordinates_are_listed_once(name):
     arm = load_arm(name)
     rows = {c: joint_row(arm, c) for c in arm.effect_coordinates}
     kept = distinct_coordinates(arm)
@@ -134,7 +134,7 @@ def test_coordinates_that_move_alike_are_asked_for_once(name):
     )
 
 
-def test_the_work_along_a_coordinate_is_that_on_the_joints():
+def test_work_along_a_coordinate_equals_work_on_the_joints():
     arm, generator = load_arm("psm"), np.random.default_rng(5)
     q, dq = generator.normal(size=(2, 1, arm.num_joints))
     for coordinate in arm.effect_coordinates:

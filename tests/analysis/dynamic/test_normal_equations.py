@@ -29,7 +29,7 @@ def total(rows):
     return NormalEquations.of([(own, x[:, own]) for own, x in zip(OWN, X, strict=True)], COLUMNS, tau).total
 
 
-def test_sums_without_zero_columns_are_those_of_all_columns(rows, total):
+def test_sums_without_zero_columns_equal_the_full_sums(rows, total):
     X, tau = rows
     full = [np.column_stack([x, t]) for x, t in zip(X, tau.T, strict=True)]
     expected = [rows.T @ rows for rows in full]
@@ -41,7 +41,7 @@ def test_sums_without_zero_columns_are_those_of_all_columns(rows, total):
 
 
 @pytest.mark.parametrize("used", [np.arange(6), np.array([1, 3, 5]), np.array([0, 2, 4])])
-def test_an_unknown_that_is_added_gives_the_fit_with_it(total, used):
+def test_adding_an_unknown_equals_a_fit_with_it(total, used):
     """By the Schur complement, for one of any sign and one that is not negative."""
     sums, precision = total.weighted(WEIGHTS), np.linspace(0.1, 3.0, COLUMNS)
     fit = NonNegativeFit(sums, precision, NON_NEGATIVE, used, np.arange(8, 12))
@@ -52,7 +52,7 @@ def test_an_unknown_that_is_added_gives_the_fit_with_it(total, used):
         assert set(np.flatnonzero(anew)) <= set(chosen.tolist())
 
 
-def test_the_fit_is_that_of_the_rows(rows, total):
+def test_fit_from_sums_equals_fit_to_rows(rows, total):
     X, tau = rows
     precision = np.full(COLUMNS, 0.5)
     A = np.vstack([*(np.sqrt(w) * x for w, x in zip(WEIGHTS, X, strict=True)), np.diag(np.sqrt(precision))])

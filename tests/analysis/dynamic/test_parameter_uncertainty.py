@@ -8,7 +8,7 @@ import pytest
 from dvrk_drake.analysis.dynamic.estimates import ParameterUncertainty
 
 
-def test_columns_that_are_almost_the_same_are_named():
+def test_nearly_equal_columns_are_named():
     generator = np.random.default_rng(1)
     Y = generator.normal(0, 1, (500, 3))
     Y[..., 1] = Y[..., 0] + 0.1 * Y[..., 1]  # correlated by 0.995: the estimates by -0.995

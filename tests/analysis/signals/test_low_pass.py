@@ -18,7 +18,7 @@ def sine_and_cosine(x, frequency):
 
 
 @pytest.mark.parametrize("frequency", [2.0, 10.0, 18.0, 20.0, 22.0, 40.0])
-def test_low_pass_has_the_gain_of_its_definition_and_no_delay(frequency):
+def test_low_pass_has_the_butterworth_gain_and_no_delay(frequency):
     in_phase, late = sine_and_cosine(low_pass(np.sin(2 * np.pi * frequency * T), RATE, 20.0), frequency)
     # Butterworth's |H|^2, as it runs both ways; the bilinear transform bends the frequencies.
     ratio = np.tan(np.pi * frequency / RATE) / np.tan(np.pi * 20.0 / RATE)
@@ -39,7 +39,7 @@ def test_low_pass_halves_the_amplitude_at_each_columns_cut_off():
 
 @pytest.mark.parametrize("order", [2, 4, 6])
 @pytest.mark.parametrize("cut_off", [0.5, 18.0, 150.0])
-def test_low_pass_and_correlation_are_scipys(order, cut_off):
+def test_low_pass_and_correlation_equal_scipy(order, cut_off):
     x = np.random.default_rng(0).normal(size=(700, 5)).cumsum(axis=0)
     expected = sosfiltfilt(butter(order, cut_off, fs=RATE, output="sos"), x, axis=0)
     np.testing.assert_allclose(low_pass(x, RATE, cut_off, order), expected, rtol=1e-9, atol=1e-9)
@@ -47,7 +47,7 @@ def test_low_pass_and_correlation_are_scipys(order, cut_off):
     np.testing.assert_allclose(correlation(a, b), correlate(a, b), rtol=1e-9, atol=1e-6)
 
 
-def test_too_few_rows_for_the_filter_are_refused():
+def test_too_few_rows_for_the_filter_are_rejected():
     with pytest.raises(ValueError, match="needs more than 21 rows, got 21"):
         low_pass(np.zeros(21), RATE, 10.0)
 

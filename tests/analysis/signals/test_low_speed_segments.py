@@ -44,7 +44,7 @@ def test_rests_of_a_motion_are_found_and_identify_the_arm(arm):
         identify_static(recording, arm)
 
 
-def test_repetitions_are_one_part(arm):
+def test_repetitions_are_joined_to_one_segment(arm):
     generator = np.random.default_rng(1)
     a, b = arm.sample_poses(2, generator, margin=0.1)
     once, thrice = (
@@ -54,7 +54,7 @@ def test_repetitions_are_one_part(arm):
     np.testing.assert_allclose(once.recording.q, thrice.recording.q, atol=1e-3)
 
 
-def test_slow_parts_at_1_khz_are_those_at_200_hz(arm):
+def test_segments_at_1_khz_equal_those_at_200_hz(arm):
     poses = arm.sample_poses(6, np.random.default_rng(1), margin=0.1)
     motions = (motion_with_pauses(arm, poses, np.random.default_rng(2), rate=rate) for rate in (200.0, 1000.0))
     slow, fast = (low_speed_segments(motion, arm) for motion in motions)
@@ -62,7 +62,7 @@ def test_slow_parts_at_1_khz_are_those_at_200_hz(arm):
     assert fast.measured.sum(axis=0).min() >= 0.6 * len(poses)
 
 
-def test_a_rest_does_not_reach_over_a_gap(arm):
+def test_rest_ends_at_a_gap_in_the_times(arm):
     """Where samples are missing the arm may have been anywhere."""
     a, b = arm.sample_poses(2, np.random.default_rng(1), margin=0.1)
     recording = motion_with_pauses(arm, [a, b], np.random.default_rng(2), rest=2.0)
@@ -93,7 +93,7 @@ def test_rests_are_poses_of_all_joints(arm, rate, with_speeds):
     assert found.note == f"12 poses at which the arm rests are taken; {len(recording)} rows"
 
 
-def test_what_does_not_rest_is_left_as_it_is(arm):
+def test_recording_without_rests_is_unchanged(arm):
     generator = np.random.default_rng(4)
     poses = arm.sample_poses(12, generator, margin=0.1)
     moving = motion_with_pauses(arm, poses, generator, rest=0.0)
@@ -104,7 +104,7 @@ def test_what_does_not_rest_is_left_as_it_is(arm):
     assert static_poses(replace(moving, t=0.1 * np.arange(len(moving))), arm) is None
 
 
-def test_what_has_no_slow_parts_is_refused(arm):
+def test_recording_without_low_speed_segments_is_rejected(arm):
     q = np.zeros((50, 7))
     with pytest.raises(
         IdentificationError,
@@ -143,7 +143,7 @@ def real_parts(arm, shared_data, tmp_path_factory):
     return {name: parts_of(name) for name in ("psm_one", "psm_one_205g_insertion")}
 
 
-def test_a_real_excitation_motion_is_no_recording_of_poses(arm, real_parts):
+def test_segments_of_a_real_motion_do_not_increase_errors(arm, real_parts):
     """No joint of a model from its segments is worse than zero torque on another day, with or without a weight."""
     for name, other in (("psm_one", "psm_one_205g_insertion"), ("psm_one_205g_insertion", "psm_one")):
         parts, measured = real_parts[name][1]

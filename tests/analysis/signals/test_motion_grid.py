@@ -39,7 +39,7 @@ def grid():
     return motion_grid(recorded(), ARM, default_settings(ARM))
 
 
-def test_positions_velocities_and_accelerations_are_the_motions(grid):
+def test_grid_reproduces_the_motion(grid):
     inner = slice(400, -400)
     for found, true in zip((grid.q, grid.v, grid.vd), motion(grid.t), strict=True):
         np.testing.assert_allclose(found[inner], true[inner], atol=0.02 * np.abs(true - true.mean(axis=0)).max())
@@ -55,7 +55,7 @@ def test_actuator_coordinates_give_the_same_grid(grid):
     np.testing.assert_allclose(other.vd, grid.vd, atol=1e-6)
 
 
-def test_what_explains_an_effort_is_late_by_its_delay(grid):
+def test_predicted_efforts_have_the_effort_delay(grid):
     delays = [0.0, 0.004, -0.01, 0.0, 0.02, 0.0, 0.0]
     settings = SignalSettings(50.0, [20.0] * N, 20.0, delays)
     late = replace(grid, settings=settings)
@@ -67,7 +67,7 @@ def test_what_explains_an_effort_is_late_by_its_delay(grid):
 
 
 @pytest.mark.parametrize(("seconds", "rate"), [(4.9, 200.0), (12.0, 45.0)])
-def test_short_and_coarse_motions_are_refused(seconds, rate):
+def test_short_and_coarse_motions_are_rejected(seconds, rate):
     with pytest.raises(RecordingError, match=rf"motion\.csv: {seconds} s at {rate:g} Hz; .* at least 5 s at 50 Hz"):
         motion_grid(recorded(seconds, rate), ARM, default_settings(ARM))
 
@@ -75,7 +75,7 @@ def test_short_and_coarse_motions_are_refused(seconds, rate):
 # Folds
 
 
-def test_folds_of_a_motion_that_repeats_go_by_phase(grid):
+def test_folds_of_a_periodic_motion_follow_the_phase(grid):
     assert period_of(grid) == pytest.approx(PERIOD, abs=1e-3)
     fold, edge = phase_folds(grid, PERIOD)
     t = grid.row_times[grid.inner]
@@ -90,7 +90,7 @@ def test_folds_of_a_motion_that_repeats_go_by_phase(grid):
     assert np.all(edge[:, 1][until < GAP - rounding]) and not np.any(edge[:, 1][until > GAP + rounding])
 
 
-def test_folds_of_a_motion_that_does_not_repeat_are_stretches(grid):
+def test_folds_of_an_aperiodic_motion_are_contiguous(grid):
     fold, _ = phase_folds(grid, None, 5)
     assert np.all(np.diff(fold) >= 0)
     np.testing.assert_allclose(np.bincount(fold), len(fold) / 5, atol=1)
@@ -101,7 +101,7 @@ def test_folds_of_a_motion_that_does_not_repeat_are_stretches(grid):
 # Efforts
 
 
-def test_parts_of_the_efforts_add_up_to_the_models(grid):
+def test_parts_of_the_efforts_add_up_to_the_model(grid):
     t = np.arange(0, 8, 1e-3)
     effects = friction_everywhere(ARM, (t, *motion(t)))
     model = true_dynamics(ARM, np.random.default_rng(0), effects)

@@ -35,7 +35,7 @@ def recorded(at, t=None):
 
 
 @pytest.mark.parametrize(("gain", "lag"), [(1.0, 0.0), (1.2, 0.0), (-1.0, 0.0), (1.0, 0.012), (0.9, -0.006)])
-def test_gain_and_lag_of_recorded_velocities_are_found(gain, lag):
+def test_gain_and_lag_of_recorded_velocities_are_estimated(gain, lag):
     t = np.arange(3000) / RATE
     found = velocity_agreement(motion(t)[0], gain * motion(t - lag)[1], RATE)
     np.testing.assert_allclose(found.gain, gain, rtol=0.01, atol=1e-12)
@@ -44,7 +44,7 @@ def test_gain_and_lag_of_recorded_velocities_are_found(gain, lag):
     assert np.all(found.agrees == (gain == 1.0 and lag == 0.0))
 
 
-def test_a_joint_at_rest_says_nothing_of_its_velocity():
+def test_velocity_of_a_joint_at_rest_is_not_evaluated():
     t = np.arange(2000) / RATE
     q, v, _ = motion(t)
     q[:, 1] = 0.4
@@ -58,7 +58,7 @@ def test_a_joint_at_rest_says_nothing_of_its_velocity():
 # Times
 
 
-def test_true_times_are_found_from_positions_and_velocities():
+def test_true_times_follow_from_positions_and_velocities():
     generator = np.random.default_rng(0)
     intervals = generator.gamma(25.0, 1 / (25.0 * RATE), 2000)  # 20 % jitter
     at = np.concatenate([[0.0], np.cumsum(intervals)])
@@ -72,7 +72,7 @@ def test_true_times_are_found_from_positions_and_velocities():
     np.testing.assert_array_equal(kept.t, at)
 
 
-def test_rows_that_repeat_the_row_before_are_left_out():
+def test_repeated_rows_are_omitted():
     t = np.arange(400) / RATE
     whole = recorded(t)
     last = np.arange(400)
@@ -85,7 +85,7 @@ def test_rows_that_repeat_the_row_before_are_left_out():
     assert not np.any(repeated_rows(replace(polled, qd=np.zeros_like(polled.qd), q=0 * polled.q, tau=0 * polled.q)))
 
 
-def test_times_that_do_not_increase_are_refused():
+def test_times_that_do_not_increase_are_rejected():
     recording = recorded(np.arange(300) / RATE)
     for row, t in ((150, 0.7), (150, 0.745)):
         times = recording.t.copy()
@@ -102,7 +102,7 @@ def test_times_that_do_not_increase_are_refused():
 
 
 @pytest.mark.parametrize("velocities", ["right", "none", "of the wrong sign"])
-def test_signals_are_those_of_the_motion(velocities):
+def test_signals_reproduce_the_motion(velocities):
     recording = recorded(np.arange(3000) / RATE)
     qd = {"right": recording.qd, "none": None, "of the wrong sign": -recording.qd}[velocities]
     signals = motion_signals(replace(recording, qd=qd), 20.0)
@@ -137,7 +137,7 @@ def delayed(lag, coulomb=0.3):
 
 
 @pytest.mark.parametrize("lag", [-0.01, 0.0, 0.005, 0.018])
-def test_a_delay_of_the_efforts_is_found(lag):
+def test_delay_of_the_efforts_is_estimated(lag):
     found = effort_lag(delayed(lag), np.ones(3, bool))
     np.testing.assert_allclose(found.lag, lag, atol=1e-3)
     assert np.all(found.determined == (lag != 0.0))
@@ -164,7 +164,7 @@ def test_a_joint_or_an_effort_at_rest_has_no_lag():
     assert signals.rate > 2 * CUT_OFF
 
 
-def test_efforts_that_go_against_the_model_are_refused():
+def test_efforts_opposite_to_the_model_are_rejected():
     t = np.arange(1000) / RATE
     expected, names = motion(t)[0], ("yaw", "pitch", "roll")
     recording = Recording(q=expected, source="motion.csv")

@@ -32,7 +32,7 @@ def test_a_motion_that_does_not_repeat_has_no_period():
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.3])
-def test_the_repeatability_floor_is_the_share_of_the_noise(noise):
+def test_repeatability_floor_equals_the_noise_share(noise):
     signal = repeating(5.0)
     tau = signal + noise * np.random.default_rng(2).normal(size=signal.shape)
     floor = repeatability_floor(tau, RATE, 5.0, RATE)  # a cut-off that lets all pass
@@ -55,7 +55,7 @@ def test_spectra_separate_noise_from_signal(period):
     )
 
 
-def test_the_cut_off_is_where_noise_begins():
+def test_cut_off_is_where_noise_exceeds_the_signal():
     generator = np.random.default_rng(4)
     tones = np.arange(0.4, 12.0, 0.2)
     phases = generator.uniform(0, 2 * np.pi, len(tones))
@@ -67,7 +67,7 @@ def test_the_cut_off_is_where_noise_begins():
     assert MIN_CUT_OFF <= found[1] < 4.0
 
 
-def test_a_narrow_band_of_noise_is_found():
+def test_narrow_band_of_noise_is_detected():
     generator = np.random.default_rng(5)
     quiet = repeating(5.0) + 0.02 * generator.normal(size=(len(T), 2))
     assert narrow_band(spectra(quiet, RATE, 5.0), 0) is None

@@ -25,7 +25,7 @@ def moving(count=3, rest=0.5, travel=0.5):
     return poses, motion_with_pauses(ARM, poses, generator, travel=travel, rest=rest)
 
 
-def test_runs_end_where_the_arm_moves_or_has_crept_away():
+def test_runs_end_at_motion_or_drift():
     still = np.array([0, 1, 1, 1, 0, 1, 1, 0, 1, 1, 1, 1, 1, 1], bool)
     q = np.zeros((14, 2))
     q[11:, 1] = 0.2  # beyond `same` of the first row of the run
@@ -45,7 +45,7 @@ def test_velocities_are_smoothed_without_delay():
         np.testing.assert_allclose(v[200:-200], (2 * np.pi * np.cos(2 * np.pi * t))[200:-200], atol=0.01)
 
 
-def test_rests_are_where_the_arm_was_put():
+def test_rests_are_at_the_commanded_poses():
     poses, recording = moving()
     rests = static_poses(recording, ARM)
     np.testing.assert_allclose(rests.q, poses, atol=1e-3)
@@ -54,7 +54,7 @@ def test_rests_are_where_the_arm_was_put():
     assert len(static_poses(moving(rest=0.15)[1], ARM)) == 0
 
 
-def test_what_is_no_motion_has_no_rests():
+def test_poses_and_short_recordings_have_no_rests():
     _, recording = moving()
     t = recording.t
     assert recording.is_motion and recording.has_increasing_times
@@ -65,7 +65,7 @@ def test_what_is_no_motion_has_no_rests():
     assert not Recording(q=recording.q[:99], t=t[:99]).is_motion
 
 
-def test_poses_come_from_rests_or_are_left_as_they_are():
+def test_poses_come_from_rests_or_are_unchanged():
     poses, recording = moving(count=12)
     found = find_poses(recording, ARM)
     np.testing.assert_allclose(found.recording.q, poses, atol=1e-3)
@@ -78,7 +78,7 @@ def test_poses_come_from_rests_or_are_left_as_they_are():
     assert find_poses(table, ARM).recording is table
 
 
-def test_a_motion_whose_times_go_back_is_refused():
+def test_motion_with_decreasing_times_is_rejected():
     _, recording = moving()
     t = recording.t.copy()
     t[150] = t[148]

@@ -59,7 +59,7 @@ def true_torque(arm, ground_truth_arm, poses):
     return tau
 
 
-def test_the_true_torque_is_found_through_the_closed_linkage(arm, ground_truth_arm, recording):
+def test_true_torque_is_identified_with_the_closed_linkage(arm, ground_truth_arm, recording):
     np.testing.assert_allclose(recording.tau, true_torque(arm, ground_truth_arm, recording.q), atol=1e-3)
     model = identify_static(recording, arm).model
     fresh = arm.sample_poses(100, np.random.default_rng(7), margin=0.1)
@@ -72,7 +72,7 @@ def test_the_true_torque_is_found_through_the_closed_linkage(arm, ground_truth_a
     assert "joint.yaw cable sine 1" not in found
 
 
-def test_the_verbs_take_a_psm(arm, recording, tmp_path, capsys):
+def test_commands_accept_a_psm(arm, recording, tmp_path, capsys):
     poses, model, prediction, errors = (tmp_path / n for n in ("poses.csv", "model.yaml", "tau.csv", "errors.json"))
     write_recording(recording, poses)
     assert (
@@ -86,7 +86,7 @@ def test_the_verbs_take_a_psm(arm, recording, tmp_path, capsys):
     np.testing.assert_allclose(tau, IdentifiedModel.load(model).holding_torque(recording.q), atol=1e-12)
 
 
-def test_a_long_name_of_a_parameter_costs_no_digit(capsys):
+def test_long_parameter_names_keep_all_digits(capsys):
     assert main(["model", "--arm", "psm"]) == 0
     text = capsys.readouterr().out
     assert "…" not in text
@@ -105,7 +105,7 @@ def test_a_long_name_of_a_parameter_costs_no_digit(capsys):
         (lambda r: Recording(q=r.q, tau=r.tau + 1000 * np.eye(7)[2]), "insertion (tau3) exceed its limit of 9.88"),
     ],
 )
-def test_bad_recordings_are_refused_in_one_line(recording, tmp_path, capsys, spoil, message):
+def test_bad_recordings_are_rejected_in_one_line(recording, tmp_path, capsys, spoil, message):
     path, model = tmp_path / "bad.csv", tmp_path / "model.yaml"
     write_recording(spoil(recording), path)
     assert main(["identify", str(path), "--arm", "psm", "--output", str(model)]) == 2
@@ -113,13 +113,13 @@ def test_bad_recordings_are_refused_in_one_line(recording, tmp_path, capsys, spo
     assert not model.exists()
 
 
-def test_an_instrument_that_does_not_exist_is_refused_in_one_line(tmp_path, capsys):
+def test_unknown_instrument_is_rejected_in_one_line(tmp_path, capsys):
     (tmp_path / "arm.yaml").write_text("name: PSM\nmechanism: psm\ninstrument: scissors\nposition_limits: {}\n")
     assert main(["model", "--arm", str(tmp_path / "arm.yaml")]) == 2
     assert 'unknown instrument "scissors"; known instruments: large_needle_driver' in refusal(capsys.readouterr().err)
 
 
-def test_a_joint_that_slides_has_no_spring_in_an_angle(arm):
+def test_prismatic_joint_has_no_angular_spring(arm):
     model = IdentifiedModel.from_arm(arm)
     model.effects = [DriveEffect("joint.insertion", "cable sine", 1.0, 1.0)]
     with pytest.raises(ModelError, match=r"effects\[0\]: kind cable sine is of an angle, and joint.insertion slides"):

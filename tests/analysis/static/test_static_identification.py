@@ -50,7 +50,7 @@ def test_least_squares_recovers_exact_parameters(arm):
     assert model.provenance.rank == 12
 
 
-def test_robust_method_recovers_parameters_and_finds_the_effects(arm):
+def test_robust_method_recovers_parameters_and_effects(arm):
     effects = tuple(ActuatorEffect(f"joint.wrist_{which}", "cable sine", 1.0) for which in ("platform", "pitch"))
     recording, _ = simulated(arm, noise=0.005, effects=effects, coefficients=(0.05, -0.05), seed=4)
     model = identify_static(recording, arm).model
@@ -77,7 +77,7 @@ def test_standard_errors_cover_the_truth_at_the_nominal_rate(arm):
     assert 0.90 < np.mean(inside) <= 0.99
 
 
-def test_left_out_residuals_are_those_of_a_fit_without_the_pose():
+def test_leave_one_out_residuals_equal_a_fit_without_the_pose():
     generator = np.random.default_rng(0)
     X, tau = generator.normal(size=(12, 3, 4)), generator.normal(size=(12, 3))
     weights, prior = generator.uniform(0.5, 2, (12, 3)), np.array([0.0, 0.1, 1.0, 0.0])
@@ -100,7 +100,7 @@ def test_gross_outliers_do_not_move_the_robust_fit():
     assert fit.outliers[5:9, 1].all()
 
 
-def test_poses_on_a_stop_are_doubted_and_named(arm):
+def test_poses_at_a_stop_are_excluded_and_named(arm):
     recording, _ = simulated(arm, poses=40, noise=0.002)
     q, tau = recording.q.copy(), recording.tau.copy()
     q[3, 1:3] = [-0.15, -0.2]  # the sum is below -0.33
@@ -120,7 +120,7 @@ def test_poses_on_a_stop_are_doubted_and_named(arm):
     np.testing.assert_allclose(with_dirt.theta[:3], without.theta[:3], rtol=0.05, atol=0)
 
 
-def test_a_joint_that_measures_nothing_gets_no_torque(arm):
+def test_joint_without_measured_torque_has_no_feedforward(arm):
     recording, _ = simulated(arm, noise=0.002)
     tau = recording.tau.copy()
     tau[:, 6] = 1e-5
@@ -129,7 +129,7 @@ def test_a_joint_that_measures_nothing_gets_no_torque(arm):
     assert np.all(model.holding_torque(recording.q)[:, 6] == 0.0)
 
 
-def test_pure_friction_hardly_makes_a_joint_worse_than_zero_torque(arm):
+def test_pure_friction_is_not_worse_than_zero_torque(arm):
     """Wrist torques that have nothing to do with the pose, judged on other poses: over seeds, no harm beyond chance."""
     ratios = []
     for seed in range(6):
@@ -164,7 +164,7 @@ def test_actuator_coordinates_give_the_same_model(arm):
     )
 
 
-def test_too_few_poses_and_too_low_a_rank_are_refused(arm):
+def test_too_few_poses_and_too_low_rank_are_rejected(arm):
     recording, _ = simulated(arm, poses=4)
     with pytest.raises(IdentificationError, match="has 4 distinct poses, too few"):
         identify_static(recording, arm)
@@ -176,7 +176,7 @@ def test_too_few_poses_and_too_low_a_rank_are_refused(arm):
         identify_static(same, arm)
 
 
-def test_samples_of_one_pose_cannot_vouch_for_each_other(arm):
+def test_repeated_samples_are_averaged_before_validation(arm):
     """10 samples each of 12 poses with friction per pose are what their 12 averages are."""
     recording, _ = simulated(arm, poses=12)
     generator = np.random.default_rng(5)
@@ -193,7 +193,7 @@ def test_samples_of_one_pose_cannot_vouch_for_each_other(arm):
     np.testing.assert_allclose(ours.model.theta, reference.model.theta, atol=1e-9)
 
 
-def test_a_joint_that_did_not_move_gets_no_torque(arm):
+def test_joint_that_did_not_move_has_no_feedforward(arm):
     recording, _ = simulated(arm, poses=40)
     generator = np.random.default_rng(0)
     q = recording.q.copy()
@@ -207,13 +207,13 @@ def test_a_joint_that_did_not_move_gets_no_torque(arm):
         assert error.rms_error <= error.rms_torque, error
 
 
-def test_torques_in_the_wrong_unit_are_refused(arm):
+def test_torques_in_the_wrong_unit_are_rejected(arm):
     recording, _ = simulated(arm)
     with pytest.raises(RecordingError, match=r"are they in N m"):
         identify_static(dataclasses.replace(recording, tau=1000 * recording.tau), arm)
 
 
-def test_moving_recording_is_refused(arm):
+def test_moving_recording_is_rejected(arm):
     recording, _ = simulated(arm)
     t = 0.005 * np.arange(len(recording))
     for moving in (
@@ -226,7 +226,7 @@ def test_moving_recording_is_refused(arm):
     assert identify_static(dataclasses.replace(recording, t=8.0 * np.arange(len(recording))), arm, "paper")
 
 
-def test_model_file_round_trip_and_refusals(arm, tmp_path):
+def test_model_file_round_trip_and_rejections(arm, tmp_path):
     spring = ActuatorEffect("joint.wrist_pitch", "cable sine", 1.0)
     recording, _ = simulated(arm, noise=0.002, effects=(spring,), coefficients=(-0.05,))
     model = identify_static(recording, arm).model
@@ -258,7 +258,7 @@ def test_model_file_round_trip_and_refusals(arm, tmp_path):
             IdentifiedModel.load(tmp_path / "bad.yaml")
 
 
-def test_a_model_file_finds_its_arm_after_both_have_moved_and_one_of_version_2_is_read(tmp_path):
+def test_moved_model_files_and_version_2_files_are_loaded(tmp_path):
     (tmp_path / "arms").mkdir()
     shutil.copy(MODELS_FOLDER / "arms" / "mtmr.yaml", tmp_path / "arms" / "own.yaml")
     IdentifiedModel.from_arm(load_arm(str(tmp_path / "arms" / "own.yaml"))).save(tmp_path / "model.yaml")
@@ -287,7 +287,7 @@ def test_a_model_file_finds_its_arm_after_both_have_moved_and_one_of_version_2_i
 # The paper's own recording.
 
 
-def test_paper_method_reproduces_the_papers_figure_4(arm, shared_data):
+def test_paper_method_reproduces_figure_4(arm, shared_data):
     recording = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
     result = identify_static(recording, arm, "paper")
     with open(shared_data / "mtm_static/paper_fig4_squared_errors.csv") as stream:
@@ -310,14 +310,14 @@ def test_paper_method_reproduces_the_papers_figure_4(arm, shared_data):
 @pytest.mark.parametrize(
     "name", ["mtm_2015_good72", "mtm_2015_apr18_all80", "mtmr_2017_sweep40", "mtmr_2017_coupled12_may10"]
 )
-def test_default_method_is_never_worse_than_zero_torque_on_left_out_poses(arm, shared_data, name):
+def test_default_method_beats_zero_torque_on_held_out_poses(arm, shared_data, name):
     model = identify_static(read_recording(shared_data / f"mtm_static/{name}.csv"), arm).model
     for joint in model.joints:
         assert joint.rms_leave_one_out_included <= joint.rms_zero_torque_included, joint
         assert joint.rms_cross_validation_included <= 1.02 * joint.rms_zero_torque_included, joint
 
 
-def test_default_method_beats_the_paper_on_left_out_poses(arm, shared_data):
+def test_default_method_beats_the_paper_on_held_out_poses(arm, shared_data):
     recording = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
     ours, paper = identify_static(recording, arm), identify_static(recording, arm, "paper")
     excluded = np.zeros(recording.q.shape, bool)
@@ -329,14 +329,14 @@ def test_default_method_beats_the_paper_on_left_out_poses(arm, shared_data):
         assert rms[0] < rms[1], arm.joint_names[j]
 
 
-def test_another_day_of_the_same_arm_is_predicted_better_than_by_zero_torque(arm, shared_data):
+def test_prediction_of_another_day_beats_zero_torque(arm, shared_data):
     model = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_good72.csv"), arm).model
     other = validate_static(model, read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"))
     for joint in other.joints:
         assert joint.rms_error_included <= joint.rms_torque_included, joint
 
 
-def test_dirty_recording_names_the_poses_that_press_on_a_stop(arm, shared_data):
+def test_poses_at_a_stop_are_named_in_a_real_recording(arm, shared_data):
     result = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"), arm)
     # Lines of the file; line 72 repeats the pose of line 62.
     line = {d: int(d.where.rpartition(":")[2]) for d in result.excluded}
