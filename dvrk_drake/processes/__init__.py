@@ -1,1 +1,1 @@
-"""What runs as a process of its own beside others, over LCM and by the wall clock."""
+"""Separate processes that communicate over LCM and run in real time."""

@@ -1,4 +1,4 @@
-"""The controller that answers an arm's status messages, one command each, without a clock of its own."""
+"""Controller of one arm that computes one command for each status message and has no clock of its own."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
 
 class ArmController:
-    """Gravity compensation or a pose hold of one arm, from status to command.
+    """Gravity compensation or pose hold of one arm, from status message to command message.
 
-    A Diagram of DvrkStatusReceiver, GravityPidController, FrictionCompensator if wanted, EffortRamp and
-    DvrkCommandSender, stepped by forced updates: one status in, one command out, nothing in between waits for a period.
-    Whenever efforts do not act yet, or not any more, it commands the measured efforts; when they begin to act it ramps
-    to its own, and latches the pose to hold.
+    The controller is a Diagram of DvrkStatusReceiver, GravityPidController, an optional FrictionCompensator, EffortRamp
+    and DvrkCommandSender. It is stepped by forced updates, so that each status produces one command without waiting for
+    a period. While its efforts are not applied, it commands the measured efforts. When they begin to be applied, it
+    latches the pose to hold and ramps to its own efforts.
 
     Attributes:
-        arm: which it controls.
+        arm: Arm that is controlled.
     """
 
     def __init__(
@@ -39,15 +39,15 @@ class ArmController:
         friction: FrictionCompensator | None = None,
         gains: Gains | None = None,
     ) -> None:
-        """Of `arm`, carried by `model`.
+        """Creates the controller of `arm`, whose gravity is computed by `model`.
 
         Args:
-            arm: named in the messages.
-            model: of that arm, mounted as it is.
-            mode: of the controller.
-            period: in which statuses come [s].
-            friction: takes friction off the hand in mode "gravity"; becomes part of this controller.
-            gains: to hold or to brake with; the arm's own by default.
+            arm: Arm whose name is in the messages.
+            model: Model of that arm in its actual mounting.
+            mode: Mode of the controller.
+            period: Period of the status messages [s].
+            friction: Compensator of friction in mode "gravity". It becomes part of this controller.
+            gains: Gains for holding and braking. Defaults to the gains of the arm.
         """
         builder = DiagramBuilder()
         self.arm, self._mode = arm, mode
@@ -69,7 +69,7 @@ class ArmController:
         builder.ConnectInput(status, self._sender.GetInputPort("lcmt_dvrk_status"))
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
-        # Fixed once: FixValue would deep-copy each message, which costs more than all the rest of an answer.
+        # The ports are fixed once: FixValue would deep-copy each message, which takes longer than the rest of a step.
         port = self._diagram.GetInputPort("lcmt_dvrk_status")
         self._status = port.FixValue(self._context, AbstractValue.Make(lcmt_dvrk_status()))
         self._ramp_context = self._ramp.GetMyMutableContextFromRoot(self._context)
@@ -79,25 +79,26 @@ class ArmController:
 
     @property
     def sender_id(self) -> int:
-        """By which the arm tells this controller from others."""
+        """Identifier of this controller in its command messages."""
         return self._sender.sender_id
 
     @property
     def acting(self) -> bool:
-        """Whether, at the last status, this controller's efforts acted."""
+        """True if the efforts of this controller were applied at the last status."""
         return self._acting
 
     @property
     def ramped(self) -> bool:
-        """Whether they have become the wanted ones in full."""
+        """True if the ramp to the desired efforts is complete."""
         return self._acting and self._ramp.GetShare(self._ramp_context) >= 1
 
     def answer(
         self, status: lcmt_dvrk_status, time: float, desired_state: NDArray[np.float64] | None = None
     ) -> lcmt_dvrk_command:
-        """The command that answers `status` at `time` [s] of the controller's own clock.
+        """Computes the command for `status`, received at `time` [s] of the controller's clock.
 
-        `desired_state` (2n: q_d, then v_d) is what "hold" regulates to; without it, always, the latched pose.
+        In mode "hold" the arm is regulated to `desired_state` (2n: q_d, then v_d), if given. Otherwise it is regulated
+        to the latched pose.
         """
         context = self._context
         context.SetTime(time)
@@ -113,9 +114,9 @@ class ArmController:
         return self._sender.get_output_port().Eval(self._sender_context)
 
     def _act(self, acting: bool) -> None:
-        """Whether efforts act from now on: then the ramp begins, and the pose to hold is latched anew."""
+        """Sets whether efforts are applied from now on. If so, restarts the ramp and latches the pose to hold."""
         self._acting = acting
         self._ramp.GetInputPort("enabled").FixValue(self._ramp_context, np.array([float(acting)]))
-        # At the change to "hold" the pose is latched anew and the integrator is empty.
+        # The change to "hold" latches the pose again and resets the integrator.
         controller_context = self._controller.GetMyMutableContextFromRoot(self._context)
         self._controller.SetMode(controller_context, self._mode if acting else "gravity")

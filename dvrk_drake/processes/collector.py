@@ -1,4 +1,4 @@
-"""Leads an arm from pose to pose and measures what holds it there: steps 4 to 6 of the paper's section III.G."""
+"""Moves an arm to a sequence of poses and measures holding efforts: steps 4 to 6 of section III.G of the paper."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
 from dvrk_drake.processes.teacher import Leg, RestDetector
 from dvrk_drake.recordings.pose_file import CollectionFile
 
-#: The way goes on by no more than this between two statuses [s]: after a pause of the computer it does not jump.
+#: Largest time step of the trajectory between two statuses [s], so that it does not jump after a pause of the computer.
 _MAX_STEP = 0.01
-#: How long the arm may take to let efforts act [s].
+#: Longest time until the arm applies efforts [s].
 _START = 10.0
-#: The arm rests within this [rad], [m] and 1.5 encoder counts for so long [s]; a pose at which it does not within
-#: `_SETTLE` [s] is left out.
+#: Tolerance of an arm at rest [rad], [m], to which 1.5 encoder counts are added. Time for which the arm must stay
+#: within the tolerance [s]. Time after which a pose is skipped because the arm did not come to rest [s].
 _REST, _REST_TIME, _SETTLE = (2e-3, 2e-4), 0.5, 10.0
-#: Measurements are averaged for so long [s].
+#: Time over which measurements are averaged [s].
 _MEASURE = 0.25
-#: When stopped on the way, it comes to rest in this time [s].
+#: Duration of braking after a stop during a motion [s].
 _BRAKE = 0.3
-#: Further from where it shall be than this share of its range, a joint does not follow.
+#: Largest tracking error of a joint as a share of its range.
 _ASTRAY = 0.1
-#: An approach begins where the controller's proportional effort to the pose is this share of the effort limit: dry
-#: friction of up to half of that is turned round on the way.
+#: Proportional effort of the controller at the start of an approach, as a share of the effort limit. Static friction of
+#: up to half of it is reversed during the approach.
 _APPROACH = 0.3
 
 Steps = Generator[None, None, None]
@@ -40,12 +40,12 @@ Steps = Generator[None, None, None]
 
 @dataclass(frozen=True)
 class CollectionSettings:
-    """How poses are collected.
+    """Settings of a pose collection.
 
     Attributes:
-        traverse_time: in which a joint may cross its range [s]: the speed on the way.
-        both_sides: each pose is approached from below and from above in all joints and the means of both
-            measurements are taken, which cancels dry friction; else measured once, as the paper does.
+        traverse_time: Time in which a joint may cross its range [s]. It determines the speed between poses.
+        both_sides: If true, each pose is approached from below and from above in all joints and the two measurements
+            are averaged, which cancels Coulomb friction. If false, each pose is measured once, as in the paper.
     """
 
     traverse_time: float = field(default=5.0, metadata=within(1.0, 60.0, "s"))
@@ -57,16 +57,16 @@ class CollectionSettings:
 
 
 class Collector:
-    """What a controller in "hold" mode shall regulate to, from status to status, until all poses are measured.
+    """Computes the desired state of a controller in "hold" mode, one per status, until all poses are measured.
 
-    Whatever happens it ends with `finished`, and whoever steps it then leaves the arm to its own hold: at the end, when
-    asked to stop (after braking), when the arm takes over, when a joint does not follow, when the disk is full.
+    The collection always ends with `finished`, and the caller then lets the arm hold itself. It ends after the last
+    pose, after a requested stop (with braking), and if the arm takes over, a joint does not follow or the disk is full.
 
     Attributes:
-        finished: there is nothing more to do.
-        problem: why it ended early, if not because it was asked to.
-        unsettled: numbers of the poses that were left out because the arm did not come to rest, from 1.
-        done: (m,) which poses are in the file.
+        finished: True after the end of the collection.
+        problem: Reason for an early end that was not requested.
+        unsettled: Numbers of the poses that were skipped because the arm did not come to rest, starting at 1.
+        done: Boolean array (m,), true for poses that are in the file.
     """
 
     def __init__(
@@ -80,16 +80,16 @@ class Collector:
         report: Callable[[str], None] = lambda line: None,
         writer: Executor | None = None,
     ) -> None:
-        """Of the controller's arm.
+        """Creates a collector for the arm of `controller`.
 
         Args:
-            poses: (m, n), checked before; those in `output` already are skipped.
-            controller: makes the commands.
-            output: takes the measurements.
-            settings: how.
-            stopped: asked once a status.
-            report: hears a line a finished pose.
-            writer: runs the writing of rows; default: a thread of its own.
+            poses: Poses (m, n) that were already checked. Poses that are already in `output` are skipped.
+            controller: Controller that computes the commands.
+            output: File for the measurements.
+            settings: Settings of the collection.
+            stopped: Function that returns whether to stop. It is called once per status.
+            report: Function that is called with one line per completed pose.
+            writer: Executor that writes rows. Defaults to a separate thread.
         """
         self.finished = False
         self.problem: DvrkDrakeError | None = None
@@ -108,17 +108,17 @@ class Collector:
         self._leg_end = 0.0
         self._stopping = self._hand_guided = False
         self._what = "waiting for the arm"
-        # The disk may take longer than the arm waits for a command.
+        # Writing to disk may take longer than the arm waits for a command.
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
         self._steps = self._collect()
 
     def lead(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:
-        """The desired state (2n) after that status. Time goes by the arm's clock, so that a slow one is not hurried."""
+        """Returns the desired state (2n) after a status. Time is that of the arm, which may be slow."""
         measured = 1e-6 * status.utime
         self._time += min(max(measured - self._heard, 0.0), _MAX_STEP)
         self._heard = measured
         self._answers.add(time)
-        # Not controller.acting, which tells of the status before: this one may say already what went wrong.
+        # controller.acting refers to the previous status. This status may already report the problem.
         if (status.guard_state, status.command_sender_id) == (status.STATE_EFFORT, self._controller.sender_id):
             self._obeyed = status
         self._q, self._tau = np.array(status.position), np.array(status.effort_measured)
@@ -138,12 +138,12 @@ class Collector:
         return self._desired
 
     def close(self) -> None:
-        """Ends the file; a row that is being written is written first."""
+        """Closes the file after a pending row is written."""
         self._writer.shutdown()
         self._output.close()
 
     def describe(self) -> str:
-        """How it goes, in a few words."""
+        """Returns a short description of the progress."""
         return f"{np.count_nonzero(self.done)} of {len(self.done)} poses, {self._what}"
 
     def _check(self, status: lcmt_dvrk_status) -> None:
@@ -170,7 +170,7 @@ class Collector:
                 self._report(f"pose {k + 1} measured, {count} of {len(self.done)}; about {left / 60:.1f} min left")
 
     def _begin(self) -> Steps:
-        """Until the efforts act in full; the arm is wanted where it was when they began to."""
+        """Waits until the efforts are fully applied. The desired pose is the one at which they began to be applied."""
         began = self._time
         while not self._controller.acting:
             if self._time - began > _START:
@@ -186,7 +186,7 @@ class Collector:
             yield
 
     def _visit(self, k: int) -> Steps:
-        """Measures pose `k` from one side or both."""
+        """Measures pose `k` from one or both sides."""
         pose = self._poses[k]
         measured: list[NDArray[np.float64]] = []
         for side in (-1, 1) if self._settings.both_sides else (0,):
@@ -218,7 +218,7 @@ class Collector:
         self._desired = leg.state(leg.duration)
 
     def _settle(self) -> Generator[None, None, bool]:
-        """Whether the arm came to rest in time."""
+        """Waits for the arm to come to rest and returns whether it did in time."""
         tolerance = self._arm.per_joint(*_REST) + 1.5 * self._arm.encoder_counts()
         detector = RestDetector(tolerance, _REST_TIME)
         end = self._time + _SETTLE
@@ -229,7 +229,7 @@ class Collector:
         return True
 
     def _measure(self) -> Generator[None, None, NDArray[np.float64]]:
-        """Means of q, then tau (2n,)."""
+        """Returns the means of q, then tau (2n,)."""
         end = self._time + _MEASURE
         samples = []
         while self._time < end:
@@ -249,7 +249,7 @@ class Collector:
         self.done[k] = True
 
     def _brake(self) -> Steps:
-        """To rest, at the end of the leg if that is near; on the way a shorter stop stays inside the limits."""
+        """Brakes to rest, at the end of the leg if that is close. A shorter stop on the leg stays inside the limits."""
         self._what = "stopping"
         if self._hand_guided:
             duration = min(_BRAKE, max(self._leg_end - self._time, 1e-3))

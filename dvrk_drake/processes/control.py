@@ -1,4 +1,4 @@
-"""A process that controls one arm over LCM: `dvrk-drake run`."""
+"""Process that controls one arm over LCM, started by `dvrk-drake run`."""
 
 from __future__ import annotations
 
@@ -26,37 +26,37 @@ from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.processes.live_status import AnswerTimes, LiveStatus, LiveStatusMaker, takeover_reason
 from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
 
-#: Without a status for this long there is no arm [s]; at first it may have to be started.
+#: Time without a status after which an arm is considered absent, and the longer time for its first status [s].
 _SILENCE, _FIRST_WAIT = 1.0, 10.0
 
-#: Measurements may not be further apart [us]: a PSM held with its own gains swings at 7 ms, an MTM at 10 ms.
+#: Longest period of the measurements [us]. With its own gains a PSM becomes unstable at 7 ms and an MTM at 10 ms.
 _MAX_PERIOD = 5000
 
-#: Statuses that wait, beyond which new ones are dropped; and how many are handled at once, so that a flood cannot keep
-#: a controller from answering.
+#: Length of the queue of statuses, beyond which new ones are dropped. Number of statuses that are processed at once, so
+#: that a flood of messages cannot keep a controller from responding.
 _QUEUE, _MESSAGES_AT_ONCE = 100, 200
 
-#: How many statuses are looked at before an arm is controlled.
+#: Number of statuses that are inspected before an arm is controlled.
 _FIRST_STATUSES = 60
 
-#: How long the arm may take to confirm that it holds by itself [s].
+#: Longest time until the arm confirms that it holds itself [s].
 _RELEASE = 1.0
 
-#: The longest time for which a guard may remember a sender that is silent, and a little [s].
+#: Longest time for which a guard reserves its place for a silent sender, plus a margin [s].
 _FORGOTTEN = 1.1
 
-#: How long commands may be refused, or watched, without one that acts [s]; the start guard takes a quarter of a second.
+#: Longest time in which commands may be refused or monitored without being applied [s]. The start guard takes 0.25 s.
 _TIMEOUT = 10.0
 
-#: What to do about an arm that has a fault or waits for an operator.
+#: Advice for an arm that has a fault or waits for an operator.
 _RESET = "Look at the arm, then start again with --reset"
 
-#: How often `tell` hears the live status [s].
+#: Period in which `tell` is called with the live status [s].
 _TELL = 0.2
 
 
 class ArmLink:
-    """Both channels of one arm, for a loop that is driven by its messages: only the newest status counts."""
+    """Status and command channel of one arm for a message-driven loop. Only the newest status is used."""
 
     def __init__(
         self,
@@ -67,15 +67,15 @@ class ArmLink:
         before: lcmt_dvrk_status | None = None,
         replays: bool = False,
     ) -> None:
-        """Of `arm` on the LCM network `url`.
+        """Opens the channels of `arm` on the LCM network `url`.
 
         Args:
-            arm: whose statuses count.
-            url: of the network.
-            key: must have signed statuses, and signs commands; None: neither is signed.
-            before: a status of the session that is controlled; None: the first session that is seen.
-            replays: also take statuses of any session and time, as of a log that is played again. Never for a
-                controller: what it is told of the arm's past would go into what it answers to the present.
+            arm: Arm whose statuses are received.
+            url: URL of the LCM network.
+            key: Key that statuses must be signed with and that signs commands. None: messages are not signed.
+            before: Status of the session to be controlled. None: the first session that is received.
+            replays: Also accepts statuses of any session and time, for example from a replayed log. It must not be used
+                for a controller because old statuses would determine the commands.
         """
         self.arm, self.lost, self._replays, self._key = arm, 0, replays, key
         self._session = 0 if before is None else before.session_id
@@ -87,20 +87,20 @@ class ArmLink:
         self._subscription.set_queue_capacity(_QUEUE)
 
     def close(self) -> None:
-        """Hears no more, and ends LCM's reading thread, which would wake for every message for nothing."""
+        """Stops receiving and ends LCM's receive thread, which otherwise wakes up for every message."""
         self._lcm.unsubscribe(self._subscription)
-        # The subscription holds this link and LCM, unseen by the garbage collector.
+        # The subscription references this link and LCM, which the garbage collector cannot detect.
         del self._subscription, self._lcm
 
     def now(self) -> float:
-        """Time by the computer's monotonic clock [s]."""
+        """Returns the time of the computer's monotonic clock [s]."""
         return time.monotonic()
 
     def next_status(self, seconds: float) -> lcmt_dvrk_status:
-        """The newest status of the session that comes within `seconds`.
+        """Returns the newest status of the session that arrives within `seconds`.
 
         Raises:
-            ControllerError: none came; the message names what came instead.
+            ControllerError: No status arrived. The message lists the statuses that were received and ignored.
         """
         end = time.monotonic() + seconds
         self._is_new = False
@@ -133,7 +133,7 @@ class ArmLink:
         self._last, self._is_new = status, True
 
     def _instead(self) -> str:
-        """Returns which statuses came and were ignored since the last one, in words, or ""."""
+        """Describes the statuses that were ignored since the last accepted one, or returns ""."""
         ignored = self._filter.ignored.most_common()
         if not ignored:
             return ""
@@ -145,11 +145,11 @@ class ArmLink:
 
 
 def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
-    """The first status of an arm that may be controlled, and the period in which statuses come [s].
+    """Returns the first status of an arm that may be controlled, and the period of its statuses [s].
 
     Raises:
-        ControllerError: no arm, a fault, an arm that waits for an operator, a state that is not known, a pose outside
-            the limits, an arm that takes no efforts, or is measured too seldom.
+        ControllerError: There is no arm, it has a fault, it waits for an operator, its state is unknown, its pose is
+            outside the limits, it does not accept efforts, or its measurements are too infrequent.
     """
     status, name = link.next_status(_FIRST_WAIT), link.arm.name
     _check(status, name)
@@ -166,7 +166,7 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
         utimes.append(later.utime)
     if not (later.sequence > status.sequence and later.utime > status.utime):
         raise ControllerError(f"{name} tells nothing new: its utime or sequence does not increase")
-    # The least one: on a busy computer some are missed. Several statuses of one measurement have one utime.
+    # The smallest period is used because a busy computer misses some. Statuses of one measurement have the same utime.
     gaps = np.diff(np.unique(utimes))
     if min(gaps) > _MAX_PERIOD:
         raise ControllerError(
@@ -176,14 +176,14 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
 
 
 def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
-    """Asks the arm to clear its latched fault, or to resume after its watchdog took over, and leaves it in its hold.
+    """Clears the latched fault of the arm, or resumes after its watchdog took over. The arm then holds itself.
 
     Args:
-        link: to the arm.
-        tell: hears what the fault was, or why the watchdog took over, before it is cleared.
+        link: Channels of the arm.
+        tell: Function that is called with the fault, or the reason of the watchdog, before it is cleared.
 
     Raises:
-        ControllerError: no arm, or one whose fault or hold stays, because its cause lasts.
+        ControllerError: There is no arm, or its fault or hold remains because the cause persists.
     """
     status, name = link.next_status(_FIRST_WAIT), link.arm.name
     if status.fault_code == lcmt_dvrk_status.FAULT_NONE and not status.fault_text:
@@ -196,14 +196,14 @@ def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
     sender = DvrkCommandSender(link.arm)
     context = sender.CreateDefaultContext()
     start = link.now()
-    # The flag must be seen to change: false, then true.
+    # The guard detects a change of the flag from false to true.
     for reset in [0.0, 0.0, *[1.0] * 20]:
         context.SetTime(link.now() - start)
         sender.GetInputPort("reset_fault").FixValue(context, np.array([reset]))
         sender.GetInputPort("lcmt_dvrk_status").FixValue(context, AbstractValue.Make(status))
         link.send(sender.get_output_port().Eval(context))
         status = link.next_status(_SILENCE)
-    # A sender that comes while this one still has its place would be ignored: a guard may keep it for a second.
+    # The guard reserves its place for this sender for up to a second and would ignore a new one in that time.
     end = link.now() + _FORGOTTEN
     while link.now() < end:
         status = link.next_status(_SILENCE)
@@ -214,9 +214,9 @@ def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
 
 
 def _check(status: lcmt_dvrk_status, name: str, late: Callable[[], str] = lambda: "") -> None:
-    """Refuses an arm that has a fault, waits for an operator, or adds its own gravity compensation.
+    """Raises an error for an arm that has a fault, waits for an operator, or adds its own gravity compensation.
 
-    `late` says whether answers came too seldom, which may be why the arm took over.
+    `late` describes late answers, which may be the reason why the arm took over. It returns "" if there are none.
     """
     if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
         raise ControllerError(f"{name} has a fault: {status.fault_text}. {_RESET}")
@@ -230,7 +230,7 @@ def _check(status: lcmt_dvrk_status, name: str, late: Callable[[], str] = lambda
         )
 
 
-#: Hears a status and the time [s], and says the desired state (2n), or None for the controller's own.
+#: Function of a status and the time [s] that returns the desired state (2n), or None for the latched pose.
 Lead = Callable[[lcmt_dvrk_status, float], NDArray[np.float64] | None]
 
 
@@ -241,17 +241,17 @@ def control(
     tell: Callable[[LiveStatus], None],
     lead: Lead = lambda status, time: None,
 ) -> None:
-    """Answers every status until `stopped`, then leaves the arm to its own hold.
+    """Answers every status until `stopped`, then lets the arm hold itself.
 
     Args:
-        link: to the arm.
-        controller: makes the commands.
-        stopped: asked once a status.
-        tell: hears how it goes a few times a second.
-        lead: where to, asked once a status.
+        link: Channels of the arm.
+        controller: Controller that computes the commands.
+        stopped: Function that returns whether to stop. It is called once per status.
+        tell: Function that is called with the live status a few times per second.
+        lead: Function that returns the desired state. It is called once per status.
 
     Raises:
-        ControllerError: the arm fell silent, as one that was restarted, faulted, took over, or lets no command act.
+        ControllerError: The arm stopped sending, restarted, had a fault, took over, or applies no commands.
     """
     start = link.now()
     first = link.next_status(_SILENCE)
@@ -276,7 +276,7 @@ def control(
 
 
 def _release(link: ArmLink, controller: ArmController, start: float) -> None:
-    """Asks the arm to hold until it says that it does."""
+    """Requests that the arm hold itself until its status confirms it."""
     end = link.now() + _RELEASE
     while link.now() < end:
         status = link.next_status(_SILENCE)

@@ -1,4 +1,4 @@
-"""Opens an LCM network, or says why it cannot be used: LCM itself only writes to stderr and goes on without."""
+"""Opens an LCM network and raises an error if it is not usable. LCM itself only writes to stderr and continues."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from pydrake.lcm import DrakeLcm, DrakeLcmParams
 
 from dvrk_drake.errors import DvrkDrakeError
 
-#: How long messages to oneself may take, on a busy machine, and the time between them: UDP may lose one [s].
+#: Longest time for a message to this process on a busy computer, and time between attempts, because UDP may lose
+#: messages [s].
 _OWN_MESSAGES, _NEXT_MESSAGE = 5.0, 0.2
 
 
 def open_lcm(url: str = "") -> DrakeLcm:
-    """The network at `url`; empty: the environment's LCM_DEFAULT_URL, or LCM's own default.
+    """Opens the network at `url`. An empty URL selects the environment's LCM_DEFAULT_URL or LCM's default.
 
     Raises:
-        DvrkDrakeError: LCM does not know such a network, or no message to oneself comes back.
+        DvrkDrakeError: LCM does not support the URL, or this process does not receive its own messages.
     """
-    # Deferred: a network that only publishes needs no thread that wakes for every message.
+    # Receiving is deferred: a network that only publishes needs no thread that wakes up for every message.
     network = DrakeLcm(DrakeLcmParams(lcm_url=url, defer_initialization=True))
     name = network.get_lcm_url()
     try:
@@ -43,7 +44,7 @@ def open_lcm(url: str = "") -> DrakeLcm:
 
 
 def handle_message(network: lcm.LCM, seconds: float) -> bool:
-    """Handles one message if it comes within that time; lcm's own handle_timeout fails when a signal comes."""
+    """Handles one message if it arrives within `seconds`. Unlike lcm's handle_timeout, it does not fail on a signal."""
     ready, _, _ = select.select([network.fileno()], [], [], seconds)
     if ready:
         network.handle()
@@ -51,7 +52,7 @@ def handle_message(network: lcm.LCM, seconds: float) -> bool:
 
 
 def listen(network: lcm.LCM, seconds: float) -> None:
-    """Handles what comes within that time, so that a tick begins with little left to do."""
+    """Handles the messages that arrive within `seconds`, so that few messages are pending when a tick begins."""
     end = time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0:
         handle_message(network, left)

@@ -1,4 +1,4 @@
-"""How answering an arm goes: what `dvrk-drake run` and `collect` show while they do."""
+"""Live status of a control loop, displayed by `dvrk-drake run` and `collect`."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from dvrk_drake.models.lcm_messages import describe_refusal, describe_state
 
 
 class LiveLine:
-    """A line that says how things are, four times a second at most."""
+    """Status line in a terminal that is updated at most four times per second."""
 
     def __init__(self, stream: TextIO, period: float = 0.25, clock: Callable[[], float] = time.monotonic) -> None:
-        """On `stream`, if it is a terminal; `period` [s] and `clock` are for tests."""
+        """Creates a line on `stream` if it is a terminal. `period` [s] and `clock` are for tests."""
         self._stream, self._period, self._clock = stream, period, clock
         self._next = clock()
 
     def show(self, text: Callable[[], str]) -> None:
-        """Writes the line anew if it is time to; only then is `text` called."""
+        """Updates the line if the period has elapsed. Only then is `text` called."""
         now = self._clock()
         if not self._stream.isatty() or now < self._next:
             return
@@ -33,37 +33,37 @@ class LiveLine:
         self._write(text()[: columns - 1])
 
     def clear(self) -> None:
-        """Leaves an empty line for what is printed next."""
+        """Clears the line for subsequent output."""
         if self._stream.isatty():
             self._write("")
 
     def _write(self, text: str) -> None:
-        # Escape sequence: erase the line from the cursor on.
+        # Escape sequence: clear the line to the right of the cursor.
         self._stream.write(f"\r\x1b[K{text}")
         self._stream.flush()
 
 
-#: Answers are counted over the last second [s]; an interval above this may be too late for the arm's guard [s].
+#: Time window in which answers are counted [s]. Interval between answers that may be too long for the arm's guard [s].
 _WINDOW, _LATE = 1.0, 0.02
-#: What a guard refuses if the sender or the arm itself is slow.
+#: Reasons for refused commands if the sender or the arm is slow.
 _REFUSED_IF_LATE = (
     lcmt_dvrk_status.REFUSAL_STALE,
     lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER,
     lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP,
     lcmt_dvrk_status.REFUSAL_CLOCK_JUMP,
 )
-#: What a guard refuses until the last accepted command expires.
+#: Reasons for refused commands until the last accepted command expires.
 _EXPIRED_IF_REFUSED = (lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP, lcmt_dvrk_status.REFUSAL_CLOCK_JUMP)
 
 
 @dataclass(frozen=True)
 class LiveStatus:
-    """How it goes, in words.
+    """Status of a control loop for display.
 
     Attributes:
-        state: the guard's.
-        pace: rate, round trip and losses.
-        problem: whether commands were refused or expired since the last one, and why; or "".
+        state: State of the guard.
+        pace: Rate, round-trip time and lost messages.
+        problem: Reason for commands that were refused or expired since the last status, or "".
     """
 
     state: str
@@ -75,10 +75,10 @@ class LiveStatus:
 
 
 class LiveStatusMaker:
-    """Counts what was answered between two reports."""
+    """Counts the answers between two live statuses."""
 
     def __init__(self, sender_id: int, first: lcmt_dvrk_status) -> None:
-        """Of a sender; counts begin at the arm's `first` status. A new one when the arm was restarted."""
+        """Starts the counts for a sender at the arm's `first` status. A restarted arm requires a new object."""
         self._sender_id, self._before, self._told_at = sender_id, first, 0.0
         self._answered = 0
         self._trips: deque[float] = deque(maxlen=1000)
@@ -90,7 +90,7 @@ class LiveStatusMaker:
             self._trips.append(time - 1e-6 * status.command_utime)
 
     def make(self, status: lcmt_dvrk_status, time: float, lost: int) -> LiveStatus:
-        """How it went since the last one; `lost` statuses never came."""
+        """Returns the live status since the previous one. `lost` is the number of statuses that were not received."""
         rate = self._answered / (time - self._told_at)
         trip = f"round trip {1e3 * float(np.median(self._trips)):.2f} ms" if self._trips else "no command accepted yet"
         problem = []
@@ -106,19 +106,19 @@ class LiveStatusMaker:
 
 
 class AnswerTimes:
-    """When a controller answered in the last second: how often, and with which longest interval."""
+    """Times of a controller's answers in the last second, for their rate and longest interval."""
 
     def __init__(self) -> None:
         self._times: deque[float] = deque()
 
     def add(self, time: float) -> None:
-        """Takes an answer at `time` [s] of the controller's own clock."""
+        """Adds an answer at `time` [s] of the controller's clock."""
         self._times.append(time)
         while time - self._times[0] > _WINDOW and len(self._times) > 2:
             self._times.popleft()
 
     def lateness(self) -> str:
-        """Returns rate and longest interval in words where answers came too seldom, else ""."""
+        """Describes the rate and longest interval if answers were too infrequent. Otherwise returns ""."""
         intervals = np.diff(np.array(self._times))
         if not len(intervals) or intervals.max() <= _LATE:
             return ""
@@ -129,12 +129,12 @@ class AnswerTimes:
 
 
 def takeover_reason(status: lcmt_dvrk_status, before: lcmt_dvrk_status, answers: AnswerTimes) -> str:
-    """Returns why an arm obeys no longer.
+    """Returns the reason why an arm no longer accepts commands.
 
     Args:
-        status: in which it does not.
-        before: the last status in which it did; a refusal code of an earlier time explains nothing.
-        answers: to its statuses.
+        status: Status in which the arm does not accept commands.
+        before: Last status in which it did. Earlier refusal codes are ignored.
+        answers: Times of the answers to its statuses.
     """
     expired, refused = status.num_expired > before.num_expired, status.num_refused > before.num_refused
     late = answers.lateness()

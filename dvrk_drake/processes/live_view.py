@@ -1,4 +1,4 @@
-"""Draws an arm as its status messages tell: `dvrk-drake view --live`, which `arm --meshcat` starts beside its loop."""
+"""Displays an arm from its status messages. `arm --meshcat` starts it as `dvrk-drake view --live`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.processes.control import ArmLink
 from dvrk_drake.systems.arm_view import ArmView
 
-#: Without a status for this long the last pose stays [s]: short enough for a page to close at once.
+#: Time to wait for a status before the last pose is kept [s]. It is short so that a page closes immediately.
 _TIMEOUT = 0.2
 
 
 def show_status(view: ArmView, link: ArmLink) -> None:
-    """Draws the pose of the newest status; where none comes, or it is not finite, the last one stays."""
+    """Displays the pose of the newest status. Without a status, or if it is not finite, the last pose is kept."""
     try:
         q = link.next_status(_TIMEOUT).position
     except ControllerError:
@@ -29,7 +29,7 @@ def show_status(view: ArmView, link: ArmLink) -> None:
         view.show(q)
 
 
-# Looked up before a fork, after which little is safe to do.
+# Looked up before a fork, because few operations are safe after it.
 _prctl = getattr(ctypes.CDLL(None), "prctl", None)
 _PR_SET_PDEATHSIG = 1
 
@@ -41,9 +41,10 @@ def _end_with_parent() -> None:
 
 @contextlib.contextmanager
 def live_view(arm: str, url: str) -> Iterator[subprocess.Popen]:
-    """`dvrk-drake view --live` of an arm (name or path), in a process that ends with the block.
+    """Runs `dvrk-drake view --live` for an arm (name or path) in a process that ends with the context.
 
-    A process of its own, because a loop at 1 kHz that draws is late. On Linux it also ends if this one is killed.
+    A separate process is required because drawing would delay a loop at 1 kHz. On Linux it also ends if the parent
+    process is killed.
     """
     command = [sys.executable, "-m", "dvrk_drake.cli", "view", "--arm", arm, "--live", "--lcm-url", url]
     viewer = subprocess.Popen(command, preexec_fn=_end_with_parent)  # noqa: PLW1509

@@ -1,4 +1,4 @@
-"""Periodic work by the wall clock, and real-time scheduling where the system permits it."""
+"""Periodic execution by the wall clock, and real-time scheduling where the system permits it."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import os
 import time
 from collections.abc import Callable
 
-#: Priority of SCHED_FIFO: above everything that is not real-time, below the kernel's own threads at 99.
+#: Priority of SCHED_FIFO. It is above all processes that are not real-time and below the kernel's own threads at 99.
 _PRIORITY = 50
 
-#: So far behind, a loop does not catch up any more but goes on from now [s].
+#: Delay beyond which a loop does not catch up but continues from the current time [s].
 _MAX_DELAY = 0.1
 
 
 class Pace:
-    """Ticks of one period by the monotonic clock, which no setting of the time changes.
+    """Periodic ticks of the monotonic clock, which is not affected by changes of the system time.
 
-    A tick that comes late is followed by the next ones at once, until the loop has caught up; behind by more than 0.1 s
-    it goes on from now.
+    After a late tick the next ones follow immediately until the loop has caught up. If it is more than 0.1 s late, it
+    continues from the current time.
 
     Attributes:
-        late: ticks that began more than a period late.
+        late: Number of ticks that began more than a period late.
     """
 
     def __init__(
@@ -31,13 +31,13 @@ class Pace:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Of ticks every `period` [s], the first one now; `clock` and `sleep` are for tests."""
+        """Starts ticks every `period` [s] with the first one now. `clock` and `sleep` are for tests."""
         self._period, self._clock, self._sleep = period, clock, sleep
         self._next = clock()
         self.late = 0
 
     def wait(self) -> None:
-        """Until the next tick."""
+        """Waits until the next tick."""
         now = self._clock()
         if now < self._next:
             self._sleep(self._next - now)
@@ -49,14 +49,14 @@ class Pace:
 
 
 def make_realtime() -> list[str]:
-    """Schedules this process as real-time (SCHED_FIFO, priority 50), keeps its memory and the machine's cores awake.
+    """Makes this process real-time (SCHED_FIFO, priority 50), locks its memory and prevents sleep states of the cores.
 
-    Threads that are started later inherit the priority, as LCM's do. A core that sleeps takes longer to wake than an
-    answer to compute: the request of https://docs.kernel.org/power/pm_qos_interface.html keeps them from it until this
-    process ends.
+    Threads that are started later, such as those of LCM, inherit the priority. A core in a sleep state takes longer to
+    wake up than an answer takes to compute. The request of https://docs.kernel.org/power/pm_qos_interface.html prevents
+    sleep states until this process ends.
 
     Returns:
-        What could not be had and why, a warning each.
+        One warning for each setting that was not permitted, with the reason.
     """
     warnings = []
     for step, what in (
@@ -82,11 +82,11 @@ def _lock_memory() -> None:
 
 
 def _keep_cores_awake() -> None:
-    # Never closed: the request lasts as long as the file is open.
+    # The file stays open because the request lasts until it is closed.
     os.write(os.open("/dev/cpu_dma_latency", os.O_WRONLY), (0).to_bytes(4, "little"))
 
 
 def settle_memory() -> None:
-    """Takes what was made so far out of the garbage collector's sight, so that its passes are short."""
+    """Excludes existing objects from garbage collection, so that collections are short."""
     gc.collect()
     gc.freeze()

@@ -1,4 +1,4 @@
-"""A process that writes what one arm says over LCM into a file: `dvrk-drake record`."""
+"""Process that records the status messages of one arm from LCM to a file, started by `dvrk-drake record`."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from dvrk_drake.processes.lcm_network import handle_message
 from dvrk_drake.recordings.lcm_log_reader import StatusStream
 from dvrk_drake.recordings.recording_stream import RecordingFile, check_stream_output, open_recording_file
 
-#: How long the first status may take [s], and after how long without one the live line says so.
+#: Longest time until the first status, and time without a status after which the live line reports it [s].
 FIRST_STATUS, SILENCE = 10.0, 0.5
-#: After so long without a status of its session an arm was restarted, and is recorded again [s].
+#: Time without a status of its session after which an arm is considered restarted and is recorded again [s].
 _RESTART = 1.0
-#: Messages that wait while the computer does something else, beyond which new ones are lost.
+#: Length of the message queue while the computer is busy. Further messages are lost.
 _QUEUE = 20_000
-#: Why messages do not belong to the arm's session.
+#: Reasons why messages do not belong to the arm's session.
 _FOREIGN = (StatusFilter.OTHER_SESSION, StatusFilter.JUMP, StatusFilter.NOT_AUTHENTIC)
-#: Longest wait for a message before it is looked whether to stop [s].
+#: Longest wait for a message between two checks for a stop [s].
 _POLL = 0.1
 
 
 class Recorder:
-    """Appends every status of one arm to a new file as it arrives, by the wall clock.
+    """Appends every status of one arm to a new file as it arrives in real time.
 
     Attributes:
-        stream: what was taken and what not.
-        num_received: messages on the arm's status channel.
-        foreign: messages that were not recorded because they do not belong to the arm's session, for each reason.
+        stream: Filter that counts accepted and rejected statuses.
+        num_received: Number of messages on the arm's status channel.
+        foreign: Number of messages that do not belong to the arm's session and were not recorded, for each reason.
     """
 
     def __init__(self, arm: Arm, path: str | Path, url: str, key: MessageKey | None = None) -> None:
-        """Of `arm` on the LCM network `url`; the file is made when its first status is there.
+        """Creates a recorder for `arm` on the LCM network `url`. The file is created at the first status.
 
         With `key`, only statuses that are signed with it are recorded.
 
         Raises:
-            RecordingError: there can be no new file at `path`.
+            RecordingError: A new file cannot be created at `path`.
         """
         check_stream_output(path)
         self.stream = StatusStream(arm.name, arm.num_joints)
@@ -56,20 +56,22 @@ class Recorder:
         self._heard: Counter[str] = Counter()
         self._arrivals: deque[float] = deque()
         self._lcm = lcm.LCM(url)
-        # All arms' statuses, to say what there is where this one's are not.
+        # Statuses of all arms, to list the available ones if there are none of this arm.
         self._subscription = self._lcm.subscribe(f"{STATUS_PREFIX}.*", self._receive)
         self._subscription.set_queue_capacity(_QUEUE)
 
     def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
-        """Records until `stopped`, or for `duration` [s] from the first message on.
+        """Records until `stopped`, or for `duration` [s] from the first message.
 
         Args:
-            duration: may be infinite.
-            stopped: asked at least every 0.1 s.
-            show: called after every message, or every 0.1 s without, with what gives the live line.
+            duration: Duration of the recording [s], may be infinite.
+            stopped: Function that returns whether to stop. It is called at least every 0.1 s.
+            show: Function that is called after every message, and every 0.1 s without messages. Its argument is a
+                function that returns the live line.
 
         Raises:
-            RecordingError: ended before the first status, none within 10 s, or the file cannot be written.
+            RecordingError: The recording ended before the first status, no status arrived within 10 s, or the file
+                cannot be written.
         """
         try:
             end = time.monotonic() + FIRST_STATUS
@@ -88,7 +90,7 @@ class Recorder:
                 self._file.close()
 
     def describe(self) -> str:
-        """How it goes, in one line: rate, losses, what the arm does."""
+        """Returns the live line with the rate, lost messages and the state of the arm."""
         now = time.monotonic()
         while self._arrivals and self._arrivals[0] < now - 1:
             self._arrivals.popleft()
@@ -106,7 +108,7 @@ class Recorder:
         return ", ".join(parts)
 
     def notes(self) -> list[str]:
-        """Returns what was left out and lost, a line each."""
+        """Returns one line for each kind of message that was not recorded or was lost."""
         left_out = [f"messages not recorded, {reason}: {count}" for reason, count in self.foreign.items()]
         return [*left_out, *self.stream.notes()]
 

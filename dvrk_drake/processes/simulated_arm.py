@@ -1,4 +1,4 @@
-"""A process that plays one arm behind LCM: `dvrk-drake arm`."""
+"""Process that simulates one arm with an LCM interface, started by `dvrk-drake arm`."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
-#: Messages that wait for the arm, beyond which new ones are dropped; and how many are handled when a tick begins. Most
-#: are handled while the arm waits for its tick, so this bounds how long a flood can delay it.
+#: Length of the queue of commands, beyond which new ones are dropped, and number of commands handled at the start of a
+#: tick. Most commands are handled while the arm waits for its tick, so this limits the delay that a flood can cause.
 _QUEUE, _MESSAGES_A_STEP = 200, 10
 
 
 def monotonic_utime() -> int:
-    """Time by the computer's monotonic clock [us]."""
+    """Returns the time of the computer's monotonic clock [us]."""
     return time.monotonic_ns() // 1000
 
 
 def load_driver(path: str | Path) -> DvrkDriver:
-    """A driver's configuration from its YAML file; what it leaves out has its default.
+    """Reads the configuration of a driver from its YAML file. Missing entries have their defaults.
 
     Raises:
-        StationError: it cannot be read, or holds something that is not allowed.
+        StationError: The file cannot be read or has an invalid entry.
     """
     driver = load_typed_yaml(DvrkDriver, path, StationError, "a driver's configuration")
     try:
@@ -51,10 +51,12 @@ def load_driver(path: str | Path) -> DvrkDriver:
 
 
 def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.float64]:
-    """The pose (n,) at which a simulated arm starts: `pose`, or the one nearest to zero that is well inside the limits.
+    """Returns the initial pose (n,) of a simulated arm: `pose`, or the pose nearest to zero that is inside the limits.
+
+    The pose nearest to zero has a margin to the limits.
 
     Raises:
-        StationError: `pose` is not n numbers inside the arm's limits.
+        StationError: `pose` does not have n entries inside the arm's limits.
     """
     if pose is None:
         inset = 0.1 * (arm.position_upper - arm.position_lower)
@@ -68,7 +70,7 @@ def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.floa
 
 
 class SimulatedArm:
-    """A simulated arm with its driver, guard included, that is stepped by the wall clock."""
+    """Simulated arm with driver and guard, stepped by the wall clock."""
 
     def __init__(
         self,
@@ -78,9 +80,9 @@ class SimulatedArm:
         q: ArrayLike,
         wall_clock: Callable[[], int] = monotonic_utime,
     ) -> None:
-        """On the LCM network `url`, at rest at the pose q (n,); the arm's clock starts at the time of day.
+        """Connects the arm to the LCM network `url`. It starts at rest at the pose q (n,), at the current time of day.
 
-        By `wall_clock` [us] the guard lets commands expire also when this process is late or was stopped.
+        The guard uses `wall_clock` [us], so that commands also expire if this process is late or was suspended.
         """
         self.arm, self.driver, self._url = arm, driver, url
         self._ticks = 0
@@ -105,23 +107,23 @@ class SimulatedArm:
 
     @property
     def guard(self) -> CommandGuard:
-        """The guard as it is now, to be read only."""
+        """Current guard, read-only."""
         return self._driver.GetGuard(self._driver.GetMyContextFromRoot(self._simulator.get_context()))
 
     def hear(self, channel: str, data: bytes) -> None:
-        """Keeps a message of the command channel for the next step."""
+        """Stores a message of the command channel for the next step."""
         self._driver.Receive(data)
 
     def step(self) -> None:
-        """Takes what was heard and moves on by one period of the driver."""
+        """Processes the stored commands and advances by one period of the driver."""
         self._ticks += 1
         self._simulator.AdvanceTo(self._ticks * self.driver.status_period)
         self._memory.HandleSubscriptions(0)
 
     def stall(self, seconds: float) -> None:
-        """Plays a bridge whose process is stopped for so long, of the arm's clock: neither guard nor status.
+        """Simulates a bridge process that is suspended for `seconds` of the arm's clock, without guard and statuses.
 
-        The motors apply meanwhile what they were told last, as those of a dVRK do.
+        The motors meanwhile apply the last commanded efforts, as those of a dVRK do.
         """
         self._driver.SetStalled(True)
         for _ in range(round(seconds / self.driver.status_period)):
@@ -129,24 +131,24 @@ class SimulatedArm:
         self._driver.SetStalled(False)
 
     def send(self, network: lcm.LCM) -> None:
-        """Tells of the state as it is now."""
+        """Publishes the current state."""
         network.publish(status_channel(self.arm), self._status)
 
     def run(self, stopped: Callable[[], bool], tell: Callable[[str], None] = lambda line: None) -> Pace:
-        """Steps by the wall clock until `stopped`, and tells of every change of the guard's state.
+        """Steps by the wall clock until `stopped` and reports every change of the guard's state to `tell`.
 
-        A status goes out when its tick begins, and the simulation computes the next state while the controller computes
-        its answer, which acts from the next tick on: as with an arm, whose motors do not wait for it.
+        A status is published when its tick begins. The simulation computes the next state while the controller computes
+        its answer, which is applied from the next tick on. The motors of a real arm do not wait for the answer either.
 
         Returns:
-            The pace, with the count of late ticks.
+            The pace, with the number of late ticks.
         """
-        # Opened here, as LCM's reading thread is scheduled like the thread that opens it. Drake's own subscription
-        # would keep one message between two steps; a second sender must not hide there.
+        # LCM is opened here because its receive thread inherits the scheduling of the thread that opens it. Drake's own
+        # subscription would keep only one message between two steps and hide a second sender.
         network = lcm.LCM(self._url)
         network.subscribe(command_channel(self.arm), self.hear).set_queue_capacity(_QUEUE)
-        # The guard takes the time since the simulation was made for its first period, which is too long. The status of
-        # that step is not sent: a controller would refuse the arm for it.
+        # The first period of the guard is too long because it includes the time since the simulation was created. The
+        # status of that step is not published because a controller would reject the arm for it.
         self.step()
         self.step()
         pace = Pace(self.driver.status_period, sleep=lambda seconds: listen(network, seconds))
@@ -173,7 +175,7 @@ class SimulatedArm:
 
 
 def stop_on_signals() -> Callable[[], bool]:
-    """Whether SIGINT or SIGTERM came since: for loops that end in order."""
+    """Returns a function that returns whether SIGINT or SIGTERM was received, for loops with an orderly end."""
     came: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, frame: came.append(number))

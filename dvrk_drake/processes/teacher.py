@@ -1,4 +1,4 @@
-"""Poses that a person shows by hand, steps 1 to 3 of the paper's section III.G, and the motions between poses."""
+"""Poses taught by hand, steps 1 to 3 of section III.G of the paper, and trajectories between poses."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.recordings.pose_file import load_poses_if_any, same_pose, save_poses
 
-#: Least time of a leg [s]: short ones would begin and end with a jerk.
+#: Shortest duration of a leg [s]. Shorter legs would begin and end with a jerk.
 MIN_DURATION = 0.3
 
 
 class Leg:
-    """A cubic in time from one joint state to rest.
+    """Cubic trajectory from a joint state to rest.
 
     Attributes:
-        duration: of it [s].
+        duration: Duration of the trajectory [s].
     """
 
     def __init__(
         self, q_start: NDArray[np.float64], v_start: NDArray[np.float64], q_end: NDArray[np.float64], duration: float
     ) -> None:
-        """From q_start, v_start (n,) to rest at q_end (n,) [rad, m, rad/s, m/s] in `duration` [s]."""
+        """Creates a leg from q_start, v_start (n,) to rest at q_end (n,) [rad, m, rad/s, m/s] in `duration` [s]."""
         self.duration = duration
         velocities = np.column_stack([v_start, np.zeros_like(v_start)])
         self._q = PiecewisePolynomial.CubicHermite([0.0, duration], np.column_stack([q_start, q_end]), velocities)
@@ -40,51 +40,51 @@ class Leg:
 
     @classmethod
     def between(cls, q_start: NDArray[np.float64], q_end: NDArray[np.float64], speed: NDArray[np.float64]) -> Leg:
-        """From rest to rest, no joint faster than `speed` (n,) [rad/s, m/s].
+        """Returns a trajectory from rest to rest in which no joint exceeds `speed` (n,) [rad/s, m/s].
 
-        It is straight, so between poses inside linear limits it stays inside of them.
+        The path is straight, so it stays inside linear limits if both poses do.
         """
-        # A cubic from rest to rest is 1.5 times as fast in its middle as on average.
+        # The peak speed of a cubic from rest to rest is 1.5 times its mean.
         duration = max(MIN_DURATION, 1.5 * float(np.max(np.abs(q_end - q_start) / speed)))
         return cls(q_start, np.zeros_like(q_start), q_end, duration)
 
     @classmethod
     def braking(cls, state: NDArray[np.float64], duration: float) -> Leg:
-        """From a state (2n: q, then v) to rest at constant deceleration."""
+        """Returns a trajectory from a state (2n: q, then v) to rest at constant deceleration."""
         q, v = np.split(state, 2)
         return cls(q, v, q + 0.5 * duration * v, duration)
 
     def state(self, time: float) -> NDArray[np.float64]:
-        """(2n,) q, then v at `time` [s] from 0 to the duration; outside of that, of its ends."""
+        """Returns q, then v (2n,) at `time` [s], which is clamped to 0 and the duration."""
         time = min(max(time, 0.0), self.duration)
         return np.concatenate([self._q.value(time).ravel(), self._v.value(time).ravel()])
 
 
 class RestDetector:
-    """An arm rests when all its joints have stayed near one pose for a while."""
+    """Detects that all joints of an arm have stayed near one pose for some time."""
 
     def __init__(self, tolerance: NDArray[np.float64], duration: float) -> None:
-        """Within `tolerance` (n,) [rad, m] of one pose for `duration` [s]."""
+        """Creates a detector for poses within `tolerance` (n,) [rad, m] for `duration` [s]."""
         self._tolerance, self._duration = tolerance, duration
         self._since = 0.0
         self._q: NDArray[np.float64] | None = None
 
     def rests(self, time: float, q: NDArray[np.float64]) -> bool:
-        """Whether it rests at `time` [s] with q (n,) measured; to be asked at every measurement."""
+        """Returns whether the arm is at rest at `time` [s] with measured q (n,). Call it at every measurement."""
         if self._q is None or not np.all(np.abs(q - self._q) <= self._tolerance):  # also true of NaN
             self._q, self._since = q, time
         return time - self._since >= self._duration
 
 
-#: For --at-rest: a hand that rests keeps all joints within this [rad], [m] for so long [s].
+#: Tolerance [rad], [m] and duration [s] in which a hand-guided arm is at rest, for --at-rest.
 _REST, _REST_TIME = (0.01, 0.001), 1.0
 
 
 class Teacher:
-    """Takes the pose of an arm in "gravity" mode into a file of poses, when told to or whenever it rests.
+    """Records poses of an arm in "gravity" mode to a file of poses, on request or whenever the arm is at rest.
 
     Attributes:
-        poses: (m, n) in the file and those being written.
+        poses: Poses (m, n) in the file, including those that are being written.
     """
 
     def __init__(
@@ -97,32 +97,32 @@ class Teacher:
         report: Callable[[str], None],
         writer: Executor | None = None,
     ) -> None:
-        """Of the controller's arm.
+        """Creates a teacher for the arm of `controller`.
 
         Args:
-            controller: in "gravity" mode.
-            path: of the file, which is made or added to; it is whole at any moment.
-            at_rest: take each pose at which the arm rests for a second.
-            told: whether to take the present pose; asked once a status.
-            report: hears of each pose, a line.
-            writer: runs the writing of the file; default: a thread of its own.
+            controller: Controller in "gravity" mode.
+            path: Path of the file, which is created or extended. It is complete at any time.
+            at_rest: Records each pose at which the arm rests for a second.
+            told: Function that returns whether to record the present pose. It is called once per status.
+            report: Function that is called with one line per pose.
+            writer: Executor that writes the file. Defaults to a separate thread.
 
         Raises:
-            CollectionError: the file is there and is none of poses of this arm.
+            CollectionError: The file exists and does not contain poses of this arm.
         """
         self.poses = load_poses_if_any(path, controller.arm)
         self._controller, self._path, self._at_rest = controller, path, at_rest
         self._identifiability, self._report = told, report
         self._detector = RestDetector(controller.arm.per_joint(*_REST), _REST_TIME)
-        # The disk may take longer than the arm waits for a command.
+        # Writing to disk may take longer than the arm waits for a command.
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
         self._writing: Future[None] | None = None
 
     def lead(self, status: lcmt_dvrk_status, time: float) -> None:
-        """Looks at a status that came at `time` [s]; leads nowhere: the hand does.
+        """Processes a status that arrived at `time` [s]. Returns no desired state because the operator moves the arm.
 
         Raises:
-            DvrkDrakeError: the file cannot be written.
+            DvrkDrakeError: The file cannot be written.
         """
         q = np.array(status.position)
         rests = self._detector.rests(time, q)
@@ -147,7 +147,7 @@ class Teacher:
         self._writing = self._writer.submit(save_poses, self.poses, arm, self._path)
 
     def close(self) -> None:
-        """Waits for the file."""
+        """Waits until the file is written."""
         self._writer.shutdown()
 
     @staticmethod
@@ -158,14 +158,14 @@ class Teacher:
 
 
 class EnterKey:
-    """Says whether a line has come on a stream since it was asked last, without waiting for one."""
+    """Detects a new line on a stream without blocking."""
 
     def __init__(self, stream: IO[str]) -> None:
-        """On `stream`, e.g. sys.stdin; nothing else may read from it."""
+        """Starts reading `stream`, e.g. sys.stdin. Nothing else may read from it."""
         self._descriptor, self._open = stream.fileno(), True
 
     def __call__(self) -> bool:
-        """Whether Enter was pressed; never again after the end of the stream."""
+        """Returns whether Enter was pressed since the last call. False after the end of the stream."""
         if not self._open or not select.select([self._descriptor], [], [], 0.0)[0]:
             return False
         data = os.read(self._descriptor, 4096)

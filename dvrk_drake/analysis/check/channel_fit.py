@@ -22,7 +22,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
-#: Prior standard deviations. The first two apply to link parameters and to the effects stated in the arm file, as shares
+#: Prior standard deviations. The first two apply to link parameters and to the effects in the arm file, as shares
 #: of their size. The third applies to simple friction, the fourth to offsets, springs and cables of unknown size. Both
 #: are shares of the RMS effort.
 LINK_DEVIATION, EFFECT_DEVIATION, FRICTION_DEVIATION, POSITION_DEVIATION = 0.3, 0.5, 0.1, 1.0
@@ -49,8 +49,8 @@ class ChannelFit:
     """Linear model of a recording's efforts with priors for rigid bodies, base tilt and drive effects of the arm file.
 
     All quantities are in actuator coordinates. A motion is low-pass filtered at the arm's `effort_cut_off` and sampled
-    as coarsely as that allows, so that a fit takes milliseconds. Poses at rest are explained by gravity, springs, cables
-    and offsets.
+    as coarsely as that allows, so that a fit takes milliseconds. Poses at rest are explained by gravity, springs,
+    cables and offsets.
 
     Attributes:
         recording: Recording that is fitted.
