@@ -74,7 +74,7 @@ def test_port_names_and_sizes(name):
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_hardware_has_exactly_the_ports_of_the_arm(name):
+def test_hardware_has_the_driver_ports(name):
     arm = load_arm(name)
     station = HardwareArmStation(arm, lcm=DrakeLcm("memq://"))
     inputs = {p.get_name(): p.size() for p in map(station.get_input_port, range(station.num_input_ports()))}
@@ -106,7 +106,7 @@ def test_linkage_stays_closed_while_the_arm_falls(closure):
     assert worst < GAP
 
 
-def test_energy_never_grows_without_effort_and_its_loss_vanishes_with_the_step():
+def test_energy_loss_vanishes_with_time_step():
     # No damping and no limit in reach: what is lost is the integrator's, which is of first order in the step.
     q = np.array([0.1, 0.4, -0.2, 0.3, 0.5, 0.1, 0.0])
     losses = []
@@ -162,7 +162,7 @@ def acceleration_of(station, q, inputs):
 
 
 @pytest.mark.parametrize("j", range(N))
-def test_efforts_act_on_their_own_joint_through_the_linkage(j):
+def test_efforts_act_on_their_joint_through_the_linkage(j):
     # M vd = tau - G at rest, with M and G of the seven independent joints: a known truth for both inputs.
     q = POSES[1]
     station = ArmStation(ARM)
@@ -192,7 +192,7 @@ def test_disturbance_is_not_clamped():
     assert disturbed[0] > 5 * commanded[0] > 0
 
 
-def test_unconnected_inputs_mean_a_limp_arm():
+def test_unconnected_inputs_are_zero_effort():
     q = POSES[2]
     unconnected = acceleration_of(ArmStation(ARM), q, {})
     zero = {"mtml.effort_commanded": np.zeros(N), "mtml.effort_disturbance": np.zeros(N)}
@@ -229,7 +229,7 @@ def test_set_positions_closes_the_linkage_and_rests():
     assert not np.any(station.GetOutputPort("mtml.velocity_estimated").Eval(context))
 
 
-def test_link_inertias_change_one_context_only():
+def test_link_inertias_change_only_one_context():
     station = ArmStation(ARM)
     heavy, nominal = station.CreateDefaultContext(), station.CreateDefaultContext()
     payload = SpatialInertia(
@@ -273,7 +273,7 @@ def test_stronger_motors_are_measured():
     np.testing.assert_array_equal(effort, np.minimum(20.0, [50.0, *ARM.effort_limits[1:]]))
 
 
-def test_collision_shapes_are_there_when_something_can_be_touched():
+def test_collision_shapes_exist_only_with_contact_candidates():
     def proximity_shapes(station):
         return station._scene_graph.model_inspector().NumGeometriesWithRole(Role.kProximity)
 
@@ -293,7 +293,7 @@ def test_collision_shapes_are_there_when_something_can_be_touched():
     assert np.abs(fallen[0] - fallen[1]).max() > 0.1, "the arm lies on the table"
 
 
-def test_errors_say_what_to_do():
+def test_errors_state_the_remedy():
     with pytest.raises(StationError, match=r"time_step must be above 0 and at most 0.01 s"):
         ArmStation(ARM, plant_config=arm_plant_config(0.0))
     with pytest.raises(StationError, match='discrete_contact_approximation is "tamsi"; a linkage needs sap'):
@@ -310,14 +310,14 @@ def test_errors_say_what_to_do():
         station.SetPositions(station.CreateDefaultContext(), np.zeros(6))
 
 
-def test_meshcat_is_given_the_arm():
+def test_meshcat_shows_the_arm():
     meshcat = Meshcat()
     diagram = ArmStation(ARM, meshcat=meshcat)
     diagram.ForcedPublish(diagram.CreateDefaultContext())
     assert meshcat.HasPath("/drake/mtml/links")
 
 
-def test_two_stations_in_one_diagram_and_again():
+def test_two_stations_in_one_diagram():
     for _ in range(2):
         builder = DiagramBuilder()
         left = builder.AddSystem(ArmStation(ARM))

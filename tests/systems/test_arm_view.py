@@ -34,7 +34,7 @@ def test_dependent_joints_follow(view):
     assert plant.GetJointByName("motor_4").get_angle(context) == pytest.approx(0.6697 * -0.2)
 
 
-def test_sliders_cover_each_joint_and_stop_at_the_coupled_limit(view):
+def test_sliders_stop_at_the_coupled_limit(view):
     view.show(np.zeros(7))
     for i, name in enumerate(view.arm.joint_names):
         view.meshcat.SetSliderValue(f"q{i + 1} {name}", 0.0)
@@ -49,7 +49,7 @@ def test_sliders_cover_each_joint_and_stop_at_the_coupled_limit(view):
     assert view.meshcat.GetSliderValue("q3 elbow_pitch") == pytest.approx(q[2])
 
 
-def test_at_the_coupled_limit_all_other_sliders_move_on(view):
+def test_other_sliders_move_at_the_coupled_limit(view):
     """As found: at the stop of the parallelogram every slider snapped back, with a division by zero."""
     q = np.zeros(7)
     q[1:3] = 0.4, 0.28033  # a step of a slider beyond the limit
@@ -72,7 +72,7 @@ def test_at_the_coupled_limit_all_other_sliders_move_on(view):
         view.meshcat.GetButtonClicks(stop)
 
 
-def test_sliders_of_the_psm_move_seven_joints_and_the_linkage_follows():
+def test_psm_sliders_move_joints_and_linkage():
     view = ArmView(load_arm("psm"), start_meshcat())
     view.add_sliders()
     assert view._slider_names == [
@@ -100,7 +100,7 @@ def test_sliders_of_the_psm_move_seven_joints_and_the_linkage_follows():
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_camera_sees_the_whole_arm_and_wastes_no_room(name):
+def test_camera_frames_the_whole_arm(name):
     arm = load_arm(name)
     camera, target = framing(arm)
     forward = (target - camera) / np.linalg.norm(target - camera)
@@ -127,7 +127,7 @@ class Link:
         return status
 
 
-def test_a_live_view_draws_what_the_status_tells_and_keeps_it_in_silence():
+def test_live_view_draws_the_last_status():
     arm = load_arm("mtml")
     view, pose = ArmView(arm, start_meshcat()), [0.1, 0.2, 0.0, 0.0, 0.5, 0.0, 0.0]
     link = Link(pose, None, [math.nan] * 7)
@@ -137,7 +137,7 @@ def test_a_live_view_draws_what_the_status_tells_and_keeps_it_in_silence():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
-def test_a_viewer_ends_with_the_arm_that_is_killed():
+def test_viewer_ends_when_arm_is_killed():
     """What draws is a sleep here: `kill -9` leaves nobody to end it, and it would keep its port."""
     program = (
         "import signal\n"

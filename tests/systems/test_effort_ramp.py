@@ -8,7 +8,7 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.systems.effort_ramp import EffortRamp
 
 
-def test_it_passes_the_measured_effort_on_then_ramps_and_starts_anew_when_disabled():
+def test_ramp_starts_when_enabled_and_restarts():
     ramp = EffortRamp(2, duration=0.1)
     simulator = Simulator(ramp)
     context = simulator.get_mutable_context()
@@ -44,6 +44,6 @@ def test_a_forced_update_is_one_period():
         assert ramp.get_output_port().Eval(context)[0] == pytest.approx(min(1.0, 0.1 * k))
 
 
-def test_a_ramp_that_is_none_is_refused():
+def test_invalid_ramp_is_refused():
     with pytest.raises(ControllerError, match="must be positive"):
         EffortRamp(7, duration=0.0)

@@ -44,7 +44,7 @@ def simulate(q0, q_desired, duration, gravity_factor=1.0):
 
 
 @pytest.mark.parametrize("gravity_factor", [1.0, 0.8, 1.2])
-def test_settles_on_every_joint_and_stays(gravity_factor):
+def test_every_joint_settles(gravity_factor):
     t, error, effort = simulate(np.array(MTM_PLAN.step), np.zeros(7), 10.0, gravity_factor)
     np.testing.assert_allclose(error[0], MTM_PLAN.step, atol=1e-12)
     late = t >= 3.0

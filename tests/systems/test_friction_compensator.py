@@ -87,7 +87,7 @@ class Compensator:
         return np.array([self.step(*row) for row in zip(q, v, strict=True)])
 
 
-def test_all_of_it_without_widening_is_a_share_of_the_identified_friction():
+def test_without_widening_it_is_a_share_of_friction():
     q, v = motion(1, 1000)
     np.testing.assert_allclose(
         Compensator(ratio=MAX_RATIO, widening=1.0).run(q, v), MAX_RATIO * friction_of_arm(q, v), atol=1e-12
@@ -96,7 +96,7 @@ def test_all_of_it_without_widening_is_a_share_of_the_identified_friction():
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("delay", [0, 2])
-def test_no_motion_gets_energy_from_it(seed, delay):
+def test_compensated_friction_is_passive(seed, delay):
     """Of friction and compensation together, in any motion, also two periods late, in counts, and noisy."""
     q, v = motion(seed)
     generator = np.random.default_rng(seed)
@@ -118,7 +118,7 @@ def test_no_motion_gets_energy_from_it(seed, delay):
     assert energy[-1] > 0.05 * np.sum(taken[1:] * dq) > 0
 
 
-def test_a_hand_feels_less():
+def test_compensation_reduces_hand_force():
     q, v = motion(5)
     given = Compensator(ratio=0.6).run(q, v)
     taken = friction_of_arm(q, v)
@@ -127,7 +127,7 @@ def test_a_hand_feels_less():
 
 
 @pytest.mark.parametrize("ratio", [0.3, MAX_RATIO])
-def test_the_friction_that_remains_holds_any_error_of_the_gravity_compensation(ratio):
+def test_remaining_friction_holds_gravity_errors(ratio):
     error = np.array([0.02, 0.03, 0.02, 0.01, 0.003, 0.002, 0.0004])
     ratios = safe_ratios(FRICTION, ratio, error)
     assert np.all((ratios >= -ROUNDING) & (ratios <= ratio + ROUNDING)) and np.any(ratios > 0.29)
@@ -140,7 +140,7 @@ def test_the_friction_that_remains_holds_any_error_of_the_gravity_compensation(r
         assert holds.success
 
 
-def test_joints_that_creep_anyway_keep_all_their_friction():
+def test_creeping_joints_keep_all_friction():
     error = np.zeros(7)
     error[5] = 0.02  # more than its friction
     ratios = safe_ratios(FRICTION, 0.6, error)
@@ -153,7 +153,7 @@ def test_joints_that_creep_anyway_keep_all_their_friction():
     np.testing.assert_allclose(ratios, np.where(touches, 0.0, 0.6), atol=ROUNDING)
 
 
-def test_what_springs_back_is_compensated_first_and_never_more_than_is_safe_along_a_coordinate():
+def test_wide_hysteresis_is_compensated_first():
     wide = FRICTION.springs_back
     assert np.any(wide) and not np.any(wide & FRICTION.holds)
     without = safe_ratios(FRICTION, 0.0, NO_EFFORT)
@@ -170,12 +170,12 @@ def test_what_springs_back_is_compensated_first_and_never_more_than_is_safe_alon
     assert safe_ratios(alone, 0.0, NO_EFFORT, hysteresis_ratio=0.9) == pytest.approx(MAX_RATIO)
 
 
-def test_without_friction_to_spare_nothing_is_compensated():
+def test_no_compensation_without_excess_friction():
     np.testing.assert_allclose(safe_ratios(FRICTION, 0.6, holding_friction(FRICTION)), 0, atol=ROUNDING)
     assert np.all(safe_ratios(FRICTION, 0.6, 0.999 * holding_friction(FRICTION)) < 0.5)
 
 
-def test_it_begins_with_nothing_and_after_a_nan_again():
+def test_friction_effort_is_zero_initially_and_after_nan():
     compensator = Compensator(ratio=MAX_RATIO)
     q = np.full(7, 0.2)
     still = np.zeros(7)
@@ -185,7 +185,7 @@ def test_it_begins_with_nothing_and_after_a_nan_again():
     assert np.all(compensator.step(q - 0.3, still) == 0)
 
 
-def test_the_sum_stays_inside_the_effort_limits():
+def test_sum_is_clamped_to_effort_limits():
     compensator = Compensator(ratio=MAX_RATIO)
     compensator.system.GetInputPort("effort_wanted").FixValue(compensator.context, 0.999 * ARM.effort_limits)
     compensator.step(np.zeros(7), np.zeros(7))
@@ -193,7 +193,7 @@ def test_the_sum_stays_inside_the_effort_limits():
     assert np.all(effort <= ARM.effort_limits) and np.any(effort == ARM.effort_limits)
 
 
-def test_it_restarts_relaxed():
+def test_elements_restart_relaxed():
     builder = DiagramBuilder()
     system = builder.AddSystem(FrictionCompensator(FRICTION))
     builder.ExportInput(system.GetInputPort("state_estimated"))
@@ -217,12 +217,12 @@ def test_it_restarts_relaxed():
         ({"holding_error": [0.1]}, "must be 7 numbers from 0"),
     ],
 )
-def test_numbers_that_are_none_are_refused(options, what):
+def test_invalid_numbers_are_refused(options, what):
     with pytest.raises(ControllerError, match=what):
         FrictionCompensator(FRICTION, **options)
 
 
-def test_friction_that_gives_energy_is_refused():
+def test_active_friction_is_refused():
     with pytest.raises(ControllerError, match="must be 0 or more"):
         Friction.of(ARM, EFFECTS, -COEFFICIENTS)
     with pytest.raises(ControllerError, match=r"allowed: actuator\.outer_yaw"):
@@ -231,7 +231,7 @@ def test_friction_that_gives_energy_is_refused():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
-def test_a_push_dies_away_on_an_arm_with_a_third_less_friction_than_identified_and_two_periods_of_delay(seed):
+def test_push_decays_with_less_friction_and_delay(seed):
     laws = [dataclasses.replace(law, coefficient=0.7 * law.coefficient) for law in ARM.effects.friction]
     effects = dataclasses.replace(
         ARM.effects.without("cables").without("springs"), friction=laws, delay=DelayEffect(measurement=1, command=1)
@@ -275,7 +275,7 @@ def released(ratio, error, holding_error, seconds=1.5):
 
 
 @pytest.mark.slow
-def test_a_released_arm_stays_though_its_gravity_is_not_known_exactly_and_would_not_with_less_care():
+def test_released_arm_stays_with_gravity_error():
     error = np.array([0.01, 0.015, -0.015, 0.01, 0.003, 0.002, 0.0004])
     assert np.all(released(MAX_RATIO, error, np.abs(error)) < 0.015)
     more = np.array([1, 2, 2, 2, 1, 1, 1]) * error

@@ -64,7 +64,7 @@ def test_ports():
 
 
 @pytest.mark.parametrize("q", POSES)
-def test_gravity_mode_is_the_plants_own_gravity(q):
+def test_gravity_mode_equals_plant_gravity(q):
     plant = make_arm_plant(ARM)
     plant_context = plant.CreateDefaultContext()
     set_arm_positions(plant, plant_context, ARM, q)
@@ -93,7 +93,7 @@ def test_law_is_equation_11():
         np.testing.assert_allclose(bench.step(q, v), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_damped_mode_brakes_and_pulls_nowhere():
+def test_damped_mode_only_adds_damping():
     bench = Bench(gains=GAINS, effort_limits=UNLIMITED, mode="damped")
     bench.initialize(POSES[0])
     v = np.linspace(-1, 1, N)
@@ -103,7 +103,7 @@ def test_damped_mode_brakes_and_pulls_nowhere():
 
 
 @pytest.mark.parametrize("j", range(N))
-def test_velocity_alone_is_damped_on_its_own_joint_and_no_other(j):
+def test_damping_acts_only_on_its_joint(j):
     # The paper's node fed positions into the damping of joints 5-7: large positions must leave it untouched.
     q = POSES[2] + 1.0
     bench = Bench(np.concatenate([q, np.zeros(N)]), gains=GAINS, effort_limits=UNLIMITED)
@@ -137,7 +137,7 @@ def test_integrator_does_not_wind_up():
     assert np.all(bench.step(q + 0.6) < effort - gravity + MODEL.holding_torque(q + 0.6))
 
 
-def test_integrator_waits_while_the_goal_is_far():
+def test_integrator_stops_while_error_is_large():
     gains = Gains(kp=[10.0] * N, kd=[0.0] * N, ki=[1.0] * N)
     q = np.zeros(N)
     bench = Bench(np.concatenate([q + 0.5, np.zeros(N)]), gains=gains, effort_limits=np.full(N, 2.0))
@@ -157,7 +157,7 @@ def test_unconnected_hold_latches_the_pose_at_initialization():
     np.testing.assert_allclose(bench.step(moved), expected, atol=1e-12)
 
 
-def test_switching_from_gravity_to_hold_latches_there_and_does_not_jump():
+def test_switch_to_hold_latches_pose_without_jump():
     bench = Bench(gains=GAINS, effort_limits=UNLIMITED, mode="gravity")
     bench.initialize(POSES[0])
     assert bench.controller.GetMode(bench.context) == "gravity"
@@ -186,7 +186,7 @@ def test_gains_belong_to_the_context():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e308])
 @pytest.mark.parametrize("where", ["position", "velocity", "desired"])
-def test_a_fault_leaves_the_gravity_of_the_last_finite_pose(bad, where):
+def test_fault_outputs_gravity_of_last_finite_pose(bad, where):
     desired = np.concatenate([POSES[0] + 0.1, np.zeros(N)])
     bench = Bench(desired, gains=GAINS, effort_limits=UNLIMITED)
     bench.initialize(POSES[0])
@@ -211,14 +211,14 @@ def test_a_fault_leaves_the_gravity_of_the_last_finite_pose(bad, where):
     assert bench.output("fault") == [0.0]
 
 
-def test_a_fault_before_any_pose_commands_nothing():
+def test_fault_before_first_pose_outputs_zero():
     bench = Bench(gains=GAINS)
     np.testing.assert_array_equal(bench.initialize(np.full(N, np.nan)), np.zeros(N))
     assert bench.output("fault") == [1.0]
     np.testing.assert_allclose(bench.step(POSES[0]), MODEL.holding_torque(POSES[0]), atol=1e-12)
 
 
-def test_gravity_mode_does_not_look_at_the_desired_state():
+def test_gravity_mode_ignores_desired_state():
     bench = Bench(np.full(2 * N, np.nan), mode="gravity")
     bench.initialize(POSES[0])
     assert bench.output("fault") == [0.0]
@@ -254,7 +254,7 @@ def test_simulator_holds_the_output_between_updates():
     np.testing.assert_allclose(port.Eval(context), expected, atol=1e-12)
 
 
-def test_trust_scales_the_gravity():
+def test_feedforward_scale_scales_gravity():
     joints = [dataclasses.replace(joint, feedforward_scale=0.25) for joint in MODEL.joints]
     bench = Bench(model=dataclasses.replace(MODEL, joints=joints), mode="gravity", effort_limits=UNLIMITED)
     np.testing.assert_allclose(bench.initialize(POSES[0]), 0.25 * MODEL.holding_torque(POSES[0]), atol=1e-12)
@@ -275,17 +275,17 @@ def test_trust_scales_the_gravity():
         ),
     ],
 )
-def test_errors_say_what_is_allowed(arguments, message):
+def test_errors_state_allowed_values(arguments, message):
     with pytest.raises(ControllerError, match=message):
         GravityPidController(MODEL, **arguments)
 
 
-def test_a_model_that_does_not_fit_its_arm_is_refused():
+def test_model_of_another_arm_is_refused():
     with pytest.raises(ModelError, match="base parameters must be"):
         GravityPidController(dataclasses.replace(MODEL, base_parameters=MODEL.base_parameters[1:]))
 
 
-def test_unconnected_state_is_named():
+def test_unconnected_state_is_reported():
     controller = GravityPidController(MODEL)
     with pytest.raises(ControllerError, match="input port state_estimated is not connected"):
         Simulator(controller).Initialize()

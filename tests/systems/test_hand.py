@@ -53,7 +53,7 @@ def held_arm(grip, X_offset, duration):
     return wanted, frame.pose(state[:7]), frame.jacobian(state[:7]) @ state[7:]
 
 
-def test_frame_is_drakes_and_its_jacobian_the_derivative_of_its_pose():
+def test_frame_pose_and_jacobian_match_drake():
     frame = ArmFrame(ARM, "dh_7")
     plant = make_arm_plant(ARM)
     context = plant.CreateDefaultContext()
@@ -68,7 +68,7 @@ def test_frame_is_drakes_and_its_jacobian_the_derivative_of_its_pose():
         np.testing.assert_allclose(J[3:, i], (plus.translation() - minus.translation()) / (2 * h), atol=1e-8)
 
 
-def test_mass_matrix_is_that_of_the_free_arms_kinetic_energy():
+def test_mass_matrix_matches_kinetic_energy():
     # The PSM's counterweight and linkage move along: its joints' inertia is that of all that they move.
     psm = load_arm("psm")
     plant = make_arm_plant(psm)
@@ -84,7 +84,7 @@ def test_mass_matrix_is_that_of_the_free_arms_kinetic_energy():
     assert 0.5 * v @ ArmFrame(psm, "dh_6").mass_matrix(q) @ v == pytest.approx(energy, rel=1e-12)
 
 
-def test_force_is_that_of_spring_and_damper_as_the_step_vanishes():
+def test_force_converges_to_spring_and_damper():
     hand = Hand(ARM, grip=WEAK, time_step=1e-9)
     frame = ArmFrame(ARM, "dh_7")
     v = np.array([0.1, -0.2, 0.1, 0.3, 0.2, -0.1, 0.4])
@@ -96,13 +96,13 @@ def test_force_is_that_of_spring_and_damper_as_the_step_vanishes():
     np.testing.assert_allclose(tau, frame.jacobian(Q).T @ F, rtol=0, atol=1e-12 * np.abs(F).max())
 
 
-def test_force_at_rest_in_the_wanted_pose_is_none():
+def test_force_at_rest_in_desired_pose_is_zero():
     tau, F = evaluate(Hand(ARM), Q, np.zeros(7), ArmFrame(ARM, "dh_7").pose(Q))
     np.testing.assert_allclose(F, 0, atol=1e-9)
     np.testing.assert_allclose(tau, 0, atol=1e-9)
 
 
-def test_force_and_torque_are_limited_and_keep_their_direction_as_the_step_vanishes():
+def test_limited_force_and_torque_keep_direction():
     way = np.array([0, 0, 1.5, 3.0, 4.0, 0.0])
     far = moved(ArmFrame(ARM, "dh_7").pose(Q), way[:3], way[3:])
     limited = evaluate(Hand(ARM, time_step=1e-9), Q, np.zeros(7), far)[1]
@@ -111,7 +111,7 @@ def test_force_and_torque_are_limited_and_keep_their_direction_as_the_step_vanis
 
 
 @pytest.mark.parametrize("time_step", [1e-3, 1e-2])
-def test_force_and_torque_stay_in_their_limits(time_step):
+def test_force_and_torque_are_limited(time_step):
     generator = np.random.default_rng(0)
     hand = Hand(ARM, time_step=time_step)
     for _ in range(20):
@@ -122,7 +122,7 @@ def test_force_and_torque_stay_in_their_limits(time_step):
         assert np.linalg.norm(F[3:]) <= 20.0 * (1 + 1e-12)
 
 
-def test_hand_lets_go_without_a_wanted_pose_and_on_nonsense():
+def test_no_force_without_finite_desired_pose():
     X = ArmFrame(ARM, "dh_7").pose(Q + 0.1)
     bad = Q.copy()
     bad[2] = np.nan
@@ -133,7 +133,7 @@ def test_hand_lets_go_without_a_wanted_pose_and_on_nonsense():
 
 
 @pytest.mark.parametrize("firmer", [1.0, 1e3])
-def test_hand_brings_the_handle_where_it_wants_it_however_firm_it_is(firmer):
+def test_hand_moves_handle_to_pose_with_any_stiffness(firmer):
     # 600 kN/m and 2 kN m/rad on a wrist of 1e-5 kg m^2: an explicit spring would throw it away in one step.
     grip = Grip(600.0 * firmer, 25.0 * firmer, 2.0 * firmer, 0.03 * firmer)
     wanted, X, V = held_arm(grip, ([0.1, -0.1, 0.2], [0.02, -0.02, 0.03]), 2.0)
@@ -142,7 +142,7 @@ def test_hand_brings_the_handle_where_it_wants_it_however_firm_it_is(firmer):
     assert np.linalg.norm(V[3:]) < 5e-3
 
 
-def test_what_is_refused():
+def test_invalid_arguments_are_refused():
     with pytest.raises(ArmError, match='MTML: its SDF has no frame "thumb"; it has dh_0'):
         Hand(ARM, "thumb")
     with pytest.raises(StationError, match=r"a hand's stiffness is nan; allowed: 1e-06\.\."):

@@ -24,7 +24,7 @@ def public_methods():
                             yield f"{path.name}: {node.name}.{method.name}", is_system, method.name
 
 
-def test_methods_of_systems_and_of_other_classes_have_their_style():
+def test_method_names_follow_the_style():
     methods = list(public_methods())
     assert sum(is_system for _, is_system, _ in methods) > 10
     wrong = [where for where, is_system, name in methods if name[0].isupper() != is_system and name not in OF_DRAKE]

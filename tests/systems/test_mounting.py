@@ -32,7 +32,7 @@ def drift(arm, mounted, model):
 @pytest.mark.parametrize(
     ("name", "gravity"), [("mtml", (3.0, 2.0, -9.1)), ("mtml", (0.0, 0.0, 9.81)), ("psm", (0.0, -9.81, 0.0))]
 )
-def test_a_model_of_the_same_mounting_holds_and_another_does_not(name, gravity):
+def test_only_model_of_same_mounting_holds_the_arm(name, gravity):
     arm = load_arm(name)
     mounted = arm.with_gravity(gravity)
     model = IdentifiedModel.from_arm(mounted)

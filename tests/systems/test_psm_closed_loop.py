@@ -70,14 +70,14 @@ def allowed_motion(plant, context):
     return H
 
 
-def test_only_the_loops_lose_their_couplings():
+def test_only_loop_joints_lose_couplings():
     tree, pinned = make_arm_plant(ARM), make_arm_plant(ARM, closure="ball")
     # Six joints follow others; those of two loops are four. Each loop gets a pin and a bar's length.
     assert tree.num_constraints() == 6
     assert pinned.num_constraints() == len(CABLES) + 2 * len(ARM.loop_closures)
 
 
-def test_pins_give_the_same_motion_torque_and_inertia_as_the_couplings():
+def test_pins_and_couplings_give_the_same_dynamics():
     tree, pinned = make_arm_plant(ARM), make_arm_plant(ARM, closure="ball")
     tree_context, context = tree.CreateDefaultContext(), pinned.CreateDefaultContext()
     G = ARM.linkage.matrix
@@ -94,7 +94,7 @@ def test_pins_give_the_same_motion_torque_and_inertia_as_the_couplings():
 
 
 @pytest.mark.parametrize("q", ARM.sample_poses(3, np.random.default_rng(1), margin=0.25))
-def test_same_torques_move_both_alike(q):
+def test_same_torques_give_the_same_motion(q):
     """Holding torque and more, different at every joint, for half a second without control: about 1 rad/s."""
     phase = np.arange(N)
     push = 0.05 * np.array([2.0, 2.0, 6.0, 0.003, 0.006, 0.015, 0.004])
@@ -120,7 +120,7 @@ def test_same_torques_move_both_alike(q):
     assert np.all(difference[N:] < 5e-6)
 
 
-def test_closure_and_remote_centre_while_the_arm_moves_through_the_whole_box():
+def test_closure_and_remote_centre_during_motion():
     """All corners of yaw, pitch and insertion under control, as fast as 1.6 rad/s, with the loops pinned."""
     # A little inside, where the controller does not push against the stops.
     center, half = (ARM.position_lower + ARM.position_upper) / 2, (ARM.position_upper - ARM.position_lower) / 2
@@ -157,7 +157,7 @@ def test_closure_and_remote_centre_while_the_arm_moves_through_the_whole_box():
 
 
 @pytest.mark.parametrize("closure", ["mimic", "ball"])
-def test_held_poses_all_over_the_box_keep_the_remote_centre(closure):
+def test_held_poses_keep_the_remote_centre(closure):
     """Statically: a released arm under exact gravity compensation, half a second at each pose."""
     builder = DiagramBuilder()
     station = builder.AddSystem(ArmStation(ARM, closure=closure))
@@ -179,7 +179,7 @@ def test_held_poses_all_over_the_box_keep_the_remote_centre(closure):
 
 @pytest.mark.parametrize("closure", ["mimic", "ball"])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_full_effort_against_every_stop_moves_neither_linkage_nor_remote_centre(closure, sign):
+def test_full_effort_at_stops_keeps_linkage_closed(closure, sign):
     """A stop acts on the leading joint; what follows it, the counterweight above all, must stop as well."""
     station = ArmStation(ARM, closure=closure)
     simulator = Simulator(station)

@@ -90,12 +90,12 @@ def check_steps(bench, poses, largest_overshoot):
 
 
 @pytest.mark.parametrize(("gravity_factor", "poses"), [(1.0, slice(None)), (0.8, slice(1, 2)), (1.2, slice(2, 3))])
-def test_a_step_of_each_joint_settles_within_a_second(gravity_factor, poses):
+def test_step_of_each_joint_settles_within_a_second(gravity_factor, poses):
     # Measured: 9 % at most, on the roll; 0.82 s at most, on the yaw.
     check_steps(Bench(gravity_factor), step_poses()[poses], 0.12)
 
 
-def test_a_step_settles_on_an_arm_with_three_times_the_inertia():
+def test_step_settles_with_three_times_the_inertia():
     """A real arm has up to twice the inertia of the SDF; here three times, and the gravity model knows it to 20 %."""
     bench = Bench(gravity_factor=0.8 * 3, inertia_factor=3)
     # Its weight is beyond the effort limits in some of the box: poses where the motors have something left.
@@ -104,7 +104,7 @@ def test_a_step_settles_on_an_arm_with_three_times_the_inertia():
     check_steps(bench, poses[light][:2], 0.15)
 
 
-def test_a_saturating_step_does_not_wind_up():
+def test_saturating_step_does_not_wind_up():
     """2.3 rad and 0.18 m at once: nobody should command it, the motors are at their limits and brake late."""
     center, half = (ARM.position_lower + ARM.position_upper) / 2, (ARM.position_upper - ARM.position_lower) / 2
     start, goal = center - 0.95 * half, center + 0.5 * half

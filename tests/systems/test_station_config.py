@@ -35,7 +35,7 @@ def path(tmp_path):
     return path
 
 
-def test_a_file_is_read_with_drakes_loader_and_keeps_what_it_leaves_out(path):
+def test_file_is_loaded_with_defaults(path):
     config = load_station_config(path)
     assert (config.arm, config.closure, config.seed, config.simulated_effects) == ("psm", "ball", 3, ["friction"])
     assert (config.plant.time_step, config.plant.contact_model) == (0.002, "point")
@@ -44,13 +44,13 @@ def test_a_file_is_read_with_drakes_loader_and_keeps_what_it_leaves_out(path):
     assert config.driver.model == str(path.parent / "model.yaml")
 
 
-def test_a_configuration_survives_its_file():
+def test_configuration_round_trip():
     config = StationConfig(arm="mtmr", plant=arm_plant_config(2e-3))
     again = yaml_load_typed(schema=StationConfig, data=yaml_dump_typed(config, schema=StationConfig))
     assert repr(again) == repr(config), "Drake's own schemas do not define equality"
 
 
-def test_the_station_is_the_one_of_the_file(path):
+def test_station_matches_its_file(path):
     config = load_station_config(path)
     station = make_arm_station(config)
     assert isinstance(station, ArmStation) and station.plant.time_step() == 0.002
@@ -75,7 +75,7 @@ def test_hardware_and_simulation_have_the_same_ports(name):
             assert ports.GetOutputPort(port).size() == size
 
 
-def test_a_scenario_states_its_arm_with_the_same_fields():
+def test_scenario_has_the_same_arm_fields():
     assert issubclass(Scenario, ArmConfig) and issubclass(StationConfig, ArmConfig)
     # "closure" has another default in a scenario, but the same meaning.
     own = [set(schema.__annotations__) & set(ArmConfig.__annotations__) for schema in (Scenario, StationConfig)]
@@ -100,7 +100,7 @@ def test_a_scenario_states_its_arm_with_the_same_fields():
         ("point", "[", r"station\.yaml: "),
     ],
 )
-def test_what_is_not_allowed_is_named(path, old, new, message):
+def test_invalid_values_are_reported(path, old, new, message):
     assert FILE.count(old) == 1
     path.write_text(FILE.replace(old, new))
     with pytest.raises((StationError, ArmError), match=message) as error:
@@ -108,7 +108,7 @@ def test_what_is_not_allowed_is_named(path, old, new, message):
     assert "\n" not in str(error.value)
 
 
-def test_the_example_of_the_documentation_runs(monkeypatch):
+def test_documentation_example_runs(monkeypatch):
     monkeypatch.chdir(ROOT)
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/lcm.md").read_text(), re.DOTALL)
     (code,) = (block for block in blocks if "load_station_config" in block)
@@ -117,7 +117,7 @@ def test_the_example_of_the_documentation_runs(monkeypatch):
     assert names["simulator"].get_context().get_time() == 0.5
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_missing_file_is_reported(tmp_path):
     with pytest.raises(StationError, match=r"nowhere\.yaml: "):
         load_station_config(tmp_path / "nowhere.yaml")
 

@@ -41,7 +41,7 @@ def run(arms, duration=2.5):
     return np.concatenate(state), (X_MG0, arms.CalcX_MG(context)), (X_FT0, arms.CalcX_FT(context)), target
 
 
-def test_simulated_follower_arrives_where_a_hand_leads_it(arms):
+def test_simulated_follower_follows_the_hand(arms):
     _, (G0, G), (T0, T), target = run(arms)
     # The hand gets the gravity-compensated master to where it wants it, so it carries no weight.
     assert np.linalg.norm(G.translation() - target.translation()) < 1e-4
@@ -57,7 +57,7 @@ def test_simulation_is_repeatable(arms):
     np.testing.assert_array_equal(run(arms, 0.5)[0], run(arms, 0.5)[0])
 
 
-def test_master_that_nobody_touches_stays_and_so_does_the_follower(arms):
+def test_master_and_follower_stay_without_a_hand(arms):
     simulator = Simulator(arms)
     context = simulator.get_mutable_context()
     arms.SetPositions(context, START_MASTER, START_FOLLOWER)
@@ -69,7 +69,7 @@ def test_master_that_nobody_touches_stays_and_so_does_the_follower(arms):
     np.testing.assert_allclose(q_F, START_FOLLOWER, atol=1e-4)
 
 
-def test_pose_stays_at_the_ends_of_its_trajectory():
+def test_pose_is_constant_outside_the_trajectory():
     ends = [RigidTransform([0.0, 0, 0]), RigidTransform([2.0, 0, 0])]
     source = PoseTrajectorySource(PiecewisePose.MakeLinear([1.0, 2.0], ends))
     context = source.CreateDefaultContext()

@@ -11,7 +11,7 @@ from dvrk_drake.systems.teleoperation import MAX_LAG, MIN_DEPTH, Teleoperation, 
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_tip_repeats_the_handle_scaled_and_turned_into_its_base(seed):
+def test_tip_follows_handle_scaled_and_rotated(seed):
     generator = np.random.default_rng(seed)
     R_FM = RotationMatrix(RollPitchYaw(generator.uniform(-1, 1, 3)))
     loop = Loop(scale=0.25, R_FM=R_FM)
@@ -37,7 +37,7 @@ def test_commanded_velocity_is_the_rate_of_the_commanded_position():
         before = q
 
 
-def test_open_clutch_holds_exactly():
+def test_open_clutch_holds_the_command():
     loop = Loop()
     loop.step(engaged=1.0)
     held = loop.move(Q_M + 0.1)[-1]
@@ -48,7 +48,7 @@ def test_open_clutch_holds_exactly():
         np.testing.assert_array_equal(v, 0.0)
 
 
-def test_engaging_again_elsewhere_moves_nothing_and_goes_on_from_there():
+def test_engaging_again_does_not_move_the_tip():
     loop = Loop()
     loop.step(engaged=1.0)
     held = loop.move(Q_M + 0.1)[-1]
@@ -66,7 +66,7 @@ def test_engaging_again_elsewhere_moves_nothing_and_goes_on_from_there():
     )
 
 
-def test_no_joint_is_commanded_faster_than_its_limit_whatever_the_master_does():
+def test_commanded_velocity_is_limited():
     loop = Loop()
     before, _ = loop.step(engaged=1.0)
     generator = np.random.default_rng(0)
@@ -85,7 +85,7 @@ def test_no_joint_is_commanded_faster_than_its_limit_whatever_the_master_does():
 
 
 @pytest.mark.parametrize("turn", [np.array([0, 0, 0, 0, 0, 0, 6.0]), np.array([0.8, 0.5, -0.7, 0, 1.5, 0.6, 0])])
-def test_limits_are_kept_and_the_tip_comes_back_with_the_master(turn):
+def test_tip_returns_from_limits_with_the_master(turn):
     q_start = np.array([1.2, -0.7, 0.22, 3.0, 1.0, 1.0, 0.5])
     loop = Loop(q_start, scale=1.0)
     loop.step(engaged=1.0)
@@ -100,7 +100,7 @@ def test_limits_are_kept_and_the_tip_comes_back_with_the_master(turn):
     np.testing.assert_allclose(tip(back[-1]).GetAsMatrix4(), tip(q_start).GetAsMatrix4(), atol=1e-9)
 
 
-def test_tip_that_is_pulled_out_stops_below_the_remote_centre_and_comes_back():
+def test_tip_stops_below_remote_centre_and_returns():
     loop = Loop(np.array([0.0, 0, 0.05, 0, 0, 0, 0.5]), scale=1.0)
     loop.step(engaged=1.0)
     up = np.array([0.1, 1.0, -0.3, 0.2, 1.0, 0.1, 0.3])
@@ -121,7 +121,7 @@ def test_instrument_in_its_cannula_does_not_follow():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e7])
 @pytest.mark.parametrize("port", ["master_position", "follower_position", "engaged", "jaw_angle"])
-def test_unusable_input_is_held_through_and_then_engaged_anew(port, bad):
+def test_unusable_input_holds_then_engages_again(port, bad):
     loop = Loop()
     loop.step(engaged=1.0)
     held = loop.move(Q_M + 0.05)[-1]
@@ -140,7 +140,7 @@ def test_unusable_input_is_held_through_and_then_engaged_anew(port, bad):
     assert (loop.flag("following"), loop.flag("fault")) == (1.0, 0.0)
 
 
-def test_nothing_is_commanded_before_the_follower_was_seen():
+def test_no_command_before_first_follower_position():
     loop = Loop(np.full(7, np.nan))
     for _ in range(3):
         q, _ = loop.step(follower=np.full(7, np.nan), engaged=1.0)
@@ -150,7 +150,7 @@ def test_nothing_is_commanded_before_the_follower_was_seen():
     np.testing.assert_allclose(q, Q_F, atol=1e-12)
 
 
-def test_follower_that_is_blocked_is_not_driven_on():
+def test_blocked_follower_is_held():
     loop = Loop()
     loop.step(engaged=1.0)
     for s in np.linspace(0, 1, 1000):
@@ -163,7 +163,7 @@ def test_follower_that_is_blocked_is_not_driven_on():
     assert loop.flag("fault") == 0.0
 
 
-def test_jaw_may_press_on_something():
+def test_jaw_may_press_on_an_object():
     loop = Loop()
     loop.step(engaged=1.0)
     for _ in range(1000):
@@ -196,7 +196,7 @@ def test_scale_out_of_range_is_refused(scale):
         loop.system.SetScale(loop.context, scale)
 
 
-def test_other_arguments_that_are_refused():
+def test_other_invalid_arguments_are_refused():
     with pytest.raises(ControllerError, match="period must be a positive number"):
         Teleoperation(MTM, PSM, period=0.0)
     with pytest.raises(ArmError, match="MTML has not the kinematics of a PSM"):

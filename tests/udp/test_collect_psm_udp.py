@@ -25,7 +25,7 @@ def test_in_a_network_of_its_own(request):
 
 
 @inside
-def test_a_collection_of_a_psm_from_both_sides_completes(tmp_path):
+def test_psm_collection_from_both_sides_completes(tmp_path):
     arm, poses, output = load_arm("psm"), tmp_path / "poses.yaml", tmp_path / "poses.csv"
     assert main(["collect", "--arm", "psm", "--poses", str(poses), "--random", str(POSES), "--seed", "3"]) == 0
     observer = Observer("psm")

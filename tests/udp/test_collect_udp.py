@@ -45,7 +45,7 @@ def moving(status):
 
 
 @inside
-def test_collect_kill_go_on_identify_and_release(observer, tmp_path):
+def test_collect_kill_resume_identify_and_release(observer, tmp_path):
     arm, poses, output = load_arm("mtml"), tmp_path / "poses.yaml", tmp_path / "poses.csv"
     assert main(["collect", "--arm", "mtml", "--poses", str(poses), "--random", str(POSES), "--seed", "5"]) == 0
     command = ["collect", "--arm", "mtml", "--poses", poses, "--output", output, "--realtime", "--traverse-time", "1"]

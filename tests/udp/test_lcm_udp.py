@@ -107,7 +107,7 @@ def reset(name, observer):
 
 
 @inside
-def test_command_and_status_go_round(arm):
+def test_command_and_status_round_trip(arm):
     name, _, observer = arm
     controller = start_controller(name, "--echo")
     try:
@@ -127,7 +127,7 @@ def test_command_and_status_go_round(arm):
 @inside
 @watchdog
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_a_killed_controller_is_followed_by_a_hold(name, tmp_path):
+def test_arm_holds_after_controller_is_killed(name, tmp_path):
     """With the expiry that a real arm has, by the arm's clock and, where scheduling is real-time, by the wall clock."""
     (tmp_path / "driver.yaml").write_text("guard: {resume_automatically: true}\n")
     observer = Observer(name, OTHER_URL)
@@ -176,7 +176,7 @@ def waits_for_an_operator(status):
 @inside
 @pytest.mark.parametrize("seconds", [0.05, 0.2, 1.0])
 @pytest.mark.parametrize("stalled", ["arm", "controller"])
-def test_a_stall_is_followed_by_a_hold_until_an_operator_resumes(stalled, seconds):
+def test_arm_holds_after_stall_until_operator_resumes(stalled, seconds):
     """By signals, with the expiry that a real arm has. One of 20 ms may last longer: its test has a simulated clock.
 
     A busy computer may stop one of them before the test does: that has the same end.
@@ -209,7 +209,7 @@ def test_a_stall_is_followed_by_a_hold_until_an_operator_resumes(stalled, second
 @inside
 @watchdog
 @pytest.mark.parametrize("stalled", ["arm", "run"])
-def test_run_ends_after_a_stall_and_starts_again_by_an_operator(stalled):
+def test_run_ends_after_stall_and_operator_restarts(stalled):
     observer, url = Observer("mtml", OTHER_URL), ("--lcm-url", OTHER_URL)
     arm, run = start_arm("mtml", *url), start_run("mtml", *url)
     runs = [run]
@@ -237,7 +237,7 @@ def test_run_ends_after_a_stall_and_starts_again_by_an_operator(stalled):
 
 @inside
 @pytest.mark.parametrize("mode", ["gravity", "hold"])
-def test_run_starts_ramps_in_and_leaves_the_arm_to_its_hold(arm, mode):
+def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     name, _, observer = arm
     expired = observer.last.num_expired
     starts = CommandLine if (name, mode) == ("mtml", "gravity") else start_run
@@ -262,7 +262,7 @@ def test_run_starts_ramps_in_and_leaves_the_arm_to_its_hold(arm, mode):
 
 
 @inside
-def test_run_stops_when_the_arm_faults_and_refuses_one_that_has_a_fault():
+def test_run_stops_on_fault_and_refuses_faulty_arm():
     arm = ScriptedArm(OTHER_URL)
 
     def ends(*options):
@@ -301,7 +301,7 @@ def test_run_stops_when_the_arm_faults_and_refuses_one_that_has_a_fault():
 
 
 @inside
-def test_garbage_neither_stops_nor_moves_the_arm(arm):
+def test_invalid_messages_neither_stop_nor_move_the_arm(arm):
     name, process, observer = arm
     generator = np.random.default_rng(7)
     network = lcm.LCM()
@@ -334,7 +334,7 @@ def test_garbage_neither_stops_nor_moves_the_arm(arm):
 
 
 @inside
-def test_a_jump_of_the_controllers_clock_is_followed_by_a_hold_and_a_new_start(arm):
+def test_controller_clock_jump_leads_to_hold_and_restart(arm):
     name, _, observer = arm
     first = len(observer.heard)
     controller = start_controller(name, "--clock-jump", {"mtml": "10", "psm": "-10"}[name])
@@ -384,7 +384,7 @@ class Logged:
 
 
 @inside
-def test_commands_that_are_played_again_from_a_log_are_refused(arm, tmp_path):
+def test_replayed_commands_of_a_log_are_refused(arm, tmp_path):
     name, _, observer = arm
     with Logged(tmp_path / "commands", NETWORK_URL) as log:
         controller = start_controller(name)
@@ -409,7 +409,7 @@ def test_commands_that_are_played_again_from_a_log_are_refused(arm, tmp_path):
 
 @watchdog
 @inside
-def test_an_arm_that_is_killed_and_restarted_hears_nothing_from_run_nor_from_a_log(tmp_path):
+def test_restarted_arm_ignores_run_and_log(tmp_path):
     """A watchdog test, since `run` ends where the computer stops the arm's guard for 40 ms."""
     observer, on_other = Observer("mtml", OTHER_URL), ("--lcm-url", OTHER_URL)
     arm = start_arm("mtml", *PATIENT, *on_other)
@@ -477,7 +477,7 @@ class ScriptedArm:
 
 @inside
 @pytest.mark.parametrize("ends", ["restarted", "clock"])
-def test_run_goes_on_beside_foreign_statuses_and_ends_when_its_session_is_silent(ends):
+def test_run_ignores_foreign_statuses_and_ends_on_silence(ends):
     arm, run = ScriptedArm(THIRD_URL), start_run("mtml", "--mode", "hold", "--realtime", "--lcm-url", THIRD_URL)
     session = arm.status.session_id
 
@@ -542,7 +542,7 @@ def test_of_two_controllers_the_first_stays_in_command(arm):
 
 @watchdog
 @inside
-def test_with_a_key_a_flood_of_foreign_commands_neither_slows_nor_moves_the_arm(tmp_path):
+def test_key_protects_from_flood_of_foreign_commands(tmp_path):
     """Good commands of a stranger, as fast as a process can publish them.
 
     The rate is compared with that of a peer, a process with the same period and scheduling that reads no messages:

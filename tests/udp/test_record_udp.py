@@ -103,7 +103,7 @@ def end_logger(logger, path):
 
 
 @inside
-def test_a_live_arm_is_logged_and_recorded_with_the_same_numbers(tmp_path):
+def test_log_and_recording_of_live_arm_agree(tmp_path):
     pose, driver = ["0.1", "0.4", "-0.25", "0.6", "0.9", "0.1", "0.5"], tmp_path / "driver.yaml"
     # The network's memory holds half a second then, and a busy computer loses nothing.
     driver.write_text("status_period: 0.005\n")
@@ -134,7 +134,7 @@ def test_a_live_arm_is_logged_and_recorded_with_the_same_numbers(tmp_path):
 
 
 @inside
-def test_lcm_logplayer_replays_a_log_into_record(tmp_path, played):
+def test_record_reads_log_from_lcm_logplayer(tmp_path, played):
     paths = [tmp_path / name for name in ("again.csv", "again.log", "logger.log")]
     logger, recorders = start_logger(paths[2]), start_records(paths[:2])
     play(played, "--speed=0.25")  # slowly: nothing is lost on a busy computer either
@@ -160,7 +160,7 @@ def missing_at_first(path):
 
 
 @inside
-def test_a_killed_record_or_logger_leaves_a_readable_file(tmp_path, played):
+def test_killed_record_or_logger_leaves_readable_file(tmp_path, played):
     """At whatever moment: when the first file has so many of 2000 rows."""
     original = by_utime(played)
     for count in (1, 100, 300, 600):
@@ -185,7 +185,7 @@ def test_a_killed_record_or_logger_leaves_a_readable_file(tmp_path, played):
 
 
 @inside
-def test_silence_is_explained(tmp_path, played):
+def test_missing_status_is_explained(tmp_path, played):
     publisher, ended = lcm.LCM(), threading.Event()
 
     def send_garbage():

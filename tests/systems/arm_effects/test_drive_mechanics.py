@@ -28,7 +28,7 @@ def test_joints_of_drive_coordinates_follow_the_arm(name):
 
 
 @pytest.mark.parametrize("which", [0, 1])
-def test_the_coupled_stop_stops(which):
+def test_coupled_stop_limits_motion(which):
     arm = weightless("mtml")
     limit = arm.coupled_limits[0]
     push = (-3.0, 3.0)[which] * np.array([limit.coefficients.get(j, 0.0) for j in arm.joint_names]) / 2
@@ -51,7 +51,7 @@ def test_the_coupled_stop_stops(which):
 
 
 @pytest.mark.parametrize("direction", [-1.0, 1.0])
-def test_the_coupled_stop_gives_no_energy(direction):
+def test_coupled_stop_adds_no_energy(direction):
     arm = weightless("mtml")
     energy = {}
     for parts in ([], ["stops"]):
@@ -71,7 +71,7 @@ def test_the_coupled_stop_gives_no_energy(direction):
     assert energy[1][-1] < 0.8 * energy[1][0] < energy[0][100]
 
 
-def test_a_cables_effort_is_minus_what_identification_calls_the_effect():
+def test_cable_effort_has_opposite_sign_of_identified_effect():
     arm, q = load_arm("mtml"), np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
     sine = DriveEffect("joint.wrist_pitch", "cable sine", 1.0, 0.2)
     offset = DriveEffect("actuator.elbow_pitch", "offset", 0.0, 0.1)
@@ -82,7 +82,7 @@ def test_a_cables_effort_is_minus_what_identification_calls_the_effect():
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_cables_and_springs_give_back_what_they_take(name):
+def test_cables_and_springs_are_conservative(name):
     """Round a closed path of the joints their work is nothing."""
     arm = weightless(name)
     run = Run(arm, arm.effects.only(["cables", "springs"]))
@@ -111,7 +111,7 @@ def stretched(friction=()):
     return arm, Run(arm, ArmEffects(stretch=CABLES, friction=list(friction)))
 
 
-def test_a_cable_stretches_by_its_load():
+def test_cable_stretches_by_its_load():
     """A motor that holds against an effort on the joints turns by what the cable gives; the encoder sits on it."""
     brakes = [FrictionEffect(f"actuator.{joint}", "viscous", 0.0, 0.5) for joint in load_arm("mtml").joint_names]
     arm, run = stretched(brakes)
@@ -129,12 +129,12 @@ def test_a_cable_stretches_by_its_load():
 
 
 @pytest.mark.parametrize(("name", "actuator"), [("mtml", "elbow_pitch"), ("psm", "insertion"), ("psm", "jaw")])
-def test_a_cable_whose_rotor_is_not_known_is_refused(name, actuator):
+def test_cable_without_rotor_inertia_is_refused(name, actuator):
     with pytest.raises(StationError, match=f"stretch.{actuator}: allowed are actuators that turn one joint alone"):
         ArmStation(load_arm(name), effects=ArmEffects(stretch={actuator: Cable(100.0)}))
 
 
-def test_cables_that_stretch_give_back_no_more_than_they_hold():
+def test_elastic_cables_add_no_energy():
     """Motion and stretch together never gain energy once nothing pushes any more."""
     arm, run = stretched()
     plant = run.station.plant
@@ -158,7 +158,7 @@ def test_cables_that_stretch_give_back_no_more_than_they_hold():
     assert path[-1] < 0.9 * path[0]
 
 
-def test_a_rotor_behind_a_cable_is_the_one_that_the_sdf_states():
+def test_rotor_behind_cable_has_inertia_of_sdf():
     arm, run = stretched()
     plant = run.station.plant
     plant_context = plant.GetMyContextFromRoot(run.context)

@@ -17,7 +17,7 @@ INVERSE = ARM.transmission.inverse  # joints from actuators
 
 
 @pytest.mark.parametrize(("value", "step", "expected"), [(0.34, 0.1, 0.3), (-0.36, 0.1, -0.4), (0.34, 0.0, 0.34)])
-def test_a_value_is_counted_in_whole_steps(value, step, expected):
+def test_in_steps_rounds_to_whole_steps(value, step, expected):
     assert in_steps(value, step) == pytest.approx(expected, abs=1e-12)
 
 
@@ -53,7 +53,7 @@ def sensor(seed, **effort):
     return measured
 
 
-def test_noise_of_a_seed_depends_on_the_time_step_alone():
+def test_noise_depends_on_seed_and_time_step_only():
     deviation = dict.fromkeys(ARM.joint_names, 0.01)
     once, again, other = sensor(1, noise=deviation), sensor(1, noise=deviation), sensor(2, noise=deviation)
     path = np.array([once(tick) for tick in range(400)])
@@ -100,7 +100,7 @@ def test_encoders_count_and_differentiate():
 
 
 @pytest.mark.parametrize("delay", [2, 4])
-def test_a_queue_of_measurements_comes_out_in_order(delay):
+def test_measurement_queue_keeps_order(delay):
     # `DriveStep` stores the newest one for the step that follows: the queue is one shorter than the delay.
     positions = np.arange(1.0, 9.0)
     path = measure(positions, 0.0, decay=-1.0, delay=delay)
@@ -121,7 +121,7 @@ def hooks(positions, *, fall_speed=0.0, side=1.0, code=5, velocity=0.0):
     return path
 
 
-def test_a_hook_stands_until_its_spring_slips_and_then_follows():
+def test_anchor_follows_when_spring_slips():
     assert hooks([0.05, 0.09, -0.09]) == [0.0, 0.0, 0.0]
     np.testing.assert_allclose(hooks([0.3, 0.25, 0.15, 0.05, 0.2]), [0.2, 0.2, 0.2, 0.15, 0.15], atol=1e-12)
     np.testing.assert_allclose(hooks([-0.3, -0.15]), [-0.2, -0.2], atol=1e-12)
@@ -130,7 +130,7 @@ def test_a_hook_stands_until_its_spring_slips_and_then_follows():
     np.testing.assert_allclose(hooks([-0.3, -0.1], code=6, side=-1.0), [-0.2, -0.1], atol=1e-12)
 
 
-def test_a_hook_whose_spring_holds_less_at_speed_comes_nearer():
+def test_anchor_moves_closer_with_fall_speed():
     (still,), (moving,) = hooks([0.3], fall_speed=1.0), hooks([0.3], fall_speed=1.0, velocity=1.0)
     assert still == pytest.approx(0.2, abs=1e-12)
     # It holds 1/e of its travel, less what the arm moves in two steps.
@@ -141,7 +141,7 @@ def test_a_hook_whose_spring_holds_less_at_speed_comes_nearer():
 
 
 @pytest.mark.parametrize("stretch", [{}, {"outer_yaw": Cable(80.0, 0.05)}])
-def test_motors_give_the_power_that_actuators_take(stretch):
+def test_power_of_motors_equals_power_of_actuators(stretch):
     """The map of velocities to the actuators is the transpose of the map of efforts from the motors."""
     parts = Run(ARM, ArmEffects(stretch=stretch)).station._parts
     np.testing.assert_allclose(parts.to_actuators, parts.from_motors.T, atol=1e-12)
@@ -150,7 +150,7 @@ def test_motors_give_the_power_that_actuators_take(stretch):
     assert len(parts.drive.motors) == len(stretch)
 
 
-def test_coordinates_of_the_drive_are_joints_of_the_plant():
+def test_drive_coordinates_are_plant_joints():
     run = Run(ARM, ARM.effects.only(["friction", "stops"]), middle(ARM))
     drive, plant = run.station._parts.drive, run.station.plant
     joint, ratio = drive.joint(-2.0 * np.eye(N)[4])
@@ -162,7 +162,7 @@ def test_coordinates_of_the_drive_are_joints_of_the_plant():
         assert drive.joint(row) == (added, 1.0)  # it is found again, not made again
 
 
-def test_a_drive_without_effects_is_the_ideal_one():
+def test_drive_without_effects_is_ideal():
     arm = weightless("mtml")
     paths = []
     for effects in (None, ArmEffects()):

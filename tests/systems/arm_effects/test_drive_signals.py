@@ -17,7 +17,7 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 5])
-def test_measurement_is_late_by_exactly_its_ticks(ticks):
+def test_measurement_delay_is_exact(ticks):
     arm = load_arm("mtml")
     run = Run(arm, ArmEffects(delay=DelayEffect(measurement=ticks)))
     true, measured = [run.get("state_true")], [run.get("state_estimated")]
@@ -31,7 +31,7 @@ def test_measurement_is_late_by_exactly_its_ticks(ticks):
 
 
 @pytest.mark.parametrize("ticks", [1, 2, 5])
-def test_command_is_late_by_exactly_its_ticks(ticks):
+def test_command_delay_is_exact(ticks):
     arm = weightless("psm")
     q = {}
     for n in (0, ticks):
@@ -47,7 +47,7 @@ def test_command_is_late_by_exactly_its_ticks(ticks):
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_positions_are_counts_of_the_encoders(name):
+def test_positions_are_whole_encoder_counts(name):
     arm = load_arm(name)
     run = Run(arm, arm.effects.only(["encoder"]))
     n = arm.num_joints
@@ -63,7 +63,7 @@ def test_positions_are_counts_of_the_encoders(name):
     assert np.abs(run.v).max() > 0.1
 
 
-def test_velocity_is_what_the_low_pass_makes_of_the_counts():
+def test_velocity_is_low_pass_of_count_differences():
     arm = load_arm("mtml")
     h, cut_off = STEP, 30.0
     run = Run(arm, ArmEffects(encoder=EncoderEffect(arm.effects.encoder.resolution, cut_off)))
@@ -78,7 +78,7 @@ def test_velocity_is_what_the_low_pass_makes_of_the_counts():
     assert np.abs(v[:3] - run.v[:3]).max() < 0.3 * np.abs(run.v[:3]).max()
 
 
-def test_an_arm_at_rest_measures_no_velocity_from_the_start():
+def test_arm_at_rest_measures_zero_velocity():
     arm = weightless("mtml")
     for delay in (None, DelayEffect(measurement=3)):
         run = Run(arm, ArmEffects(encoder=arm.effects.encoder, delay=delay), q=np.full(7, 0.2))
@@ -89,7 +89,7 @@ def test_an_arm_at_rest_measures_no_velocity_from_the_start():
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_motors_saturate_each_at_its_own_limit(name):
+def test_each_motor_saturates_at_its_limit(name):
     arm = load_arm(name)
     limit = np.array([arm.effects.saturation[joint] for joint in arm.joint_names])
     run = Run(arm, arm.effects.only(["saturation"]))
@@ -125,7 +125,7 @@ def test_efforts_have_steps_and_noise():
 
 
 @pytest.mark.parametrize("effects", [None, ArmEffects()])
-def test_a_controller_sees_the_arm_before_the_step_of_its_command(effects):
+def test_controller_receives_state_before_the_step(effects):
     arm = load_arm("mtml")
     model = IdentifiedModel.from_arm(arm)
     builder = DiagramBuilder()

@@ -14,7 +14,7 @@ from dvrk_drake.systems.arm_station import ArmStation
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ARMS)
-def test_friction_sticks_below_its_limit_and_does_not_creep(name):
+def test_friction_sticks_below_its_limit_without_creep(name):
     arm = weightless(name)
     run = Run(arm, arm.effects.only(["friction"]))
     run.fix("effort_disturbance", arm.transmission.pull_back_effort(0.65 * breakaway(arm)))
@@ -71,7 +71,7 @@ LAWS = {
 
 @pytest.mark.parametrize("law", ["the arm's", *LAWS])
 @pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
-def test_friction_only_takes_energy(name, law):
+def test_friction_is_dissipative(name, law):
     """Work on the friction, by what Drake says that it applies: never less than nothing, whatever the motion."""
     arm = weightless(name)
     run = Run(arm, friction_of(arm, LAWS[law]) if law in LAWS else arm.effects.only(["friction"]))
@@ -99,7 +99,7 @@ def test_friction_only_takes_energy(name, law):
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_friction_is_the_element_that_is_identified(name):
+def test_friction_equals_the_identified_element(name):
     """Effort and motion of the first presliding element obey `ActuatorEffect.column`."""
     arm = weightless(name)
     effect = next(e for e in arm.effects.friction if e.kind == "presliding")
@@ -126,7 +126,7 @@ def test_friction_is_the_element_that_is_identified(name):
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_friction_leaves_the_inertia_as_it_is(name):
+def test_friction_does_not_change_inertia(name):
     arm = load_arm(name)
     bare, rubbing = ArmStation(arm), ArmStation(arm, effects=arm.effects)
     matrices = []
@@ -150,7 +150,7 @@ def roll_friction(*effects):
 
 
 @pytest.mark.parametrize("more", [-0.001, 0.001])
-def test_friction_of_one_side_holds_more_on_that_side(more):
+def test_one_sided_friction_holds_more_on_that_side(more):
     for direction in (-1.0, 1.0):
         limit = 0.002 + (0.001 if more * direction > 0 else 0.0)
         for share in (0.95, 1.05):
@@ -160,7 +160,7 @@ def test_friction_of_one_side_holds_more_on_that_side(more):
             assert (direction * run.v[6] > 0.05) == (share > 1)
 
 
-def test_friction_that_falls_with_speed_lets_go_once_it_slides():
+def test_stribeck_friction_decreases_while_sliding():
     """Stribeck's friction: the same effort holds an arm that rests and keeps one going that slides."""
     at_rest, sliding, fall_speed, viscous = 0.002, 0.002, 2.0, 2e-4
     travel = 0.1

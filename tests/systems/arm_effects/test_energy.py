@@ -119,7 +119,7 @@ class HeldArm:
         pytest.param("psm", "ten times as firm", marks=pytest.mark.slow),
     ],
 )
-def test_arm_and_a_hand_that_keeps_still_never_gain_energy(name, grip):
+def test_arm_with_fixed_hand_never_gains_energy(name, grip):
     held = HeldArm(name, weightless(name).effects, GRIPS[grip])
     held.want([0.3, -0.2, 0.4], [0.1, -0.08, 0.1])
     path = []
@@ -134,7 +134,7 @@ def test_arm_and_a_hand_that_keeps_still_never_gain_energy(name, grip):
 
 
 @pytest.mark.parametrize("grip", ["as a person", "a thousand times as firm"])
-def test_a_hand_gives_the_arm_no_more_than_moving_it_took(grip):
+def test_hand_adds_no_energy_beyond_its_work(grip):
     """Between steps the wanted pose jumps, which is work put into the springs; in the step they work on the arm."""
     held = HeldArm("mtml", weightless("mtml").effects, GRIPS[grip])
     generator = np.random.default_rng(1)
@@ -153,7 +153,7 @@ def test_a_hand_gives_the_arm_no_more_than_moving_it_took(grip):
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_cables_and_springs_alone_swing_and_gain_nothing(name):
+def test_oscillation_on_cables_and_springs_gains_no_energy(name):
     held = HeldArm(name, weightless(name).effects.only(["cables", "springs"]), Grip())
     held.let_go()
     path = []

@@ -22,7 +22,7 @@ def scenario(arm, *settings):
 
 
 @pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
-def test_a_seed_gives_the_same_bits(name):
+def test_seed_gives_identical_bits(name):
     one, two, other = (simulate(scenario(name, f"seed={seed}")).recording for seed in (5, 5, 6))
     for field in ("q", "qd", "tau"):
         np.testing.assert_array_equal(getattr(one, field), getattr(two, field))
@@ -31,7 +31,7 @@ def test_a_seed_gives_the_same_bits(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ARMS)
-def test_a_controller_that_knows_only_gravity_holds_the_real_arm(name):
+def test_gravity_controller_holds_arm_with_effects(name):
     arm = load_arm(name)
     path = simulate(load_scenario(name, ["duration=2", "simulated_effects=[all]"])).recording.q
     # Cables and springs, which it does not know, pull it by their torque over its gain until its integral has grown.
@@ -45,7 +45,7 @@ def test_a_controller_that_knows_only_gravity_holds_the_real_arm(name):
     assert np.all(np.abs(recording.tau) <= 1.1 * arm.effort_limits)
 
 
-def test_every_part_can_be_switched():
+def test_every_part_can_be_selected():
     arm = load_arm("mtml")
     for name in EFFECT_NAMES:
         assert getattr(arm.effects, name) or name == "stretch"
@@ -58,7 +58,7 @@ def test_every_part_can_be_switched():
         arm.effects.only(["frction"])
 
 
-def test_a_typo_is_an_error(tmp_path):
+def test_unknown_part_is_an_error(tmp_path):
     with pytest.raises(ScenarioError, match="simulated arm: unknown effect frction"):
         load_scenario("mtml", ["simulated_effects=[frction]"])
     text = (MODELS_FOLDER / "mechanisms" / "mtm.yaml").read_text()
@@ -84,7 +84,7 @@ def test_a_typo_is_an_error(tmp_path):
             load_arm(str(tmp_path / "a.yaml"))
 
 
-def test_a_coordinate_that_is_none_is_refused():
+def test_unknown_coordinate_is_refused():
     arm = load_arm("mtml")
     nowhere = ArmEffects(friction=[FrictionEffect("actuator.elbow", "presliding", 0.01, 0.1)])
     with pytest.raises(StationError, match=r'coordinate is "actuator\.elbow"; allowed: actuator\.outer_yaw'):
@@ -107,7 +107,7 @@ HAND = [
 
 
 @pytest.mark.slow
-def test_a_hand_moves_the_arm_and_lets_go():
+def test_hand_moves_and_releases_the_arm():
     settings = ["duration=2.2", "controller.mode=gravity", "simulated_effects=[all]", *HAND]
     simulation = simulate(load_scenario("mtml", settings))
     frame = ArmFrame(load_arm("mtml"), "dh_7")
@@ -124,7 +124,7 @@ def test_a_hand_moves_the_arm_and_lets_go():
 
 
 @pytest.mark.slow
-def test_a_controller_that_knows_cables_and_springs_holds_them_exactly():
+def test_model_with_cables_and_springs_holds_exactly():
     """Gravity compensation alone, without friction: nothing is left that moves the arm."""
     parts = ["simulated_effects=[cables, springs]", "duration=1", "controller.mode=gravity", f"start={TWO_POSES[1]}"]
     moved = {}
@@ -135,7 +135,7 @@ def test_a_controller_that_knows_cables_and_springs_holds_them_exactly():
     assert moved["[]"] > 0.05
 
 
-def test_saturation_shows_what_motors_cannot_follow():
+def test_saturation_limits_fast_motion():
     """From 0.05 to 0.9 rad in 0.25 s: more than the shoulder's motor has, though not than the joint's limit."""
     arm = load_arm("mtml")
     low, high = [0, 0.05, 0, 0, 0, 0, 0], [0, 0.6, -0.5, 0, 0, 0, 0]
@@ -151,7 +151,7 @@ def test_saturation_shows_what_motors_cannot_follow():
     assert error["[saturation]"] > 1.2 * error["[]"]
 
 
-def test_a_cable_of_a_scenario_stretches():
+def test_scenario_cable_stretches():
     """At rest it carries what the motor gives, but for the friction at the motor."""
     arm, start = load_arm("mtml"), "start=[0.0, 0.4, -0.2, 0.0, 0.5, 0.0, 0.0]"
     friction = sum(e.coefficient for e in arm.effects.friction if e.coordinate == "actuator.shoulder_pitch")
@@ -183,6 +183,6 @@ def test_a_cable_of_a_scenario_stretches():
         ("controller.friction_ratio=0.5", 'controller.friction_ratio needs mode "gravity"'),
     ],
 )
-def test_a_scenario_of_a_real_arm_that_makes_no_sense_is_refused(setting, message):
+def test_invalid_scenario_is_refused(setting, message):
     with pytest.raises(ScenarioError, match=message):
         load_scenario("mtml", [setting])

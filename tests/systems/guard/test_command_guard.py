@@ -23,7 +23,7 @@ def test_holds_the_first_pose_without_any_command():
 
 
 @pytest.mark.parametrize("mode", [Command.EFFORT, Command.POSITION])
-def test_start_guard_waits_250_ms_of_good_commands(mode):
+def test_start_requires_250_ms_of_good_commands(mode):
     bench = Bench()
     for k in range(300):
         assert bench.send(mode) == Status.REFUSAL_NONE
@@ -41,7 +41,7 @@ def test_start_guard_waits_250_ms_of_good_commands(mode):
         (Command.POSITION, {"position": list(Q + 0.06 * np.eye(N)[4])}, Status.REFUSAL_START_FAR),
     ],
 )
-def test_a_start_far_from_the_present_is_refused_and_starts_the_guard_anew(mode, fields, code):
+def test_start_far_from_present_state_is_refused(mode, fields, code):
     bench = Bench()
     bench.run(mode, 200)
     assert bench.send(mode, **fields) == code
@@ -53,7 +53,7 @@ def test_a_start_far_from_the_present_is_refused_and_starts_the_guard_anew(mode,
     assert bench.guard.state in (Status.STATE_EFFORT, Status.STATE_POSITION)
 
 
-def test_a_gap_while_starting_starts_anew():
+def test_gap_while_starting_restarts():
     bench = Bench()
     bench.run(Command.EFFORT, 200)
     bench.tick(60)
@@ -63,7 +63,7 @@ def test_a_gap_while_starting_starts_anew():
     assert bench.guard.state == Status.STATE_STARTING
 
 
-def test_changing_the_mode_goes_through_a_hold_and_the_start_guard():
+def test_mode_change_passes_hold_and_start_check():
     bench = Bench().started(Command.EFFORT)
     bench.q = Q + 0.02
     bench.tick()
@@ -75,7 +75,7 @@ def test_changing_the_mode_goes_through_a_hold_and_the_start_guard():
     assert bench.run(Command.POSITION, 1).control_mode == Command.POSITION
 
 
-def test_a_command_expires_after_50_ms_into_a_hold_of_the_pose():
+def test_command_expires_after_50_ms_and_arm_holds():
     bench = Bench().started()
     bench.tick(49)  # the command was received one tick before
     assert bench.output.control_mode == Command.EFFORT
@@ -86,7 +86,7 @@ def test_a_command_expires_after_50_ms_into_a_hold_of_the_pose():
     assert (bench.guard.counts.expired, bench.guard.fault_code) == (1, Status.FAULT_NONE)
 
 
-def test_a_command_that_comes_after_the_expiry_starts_anew():
+def test_command_after_expiry_restarts():
     """Also where no step came in between."""
     bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
     bench.utime += 60 * MS
@@ -94,14 +94,14 @@ def test_a_command_that_comes_after_the_expiry_starts_anew():
     assert (bench.guard.state, bench.guard.counts.expired) == (Status.STATE_STARTING, 1)
 
 
-def test_two_steps_at_one_time_do_not_forget_the_sender():
+def test_two_steps_at_one_time_keep_the_sender():
     bench = Bench()
     bench.run(Command.HOLD, 1)
     bench.step()
     assert bench.send(Command.HOLD, sender=6) == Status.REFUSAL_OTHER_SENDER
 
 
-def test_hold_command_holds_at_once_and_does_not_creep():
+def test_hold_command_acts_immediately_without_creep():
     bench = Bench().started()
     bench.q = Q + 0.01
     bench.tick()
@@ -113,7 +113,7 @@ def test_hold_command_holds_at_once_and_does_not_creep():
         np.testing.assert_array_equal(output.position, Q + 0.01)
 
 
-def test_a_command_is_obeyed_until_50_ms_after_the_measurement_that_it_answers_whenever_it_came():
+def test_expiry_counts_from_the_answered_measurement():
     bench = Bench().started()
     answered = bench.utime
     bench.tick(39)
@@ -128,7 +128,7 @@ def test_a_command_is_obeyed_until_50_ms_after_the_measurement_that_it_answers_w
     assert (bench.guard.counts.expired, bench.guard.fault_code) == (1, Status.FAULT_NONE)
 
 
-def test_a_sender_that_answers_one_measurement_for_ever_never_starts():
+def test_repeated_answer_to_one_measurement_never_starts():
     bench = Bench()
     answered = bench.utime
     for _ in range(50):
@@ -141,7 +141,7 @@ def test_a_sender_that_answers_one_measurement_for_ever_never_starts():
 
 
 @pytest.mark.parametrize("mode", [Command.EFFORT, Command.POSITION])
-def test_no_single_message_drops_the_arm(mode):
+def test_single_message_cannot_switch_off(mode):
     bench = Bench(modes=WITH_OFF).started(mode)
     allowed = bench.guard.accepted_modes
     assert not allowed >> Command.OFF & 1
@@ -157,7 +157,7 @@ def test_no_single_message_drops_the_arm(mode):
 
 
 @pytest.mark.parametrize("sender", [5, 6])
-def test_an_arm_is_switched_off_only_if_it_is_configured_to_accept_it(sender):
+def test_off_requires_configuration(sender):
     bench = Bench()
     bench.run(Command.HOLD, 1)
     bench.tick(60)  # idle: a stranger may come
@@ -168,7 +168,7 @@ def test_an_arm_is_switched_off_only_if_it_is_configured_to_accept_it(sender):
     assert bench.guard.state == Status.STATE_HOLD
 
 
-def test_off_and_back():
+def test_off_and_return_to_hold():
     bench = Bench(modes=WITH_OFF).started()
     bench.run(Command.HOLD, 1)
     assert bench.run(Command.OFF, 20).control_mode == Command.OFF
@@ -188,7 +188,7 @@ def test_modes_can_be_restricted():
     bench.started(Command.POSITION)
 
 
-def test_a_guard_that_has_measured_nothing_moves_nothing():
+def test_no_output_without_measurement():
     guard = CommandGuard(ARM, 1, Weightless())
     assert (guard.state, guard.fault_code, guard.sender_id) == (Status.STATE_HOLD, Status.FAULT_NONE, 0)
     assert (guard.fault_text, guard.refusal_code) == ("", Status.REFUSAL_NONE)
@@ -221,7 +221,7 @@ def test_accepted_modes_and_the_sender_in_each_state():
     assert (bench.guard.accepted_modes, bench.guard.sender_id) == (modes(Command.HOLD), 0)
 
 
-def test_changing_the_mode_while_starting_starts_anew():
+def test_mode_change_while_starting_restarts():
     bench = Bench()
     bench.run(Command.EFFORT, 200)
     bench.run(Command.POSITION, 250)
@@ -230,7 +230,7 @@ def test_changing_the_mode_while_starting_starts_anew():
     assert bench.guard.state == Status.STATE_POSITION
 
 
-def test_a_hold_while_starting_ends_the_start():
+def test_hold_while_starting_ends_start():
     bench = Bench()
     bench.run(Command.EFFORT, 200)
     bench.run(Command.HOLD, 1)
@@ -239,7 +239,7 @@ def test_a_hold_while_starting_ends_the_start():
     assert bench.guard.state == Status.STATE_STARTING
 
 
-def test_what_others_send_does_not_end_a_start():
+def test_foreign_messages_do_not_end_start():
     bench = Bench()
     bench.run(Command.EFFORT, 100)
     for _ in range(160):
@@ -255,7 +255,7 @@ def test_what_others_send_does_not_end_a_start():
     assert bench.guard.state == Status.STATE_HOLD
 
 
-def test_a_refused_command_does_not_end_what_acts():
+def test_refused_command_keeps_command_in_force():
     for mode in (Command.EFFORT, Command.POSITION):
         bench = Bench().started(mode)
         assert bench.send(mode, num_joints=3) == Status.REFUSAL_WRONG_SIZE
@@ -263,7 +263,7 @@ def test_a_refused_command_does_not_end_what_acts():
 
 
 @pytest.mark.parametrize("ending", ["refused", "expired", "fault and reset"])
-def test_a_start_that_ends_keeps_the_pose_that_was_held(ending):
+def test_ended_start_keeps_held_pose(ending):
     bench = Bench()
     bench.run(Command.EFFORT, 100)
     bench.q = Q - 0.01  # it sags meanwhile
@@ -292,7 +292,7 @@ def test_positions_start_from_the_held_pose():
     np.testing.assert_array_equal(output.position, Q)
 
 
-def test_a_wall_comes_on_evenly_while_a_start_time_passes():
+def test_wall_effort_increases_over_start_time():
     bench = Bench(q=[ARM.position_upper[0], *Q[1:]])
     bench.effort = np.zeros(N)
     bench.run(Command.EFFORT, 250)
@@ -307,7 +307,7 @@ def test_a_wall_comes_on_evenly_while_a_start_time_passes():
     np.testing.assert_allclose(bench.run(Command.EFFORT, 1).effort, np.zeros(N), atol=1e-12)
 
 
-def test_a_pose_beyond_a_limit_is_no_fault_while_positions_act():
+def test_pose_beyond_limit_is_no_fault_in_position_mode():
     bench = Bench(modes=WITH_OFF)
     for mode in (Command.HOLD, Command.OFF):
         bench.run(mode, 1)
@@ -319,7 +319,7 @@ def test_a_pose_beyond_a_limit_is_no_fault_while_positions_act():
     assert bench.guard.fault_code == Status.FAULT_NONE
 
 
-def test_an_arms_clock_that_went_back_forgets_who_was_heard():
+def test_backward_arm_clock_discards_sender():
     bench = Bench().started()
     bench.utime -= 10**6
     bench.step()
@@ -332,7 +332,7 @@ def test_an_arms_clock_that_went_back_forgets_who_was_heard():
     assert (bench.guard.state, bench.guard.sender_id) == (Status.STATE_HOLD, 0)
 
 
-def test_a_jump_of_the_senders_clock_does_not_disturb_a_hold():
+def test_sender_clock_jump_does_not_disturb_hold():
     bench = Bench()
     bench.run(Command.HOLD, 1)
     bench.q = Q - 0.01
@@ -344,13 +344,13 @@ def test_a_jump_of_the_senders_clock_does_not_disturb_a_hold():
     assert bench.guard.state == Status.STATE_FAULT
 
 
-def test_the_guard_knows_the_gravity_effort_of_the_pose():
+def test_guard_computes_gravity_effort():
     bench = Bench(model=Heavy()).at_rest()
     np.testing.assert_allclose(bench.guard.gravity_effort, Heavy().gravity_effort(Q), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])
-def test_a_copy_goes_its_own_way(mode):
+def test_copy_is_independent(mode):
     """Drake copies a guard with its context before every step."""
     bench = Bench()
     bench.run(mode, 260)

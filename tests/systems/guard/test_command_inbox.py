@@ -68,7 +68,7 @@ def stranger(bench, **fields):
         (Command().encode(), Status.REFUSAL_WRONG_SESSION),
     ],
 )
-def test_foreign_bytes_are_counted_with_the_reason(fields, code):
+def test_foreign_messages_are_counted_by_reason(fields, code):
     bench = Networked().acting()
     data = fields if isinstance(fields, bytes) else stranger(bench, **fields)
     bench.round([data] * 3, [data] * 2)
@@ -78,7 +78,7 @@ def test_foreign_bytes_are_counted_with_the_reason(fields, code):
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
 @pytest.mark.parametrize("key", [None, KEY])
-def test_good_commands_of_any_arm_come_through(name, key):
+def test_good_commands_of_any_arm_are_delivered(name, key):
     bench = Networked(key, arm=load_arm(name)).acting()
     assert (bench.guard.counts.accepted, bench.guard.counts.ignored) == (260, 0)
     # A signed command is one for an arm without a key as well.
@@ -91,7 +91,7 @@ def test_good_commands_of_any_arm_come_through(name, key):
     "kind", ["garbage", "other session", "other senders", "signed by somebody else", "copies of the sender's own"]
 )
 @pytest.mark.parametrize("key", [None, KEY])
-def test_a_flood_does_not_displace_the_sender_in_command(kind, key):
+def test_flood_does_not_displace_sender_in_control(kind, key):
     bench = Networked(key).acting()
     for _ in range(200):
         flood = {
@@ -109,7 +109,7 @@ def test_a_flood_does_not_displace_the_sender_in_command(kind, key):
     assert bench.guard.counts.refused == 0 or "copies" in kind
 
 
-def test_of_a_flood_a_bounded_number_is_decoded():
+def test_flood_decodes_bounded_number():
     bench = Networked().acting()
     given = []
     receive = bench.guard.receive
@@ -121,7 +121,7 @@ def test_of_a_flood_a_bounded_number_is_decoded():
 
 
 @pytest.mark.parametrize("key", [None, KEY])
-def test_200_spoofed_commands_that_copy_the_sender_and_continue_its_stream(key):
+def test_200_spoofed_commands_that_continue_the_stream(key):
     """Only a key tells them from the true ones: without one they act, within the guard's limits."""
     bench = Networked(key).acting()
     moved = []
@@ -141,7 +141,7 @@ def test_200_spoofed_commands_that_copy_the_sender_and_continue_its_stream(key):
 
 @pytest.mark.parametrize("field", ["sequence", "utime", "status_utime"])
 @pytest.mark.parametrize("key", [None, KEY])
-def test_a_huge_sequence_or_time_locks_nobody_out(field, key):
+def test_huge_sequence_or_time_blocks_no_sender(field, key):
     bench = Networked(key).acting()
     for _ in range(200):
         output = bench.round([stranger(bench, **{field: 2**62})], [stranger(bench, **{field: -(2**62)})])
@@ -174,7 +174,7 @@ def test_replayed_authentic_commands_do_not_act():
 
 
 @pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT, Command.OFF])
-def test_with_a_key_a_stranger_does_not_even_begin(mode):
+def test_key_rejects_unknown_sender(mode):
     bench = Networked(KEY, modes=(Command.POSITION, Command.EFFORT, Command.OFF))
     for _ in range(300):
         bench.put(bench.command(mode, sender=9).encode(), MessageKey(bytes(32)).sign(bench.command(mode).encode()))
@@ -196,7 +196,7 @@ def test_fuzzed_bytes_of_a_signed_command_never_act():
         np.testing.assert_allclose(output.effort, 0.05 * LIMIT, atol=1e-12)
 
 
-def test_the_capacity_is_of_the_sender_in_command_and_of_all_others_each():
+def test_sender_in_control_has_separate_capacity():
     bench = Networked()
     bench.inbox = CommandInbox(bench.guard, capacity=3)
     bench.put(*[bench.good() for _ in range(5)])

@@ -21,7 +21,7 @@ def at(q=Q):
     return follower
 
 
-def test_off_and_hold_give_neither_velocity_nor_effort():
+def test_off_and_hold_output_zero_velocity_and_effort():
     follower = at()
     for output, mode, position in ((follower.off(Q + 1), Command.OFF, Q + 1), (follower.hold(1e-3), Command.HOLD, Q)):
         assert output.control_mode == mode
@@ -38,13 +38,13 @@ def test_off_and_hold_give_neither_velocity_nor_effort():
 
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_near_is_within_the_start_position_of_every_joint(joint, side):
+def test_is_near_uses_start_tolerance_of_every_joint(joint, side):
     away = side * LIMITS.start_position[joint] * E[joint]
     assert at().is_near(Q + 0.999 * away)
     assert not at().is_near(Q + 1.001 * away)
 
 
-def test_what_is_exactly_as_far_as_allowed_is_near():
+def test_is_near_includes_the_exact_tolerance():
     follower = at(STILL)
     follower.begin_position()
     assert follower.is_near(LIMITS.start_position)
@@ -54,7 +54,7 @@ def test_what_is_exactly_as_far_as_allowed_is_near():
 # Positions
 
 
-def test_a_target_moves_towards_the_command_at_its_rate():
+def test_target_follows_command_at_limited_rate():
     follower = at()
     follower.begin_position()
     goal = Q + 0.02
@@ -76,7 +76,7 @@ def test_a_target_moves_towards_the_command_at_its_rate():
 
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_joint_too_far_from_its_target_is_astray(joint, side):
+def test_large_following_error_is_detected(joint, side):
     follower = at()
     follower.begin_position()
     away = side * 0.15 * RANGE[joint] * E[joint]
@@ -90,7 +90,7 @@ def test_a_joint_too_far_from_its_target_is_astray(joint, side):
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_an_arm_may_be_as_late_as_the_following_time(side):
+def test_lag_up_to_following_time_is_allowed(side):
     """Between the target and a first order that follows it late, and the following error beyond either."""
     follower, joint = at(), 4
     follower.begin_position()
@@ -111,7 +111,7 @@ def test_an_arm_may_be_as_late_as_the_following_time(side):
     assert astray(target - side * 1.001 * error) and astray(target + side * 1.001 * error)
 
 
-def test_positions_that_begin_forget_how_late_the_arm_was():
+def test_position_start_resets_the_lag():
     follower = at()
     follower.begin_position()
     for _ in range(100):
@@ -129,7 +129,7 @@ def test_positions_that_begin_forget_how_late_the_arm_was():
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("share", [0.3, 1.0, 9.0])
-def test_a_joint_that_moves_when_it_is_held_may_go_on_until_it_is_braked(joint, side, share):
+def test_braking_distance_is_allowed_after_latch(joint, side, share):
     error, way = LIMITS.following_error[joint], side * min(share, 1.0) * 0.1 * LIMITS.speed[joint]
     follower, q = at(STILL), Q.copy()
     follower.latch(q, side * share * LIMITS.speed * E[joint])
@@ -147,7 +147,7 @@ def test_a_joint_that_moves_when_it_is_held_may_go_on_until_it_is_braked(joint, 
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_in_a_fault_joints_with_a_valid_position_are_held_with_bounded_efforts(side):
+def test_fault_holds_valid_joints_with_bounded_effort(side):
     """At most `fault_effort`, or a third of it more than gravity needs, and never more than the motor has."""
     bound, valid = LIMITS.fault_effort, np.ones(N, bool)
     for gravity, most in ((STILL, bound), (0.5 * LIMIT, 0.5 * LIMIT + bound / 3), (0.95 * LIMIT, LIMIT)):
@@ -164,7 +164,7 @@ def test_in_a_fault_joints_with_a_valid_position_are_held_with_bounded_efforts(s
     np.testing.assert_array_equal(output.position, q)
 
 
-def test_in_a_fault_joints_without_a_valid_position_get_their_gravity_effort():
+def test_fault_gives_invalid_joints_gravity_effort():
     valid = np.arange(N) != 3
     output = at().hold_valid_joints(Q - 9.0, STILL + 9.0, valid, 0.1 * LIMIT)
     assert output.effort[3] == pytest.approx(0.1 * LIMIT[3])
@@ -174,7 +174,7 @@ def test_in_a_fault_joints_without_a_valid_position_get_their_gravity_effort():
 # Efforts
 
 
-def test_efforts_begin_at_the_measured_ones_and_go_at_their_rate():
+def test_efforts_start_at_measured_ones_at_limited_rate():
     follower, measured = at(), LIMIT * [0.3, -0.3, 0.0, 1.2, -1.2, 0.1, 0.0]
     follower.begin_effort(measured, Q)
     start = np.clip(measured, -LIMIT, LIMIT)
@@ -188,7 +188,7 @@ def test_efforts_begin_at_the_measured_ones_and_go_at_their_rate():
     np.testing.assert_array_equal(output.velocity, STILL)
 
 
-def test_commands_that_may_use_a_fraction_begin_at_it():
+def test_effort_start_is_clamped_to_effort_fraction():
     follower = Follower(GuardLimits(ARM, GuardSettings(effort_fraction=0.2)))
     follower.begin_effort(0.25 * LIMIT, Q)
     np.testing.assert_allclose(follower.follow_effort(LIMIT, Q, STILL, 1e-3, 0.0).effort, 0.2 * LIMIT, atol=1e-12)
@@ -197,7 +197,7 @@ def test_commands_that_may_use_a_fraction_begin_at_it():
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_wall_that_efforts_begin_inside_comes_on_gradually(side):
+def test_start_inside_wall_increases_wall_gradually(side):
     q = Q.copy()
     q[0] = (ARM.position_upper if side > 0 else ARM.position_lower)[0]
     push = side * 0.25 * LIMIT * E[0]
@@ -215,7 +215,7 @@ def test_a_wall_that_efforts_begin_inside_comes_on_gradually(side):
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_wall_that_efforts_begin_inside_never_pulls_outward(side):
+def test_start_inside_wall_never_pulls_outward(side):
     """Nothing is left out that the wall does not add now: the arm has left it, or the speed limit brakes."""
     q = Q.copy()
     q[0] = (ARM.position_upper if side > 0 else ARM.position_lower)[0]
@@ -228,7 +228,7 @@ def test_a_wall_that_efforts_begin_inside_never_pulls_outward(side):
     np.testing.assert_array_equal(follower.follow_effort(STILL, Q, fast, 1e-3, 0.0).effort, brake)
 
 
-def test_flags_of_commands_and_of_walls_come_together():
+def test_flags_of_commands_and_walls_are_combined():
     q = Q.copy()
     q[0] = ARM.position_upper[0]
     follower = at(q)

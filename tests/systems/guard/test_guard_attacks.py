@@ -21,7 +21,7 @@ LOOK_AHEAD = np.array(ARM.gains.kd) / np.array(ARM.gains.kp)
 # The arm's clock
 
 
-def test_a_clock_that_stands_still_is_a_fault_since_nothing_expires_by_it():
+def test_stopped_clock_is_a_fault():
     bench = Bench().started()
     for _ in range(10):
         output = bench.step()
@@ -31,7 +31,7 @@ def test_a_clock_that_stands_still_is_a_fault_since_nothing_expires_by_it():
 
 
 @pytest.mark.parametrize("seconds", [1e-6, 0.011, 0.0499, 3.0, 1e9])
-def test_a_long_step_moves_efforts_and_targets_no_further_than_ten_milliseconds(seconds):
+def test_long_step_moves_at_most_10_ms(seconds):
     for mode in (Command.EFFORT, Command.POSITION):
         bench = Bench().started(mode)
         before = bench.output
@@ -46,7 +46,7 @@ def test_a_long_step_moves_efforts_and_targets_no_further_than_ten_milliseconds(
         assert np.all(np.abs(output.position - before.position) <= dt * bench.guard.limits.speed + 1e-12)
 
 
-def test_two_controllers_that_alternate_at_the_expiry_never_act():
+def test_controllers_alternating_at_expiry_never_act():
     for gap, ignored in ((50 * MS, 20), (50 * MS + 1, 0)):
         bench = Bench()
         for k in range(40):
@@ -60,7 +60,7 @@ def test_two_controllers_that_alternate_at_the_expiry_never_act():
 # The messages
 
 
-def test_a_jump_of_the_sequence_leaves_a_status_that_can_be_sent():
+def test_sequence_jump_keeps_status_encodable():
     bench = Bench()
     for sender in (5, 6):
         assert bench.send(Command.HOLD, sequence=-(2**63), sender=sender) == Status.REFUSAL_NONE
@@ -73,7 +73,7 @@ def test_a_jump_of_the_sequence_leaves_a_status_that_can_be_sent():
     assert Status.decode(status.encode()).num_lost == 2 * 999
 
 
-def test_a_command_that_is_changed_after_it_was_accepted_does_not_act():
+def test_change_of_accepted_command_has_no_effect():
     bench = Bench()
     for _ in range(260):
         command = bench.command(effort=np.array(bench.effort))
@@ -83,7 +83,7 @@ def test_a_command_that_is_changed_after_it_was_accepted_does_not_act():
     np.testing.assert_allclose(bench.tick().effort, 0.05 * LIMIT, atol=1e-12)
 
 
-def test_whoever_changes_the_output_does_not_change_the_guard():
+def test_change_of_output_does_not_change_guard():
     bench = Bench().started()
     for array in (bench.output.position, bench.output.velocity, bench.output.effort):
         array[:] = 1.0
@@ -92,7 +92,7 @@ def test_whoever_changes_the_output_does_not_change_the_guard():
     np.testing.assert_array_equal(bench.run(Command.HOLD, 1).position, Q)
 
 
-def test_a_session_that_an_empty_command_has_is_refused():
+def test_session_zero_is_refused():
     with pytest.raises(StationError, match="session_id must not be 0"):
         CommandGuard(ARM, 0, Weightless())
 
@@ -100,7 +100,7 @@ def test_a_session_that_an_empty_command_has_is_refused():
 # What is configured
 
 
-def test_no_mode_accepted_is_not_every_mode_accepted():
+def test_empty_modes_accept_no_mode():
     bench = Bench(modes=())
     assert bench.guard.accepted_modes == modes(Command.HOLD)
     assert bench.send(Command.EFFORT) == bench.send(Command.POSITION) == Status.REFUSAL_BAD_MODE
@@ -120,27 +120,27 @@ def test_no_mode_accepted_is_not_every_mode_accepted():
         ("start_time", 1e-3),
     ],
 )
-def test_settings_that_switch_the_guard_off_are_refused(name, value):
+def test_settings_that_disable_the_guard_are_refused(name, value):
     for bad in (value, 0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(StationError, match=f"guard settings: {name} is .*; allowed: "):
             GuardSettings(**{name: bad})
 
 
-def test_settings_that_are_changed_afterwards_are_refused():
+def test_later_changes_of_settings_are_checked():
     settings = GuardSettings()
     settings.expiry = 9.0
     with pytest.raises(StationError, match=r"guard settings: expiry is 9; allowed: 0\.002\.\.1 s"):
         CommandGuard(ARM, SESSION, Weightless(), settings)
 
 
-def test_an_arm_that_nothing_holds_is_refused():
+def test_arm_without_gains_is_refused():
     arm = dataclasses.replace(ARM, gains=dataclasses.replace(ARM.gains, kp=list(ARM.gains.kp)))
     arm.gains.kp[0] = 0.0
     with pytest.raises(StationError, match=r"MTML: gains\.kp\[0\] is 0; allowed: "):
         CommandGuard(arm, SESSION, Weightless())
 
 
-def test_a_fraction_of_the_effort_limits_clamps_commands_and_refuses_a_start_that_would_drop_the_arm():
+def test_effort_fraction_clamps_and_refuses_a_dropping_start():
     bench = Bench(settings=GuardSettings(effort_fraction=0.1)).started()
     output = bench.run(Command.EFFORT, 50, effort=list(LIMIT))
     np.testing.assert_allclose(output.effort, 0.1 * LIMIT, atol=1e-12)
@@ -159,7 +159,7 @@ def test_a_fraction_of_the_effort_limits_clamps_commands_and_refuses_a_start_tha
 
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
-def test_a_velocity_leads_a_position_controller_to_no_pose_beyond_the_limits(name):
+def test_feedforward_velocity_stays_inside_limits(name):
     arm = load_arm(name)
     A, lower, upper = arm.limit_matrix()
     look_ahead = np.array(arm.gains.kd) / np.array(arm.gains.kp)
@@ -175,7 +175,7 @@ def test_a_velocity_leads_a_position_controller_to_no_pose_beyond_the_limits(nam
         assert np.any(bench.output.velocity)
 
 
-def test_a_start_with_a_velocity_that_leads_away_is_refused():
+def test_start_with_leading_velocity_is_refused():
     bench = Bench()
     farthest = 0.05 / LOOK_AHEAD * np.eye(N)[4]
     bench.run(Command.POSITION, 240, velocity=list(0.9 * farthest))
@@ -186,7 +186,7 @@ def test_a_start_with_a_velocity_that_leads_away_is_refused():
 # Limits
 
 
-def test_efforts_that_begin_to_act_inside_the_wall_begin_without_a_kick():
+def test_efforts_inside_wall_start_without_step():
     for side in (1, -1):
         bench = Bench(q=[(UPPER if side > 0 else LOWER)[0], *Q[1:]])
         bench.run(Command.EFFORT, 250)
@@ -199,7 +199,7 @@ def test_efforts_that_begin_to_act_inside_the_wall_begin_without_a_kick():
         assert last == pytest.approx(-side * LIMIT[0])
 
 
-def test_a_wall_that_one_starts_beside_is_there_at_once():
+def test_wall_next_to_start_acts_immediately():
     """Efforts outward as soon as they act, from where the wall begins: as strong as it is later."""
     q = Q.copy()
     q[0] = UPPER[0] - 0.05
@@ -212,7 +212,7 @@ def test_a_wall_that_one_starts_beside_is_there_at_once():
     assert efforts[0] == pytest.approx(efforts[1]) and efforts[1] < 0
 
 
-def test_shoulder_and_elbow_at_their_ends_never_leave_the_coupled_limit():
+def test_targets_stay_inside_coupled_limit():
     """Targets, from every corner of the two joints that the coupled limit leaves, with jumps to any other."""
     bench = Bench()
     limits = bench.guard.limits
@@ -226,7 +226,7 @@ def test_shoulder_and_elbow_at_their_ends_never_leave_the_coupled_limit():
         assert np.all((A @ target <= UPPER + 1e-9) & (A @ target >= LOWER - 1e-9))
 
 
-def test_a_target_that_starts_outside_every_limit_only_comes_back():
+def test_target_outside_limits_only_returns():
     limits = Bench().guard.limits
     generator = np.random.default_rng(1)
     for _ in range(300):
@@ -240,7 +240,7 @@ def test_a_target_that_starts_outside_every_limit_only_comes_back():
 
 
 @pytest.mark.parametrize("excess", [0.0, 0.0249, 0.0251, 0.3])
-def test_a_reset_outside_the_limits_holds_there_and_efforts_do_not_start(excess):
+def test_reset_outside_limits_holds_and_refuses_efforts(excess):
     bench = Bench().started()
     bench.q = Q.copy()
     bench.q[0] = UPPER[0] + 0.3
@@ -256,7 +256,7 @@ def test_a_reset_outside_the_limits_holds_there_and_efforts_do_not_start(excess)
 
 
 @pytest.mark.parametrize("velocity", [1e5, -1e5])
-def test_a_huge_velocity_gives_no_more_effort_than_the_motors_limit(velocity):
+def test_huge_velocity_keeps_effort_limit(velocity):
     bench = Bench().started()
     bench.v = np.full(N, velocity)
     output = bench.tick()
@@ -268,7 +268,7 @@ def test_a_huge_velocity_gives_no_more_effort_than_the_motors_limit(velocity):
 # A real arm's power
 
 
-def test_an_arm_that_lost_its_power_is_held_where_it_fell_not_where_it_was():
+def test_arm_after_power_loss_is_held_at_measured_pose():
     for mode in (Command.HOLD, Command.POSITION):
         bench = Bench()
         bench.run(mode, 260)
@@ -283,7 +283,7 @@ def test_an_arm_that_lost_its_power_is_held_where_it_fell_not_where_it_was():
         np.testing.assert_array_equal(output.position, bench.q)
 
 
-def test_power_lost_in_a_fault_is_noticed_and_keeps_the_first_text():
+def test_power_loss_during_fault_keeps_first_text():
     bench = Bench()
     bench.guard.report_fault("the amplifier is hot")
     assert bench.tick().control_mode == Command.HOLD

@@ -11,7 +11,7 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 
-def test_in_a_fault_only_a_hold_is_accepted():
+def test_fault_accepts_only_hold():
     bench = Bench().started()
     bench.guard.report_fault("the amplifier is hot")
     assert bench.guard.accepted_modes == modes(Command.HOLD)
@@ -20,7 +20,7 @@ def test_in_a_fault_only_a_hold_is_accepted():
         assert bench.tick().control_mode == Command.HOLD
 
 
-def test_a_sender_may_follow_one_that_is_silent_but_starts_anew():
+def test_new_sender_after_silence_restarts():
     bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
     bench.tick(51)
     assert bench.send(sender=6) == Status.REFUSAL_NONE
@@ -28,7 +28,7 @@ def test_a_sender_may_follow_one_that_is_silent_but_starts_anew():
     assert bench.guard.fault_code == Status.FAULT_NONE
 
 
-def test_only_a_meant_reset_clears_a_fault():
+def test_reset_requires_a_change_of_the_flag():
     bench = Bench(modes=WITH_OFF)
     bench.guard.report_fault("the amplifier is hot")
     assert (bench.guard.fault_code, bench.guard.fault_text) == (Status.FAULT_DRIVER, "the amplifier is hot")
@@ -45,7 +45,7 @@ def test_only_a_meant_reset_clears_a_fault():
     assert (bench.guard.state, bench.guard.fault_code, bench.guard.fault_text) == (Status.STATE_HOLD, 0, "")
 
 
-def test_a_pose_beyond_a_limit_faults_while_efforts_act_and_is_held():
+def test_pose_beyond_limit_faults_in_effort_mode():
     bench = Bench().started()
     bench.q = Q.copy()
     bench.q[5] = ARM.position_upper[5] + 0.02
@@ -60,7 +60,7 @@ def test_a_pose_beyond_a_limit_faults_while_efforts_act_and_is_held():
     assert bench.send(Command.EFFORT) == Status.REFUSAL_START_OUTSIDE
 
 
-def test_the_coupled_limit_faults_too():
+def test_pose_beyond_coupled_limit_faults():
     bench = Bench().started()
     bench.q = Q.copy()
     bench.q[1:3] = 0.2, -0.2 - 0.36  # each inside its own limits
@@ -73,7 +73,7 @@ BAD = GuardSettings().plausibility.bad_samples
 
 @pytest.mark.parametrize("which", ["q", "v", "effort"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e9])
-def test_bad_measurements_end_in_a_hold_and_then_in_a_fault_that_keeps_the_gravity_effort(which, value):
+def test_bad_measurements_lead_to_hold_then_fault(which, value):
     bench = Bench(model=Heavy()).at_rest().started()
     good = getattr(bench, which)
     setattr(bench, which, np.where(np.arange(N) == 3, value, good))
@@ -102,7 +102,7 @@ def test_bad_measurements_end_in_a_hold_and_then_in_a_fault_that_keeps_the_gravi
     np.testing.assert_array_equal(output.position, Q - 0.03)
 
 
-def test_a_few_bad_measurements_while_holding_change_nothing():
+def test_few_bad_measurements_in_hold_are_tolerated():
     bench = Bench()
     for _ in range(3):
         bench.q = Q * np.nan
@@ -115,7 +115,7 @@ def test_a_few_bad_measurements_while_holding_change_nothing():
 
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_wrong_velocity_while_efforts_begin_is_not_felt_afterwards(joint, side):
+def test_wrong_velocity_at_start_has_no_lasting_effect(joint, side):
     """The brake of the speed limit acts on that one sample, and nothing takes it back in the next 250 ms."""
     bench = Bench().at_rest()
     commanded = bench.effort.copy()
@@ -129,7 +129,7 @@ def test_a_wrong_velocity_while_efforts_begin_is_not_felt_afterwards(joint, side
         np.testing.assert_allclose(bench.tick().effort, commanded, rtol=0, atol=1e-12)
 
 
-def test_a_pose_that_is_not_measured_now_is_not_where_a_reset_holds():
+def test_reset_does_not_hold_an_unmeasured_pose():
     bench = Bench(modes=WITH_OFF, checks=True, model=Heavy()).at_rest()
     good = bench.q
     # Off: neither a hold nor a reset of a fault gives power.
@@ -166,7 +166,7 @@ def test_a_pose_that_is_not_measured_now_is_not_where_a_reset_holds():
     np.testing.assert_array_equal(output.position, good)
 
 
-def test_after_a_joint_without_a_valid_position_a_reset_holds_the_measured_pose():
+def test_reset_after_invalid_position_holds_measured_pose():
     """Also where it is so near that a hold would go on; until then the others are braked as well as held."""
     bench = Bench(checks=True, model=Heavy()).at_rest()
     bench.tick(100)
@@ -187,7 +187,7 @@ def test_after_a_joint_without_a_valid_position_a_reset_holds_the_measured_pose(
     np.testing.assert_array_equal(output.position, bench.q)
 
 
-def test_a_reset_without_a_fault_says_nothing():
+def test_reset_without_fault_has_no_effect():
     bench = Bench()
     bench.q = Q * np.nan
     for reset in (False, True):
@@ -196,14 +196,14 @@ def test_a_reset_without_a_fault_says_nothing():
     assert (bench.guard.state, bench.guard.fault_text) == (Status.STATE_HOLD, "")
 
 
-def test_bad_measurements_before_any_good_one_leave_the_motors_without_power():
+def test_no_power_before_first_good_measurement():
     guard = CommandGuard(ARM, SESSION, Weightless())
     output = guard.step(0, 0, Q * np.nan, 0 * Q, 0 * Q)
     assert (output.control_mode, guard.fault_code) == (Command.OFF, Status.FAULT_MEASUREMENT)
     assert np.all(np.isfinite(output.position))
 
 
-def test_a_fault_while_off_stays_off():
+def test_fault_in_off_keeps_power_off():
     bench = Bench(modes=WITH_OFF)
     bench.run(Command.HOLD, 1)
     bench.run(Command.OFF, 1)
@@ -213,7 +213,7 @@ def test_a_fault_while_off_stays_off():
     assert bench.run(Command.HOLD, 1, reset_fault=True).control_mode == Command.HOLD
 
 
-def test_a_first_pose_far_beyond_the_limits_is_a_fault_until_it_is_plausible():
+def test_implausible_first_pose_is_a_fault():
     degrees = Q.copy()
     degrees[0] = 40.0
     bench = Bench(q=degrees, modes=WITH_OFF)
@@ -231,7 +231,7 @@ def test_a_first_pose_far_beyond_the_limits_is_a_fault_until_it_is_plausible():
     bench.started()
 
 
-def test_a_first_pose_far_beyond_the_limits_faults_again_after_a_reset():
+def test_implausible_first_pose_faults_again_after_reset():
     bench = Bench(q=np.degrees(Q))
     for asks in (False, True):
         bench.send(Command.HOLD, reset_fault=asks, position=list(Q))
@@ -239,7 +239,7 @@ def test_a_first_pose_far_beyond_the_limits_faults_again_after_a_reset():
     assert (bench.guard.state, bench.output.control_mode) == (Status.STATE_FAULT, Command.OFF)
 
 
-def test_a_first_pose_a_little_beyond_a_limit_is_held():
+def test_first_pose_slightly_beyond_limit_is_held():
     q = Q.copy()
     q[0] = ARM.position_upper[0] + 0.4 * (ARM.position_upper[0] - ARM.position_lower[0])
     bench = Bench(q=q)
@@ -267,7 +267,7 @@ def lost_measurements(bench):
 
 
 @pytest.mark.parametrize("begin", [gap, off, lost_power, lost_measurements])
-def test_a_pose_far_beyond_the_limits_is_never_held(begin):
+def test_pose_far_beyond_limits_is_never_held(begin):
     bench = Bench(modes=WITH_OFF, model=Heavy(), checks=True).at_rest()
     begin(bench)
     bench.q = np.degrees(Q)
@@ -286,7 +286,7 @@ def test_a_pose_far_beyond_the_limits_is_never_held(begin):
     assert (bench.tick().control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_NONE)
 
 
-def test_a_jump_far_beyond_the_limits_is_not_reset_into_a_hold():
+def test_jump_far_beyond_limits_cannot_be_reset():
     bench = Bench(model=Heavy(), checks=True).at_rest().started()
     bench.q = np.degrees(Q)
     bench.tick()
@@ -296,7 +296,7 @@ def test_a_jump_far_beyond_the_limits_is_not_reset_into_a_hold():
     assert bench.guard.state == Status.STATE_FAULT
 
 
-def test_measurements_whose_time_goes_back_end_commands_and_are_a_fault():
+def test_backward_measurement_time_is_a_fault():
     bench = Bench(model=Heavy(), checks=True).at_rest().started()
     for k in range(2 * BAD):
         bench.age = 2 * MS * (k % 2)
@@ -305,13 +305,13 @@ def test_measurements_whose_time_goes_back_end_commands_and_are_a_fault():
     assert bench.guard.hold_reason == "the measurement is 0.001000 s older than the one before"
 
 
-def test_efforts_do_not_start_where_the_model_has_no_number():
+def test_efforts_require_finite_model_gravity():
     bench = Bench(model=Heavy(), checks=True).at_rest()
     bench.guard._plausibility.gravity = np.full(N, np.nan)
     assert bench.send() == Status.REFUSAL_START_GRAVITY
 
 
-def test_an_effort_that_the_caller_changes_is_still_the_commanded_one():
+def test_caller_cannot_change_commanded_effort():
     bench = Bench(model=Heavy(), checks=True).at_rest().started()
     for _ in range(60):
         bench.effort = 0.0 * LIMIT
@@ -320,7 +320,7 @@ def test_an_effort_that_the_caller_changes_is_still_the_commanded_one():
     assert "does not show the commanded one" in bench.guard.fault_text
 
 
-def test_a_prismatic_joint_in_millimetres_is_named_as_such():
+def test_prismatic_joint_in_millimetres_is_reported():
     arm = load_arm("psm")
     guard = CommandGuard(arm, SESSION, Weightless())
     q = np.zeros(7)
@@ -329,7 +329,7 @@ def test_a_prismatic_joint_in_millimetres_is_named_as_such():
     assert guard.fault_text == "insertion = 120 is far beyond 0..0.24; mm or wrong zero?"
 
 
-def test_nobody_turns_the_motors_off_in_a_fault_but_whoever_resets_it_first():
+def test_off_in_fault_requires_reset():
     bench = Bench(modes=WITH_OFF)
     bench.guard.report_fault("the amplifier is hot")
     bench.run(Command.HOLD, 2)
@@ -340,7 +340,7 @@ def test_nobody_turns_the_motors_off_in_a_fault_but_whoever_resets_it_first():
 
 
 @pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])
-def test_a_measurement_that_is_too_old_is_bad(mode):
+def test_old_measurement_is_bad(mode):
     bench = Bench()
     bench.run(mode, 260)
     for _ in range(20):  # the same measurement, until it is 20 ms old
@@ -356,7 +356,7 @@ def test_a_measurement_that_is_too_old_is_bad(mode):
     assert bench.guard.fault_text == old
 
 
-def test_a_measurement_from_the_future_is_bad():
+def test_future_measurement_is_bad():
     bench = Bench().started()
     bench.age = -1
     assert bench.tick().control_mode == Command.HOLD
@@ -369,7 +369,7 @@ RANGE = ARM.position_upper - ARM.position_lower
 
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_joint_that_does_not_follow_position_commands_is_a_fault_and_held_where_it_is(joint, side):
+def test_joint_that_does_not_follow_is_a_fault(joint, side):
     away = side * 0.15 * RANGE[joint] * np.eye(N)[joint]
     bench = Bench().started(Command.POSITION)
     bench.q = Q + 0.99 * away
@@ -381,7 +381,7 @@ def test_a_joint_that_does_not_follow_position_commands_is_a_fault_and_held_wher
     np.testing.assert_array_equal(output.position, bench.q)
 
 
-def test_an_arm_that_is_stuck_while_it_is_led_on_is_a_fault():
+def test_stuck_arm_during_motion_is_a_fault():
     bench = Bench().started(Command.POSITION)
     target = Q - 0.5 * RANGE * np.eye(N)[0]
     for k in range(1000):  # noqa: B007
@@ -394,7 +394,7 @@ def test_an_arm_that_is_stuck_while_it_is_led_on_is_a_fault():
     np.testing.assert_array_equal(bench.output.position, Q)
 
 
-def test_an_arm_that_follows_late_is_no_fault():
+def test_following_lag_is_no_fault():
     """A PD controller without feed-forward, at the highest speed from end to end: late by Kd/Kp, and no fault."""
     late = np.array(ARM.gains.kd) / np.array(ARM.gains.kp)
     bench = Bench().started(Command.POSITION)

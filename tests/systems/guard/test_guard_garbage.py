@@ -35,7 +35,7 @@ def random_command(bench, generator):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_fuzz_never_an_unlimited_output(seed):
+def test_fuzzed_commands_keep_output_limited(seed):
     generator = np.random.default_rng(seed)
     bench = Bench(modes=WITH_OFF)
     limits = bench.guard.limits
@@ -109,7 +109,7 @@ def test_fuzzed_bytes_never_act():
         assert not np.any(output.effort)
 
 
-def test_settings_are_taken():
+def test_settings_are_applied():
     settings = dataclasses.replace(CommandGuard(ARM, 1, Weightless()).settings, start_time=0.1, expiry=0.02)
     bench = Bench(settings=settings)
     bench.run(Command.EFFORT, 101)

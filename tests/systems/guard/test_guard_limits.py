@@ -9,7 +9,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm import load_arm
 
 
-def test_efforts_are_clamped_and_limited_in_rate_from_the_measured_one():
+def test_efforts_are_clamped_and_limited_in_rate():
     bench = Bench().started()
     np.testing.assert_allclose(bench.output.effort, 0.05 * LIMIT, atol=1e-12)
     for k in range(1, 30):
@@ -21,7 +21,7 @@ def test_efforts_are_clamped_and_limited_in_rate_from_the_measured_one():
 
 @pytest.mark.parametrize("row", range(N + 1))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_soft_wall_turns_outward_effort_inward_before_each_limit(row, side):
+def test_soft_wall_reverses_outward_effort(row, side):
     bench = Bench()
     limits = bench.guard.limits
     a, bound = limits.A[row], (limits.lower if side < 0 else limits.upper)[row]
@@ -61,7 +61,7 @@ def test_a_soft_wall_turns_outward_effort_inward_before_each_limit(row, side):
     np.testing.assert_allclose(effort, command, atol=1e-12)
 
 
-def test_positions_move_at_their_rate_and_stop_at_the_limits():
+def test_positions_are_limited_in_rate_and_range():
     bench = Bench().started(Command.POSITION)
     bench.follows = True
     limits = bench.guard.limits
@@ -80,7 +80,7 @@ def test_positions_move_at_their_rate_and_stop_at_the_limits():
         assert not np.any(output.velocity)
 
 
-def test_velocity_feed_forward_passes_where_the_position_is_followed():
+def test_feedforward_velocity_passes_with_unlimited_position():
     bench = Bench().started(Command.POSITION)
     output = bench.run(Command.POSITION, 1, velocity=[0.01] * N)
     np.testing.assert_array_equal(output.velocity, np.full(N, 0.01))
@@ -90,7 +90,7 @@ def test_velocity_feed_forward_passes_where_the_position_is_followed():
     np.testing.assert_array_equal(output.velocity[free], bench.guard.limits.speed[free])
 
 
-def test_holding_after_position_commands_keeps_the_target_unless_the_arm_is_elsewhere():
+def test_hold_after_position_keeps_near_target():
     bench = Bench().started(Command.POSITION)
     bench.q = Q - 0.01  # it sags
     bench.tick()
@@ -102,7 +102,7 @@ def test_holding_after_position_commands_keeps_the_target_unless_the_arm_is_else
 
 
 @pytest.mark.parametrize("name", ["mtmr", "psm"])
-def test_other_arms(name):
+def test_limits_of_other_arms(name):
     arm = load_arm(name)
     bench = Bench(arm)
     bench.started(Command.EFFORT)

@@ -27,7 +27,7 @@ def measurement():
     return measured
 
 
-def test_a_clock_tells_how_much_time_has_passed():
+def test_clock_returns_elapsed_time():
     measured = Measurement(3, 20_000)
     assert measured.utime is None and measured.q is None
     assert measured.advance(5_000_000) == (0.0, "")
@@ -38,7 +38,7 @@ def test_a_clock_tells_how_much_time_has_passed():
     assert measured.advance(5_002_500) == (pytest.approx(1e-3), "")
 
 
-def test_a_clock_that_stands_still_is_noticed():
+def test_stopped_clock_is_reported():
     measured = Measurement(3, 20_000)
     for k in range(25):
         assert (measured.advance(1000)[1] == "the arm's clock stands still") == (k >= 10)
@@ -47,7 +47,7 @@ def test_a_clock_that_stands_still_is_noticed():
 
 
 @pytest.mark.parametrize(("age", "good"), [(-1, False), (0, True), (20_000, True), (20_001, False)])
-def test_a_measurement_has_an_age(age, good):
+def test_measurement_age_is_checked(age, good):
     measured = measurement()
     problem = measured.take(NOW - age, GOOD + 1, GOOD + 2, GOOD + 3)
     assert (problem == "") == good
@@ -59,7 +59,7 @@ def test_a_measurement_has_an_age(age, good):
 
 @pytest.mark.parametrize("which", range(3))
 @pytest.mark.parametrize("bad", [np.zeros(2), np.zeros(4), np.zeros((1, 3)), [0, np.nan, 0], [1e6, 0, 0], [0, 0, -1e6]])
-def test_a_measurement_is_that_many_finite_numbers(which, bad):
+def test_measurement_size_and_numbers_are_checked(which, bad):
     measured = measurement()
     vectors = [GOOD, GOOD, GOOD]
     vectors[which] = bad
@@ -72,7 +72,7 @@ def test_a_measurement_is_that_many_finite_numbers(which, bad):
     assert measured.bad == 0
 
 
-def test_the_time_between_measurements_is_that_of_the_good_ones():
+def test_interval_is_between_good_measurements():
     measured = measurement()
     measured.advance(NOW + 7 * MS)
     measured.take(NOW + 2 * MS, GOOD * np.nan, GOOD, GOOD)
@@ -80,7 +80,7 @@ def test_the_time_between_measurements_is_that_of_the_good_ones():
     assert measured.dt == pytest.approx(30e-3, abs=1e-12)
 
 
-def test_a_measurement_with_the_same_time_is_the_same_and_an_older_one_is_bad():
+def test_repeated_and_older_measurements():
     measured = measurement()
     assert measured.take(NOW, GOOD + 1, GOOD, GOOD) == ""
     assert measured.take(NOW, GOOD + 2, GOOD, GOOD) == "" and measured.dt == 0.0
@@ -92,14 +92,14 @@ def test_a_measurement_with_the_same_time_is_the_same_and_an_older_one_is_bad():
     assert measured.take(NOW - 1000 * MS, GOOD, GOOD, GOOD) == "" and measured.dt == np.inf
 
 
-def test_a_pose_that_nothing_is_compared_with_can_be_implausible():
+def test_first_pose_can_be_implausible():
     measured = measurement()
     assert measured.take(NOW, GOOD + 100, GOOD, GOOD, lambda q: f"{q[0]:g} is far away") == "100 is far away"
     np.testing.assert_array_equal(measured.q, GOOD)
     assert measured.bad == 1
 
 
-def test_a_measurement_is_a_copy():
+def test_measurement_is_copied():
     measured, q = measurement(), GOOD.copy()
     measured.take(NOW, q, q, q)
     q[:] = 9.0
@@ -107,7 +107,7 @@ def test_a_measurement_is_a_copy():
 
 
 @pytest.mark.parametrize(("number", "finite"), [(0.99e6, True), (1e6, False), (-1e6, False), (np.nan, False)])
-def test_numbers_below_a_million_are_finite(number, finite):
+def test_is_finite_bounds_the_sum_to_a_million(number, finite):
     assert is_finite([0.0, number, 1.0]) == is_finite([number, 0.0]) == finite
 
 
@@ -132,7 +132,7 @@ class Stream:
 
 
 @pytest.mark.parametrize(("silence", "code"), [(50 * MS, Status.REFUSAL_OTHER_SENDER), (50 * MS + 1, False)])
-def test_another_sender_must_wait_for_silence(silence, code):
+def test_second_sender_requires_silence(silence, code):
     stream = Stream()
     assert stream.send(0) is False
     assert stream.send(silence, sender=6) == code
@@ -155,7 +155,7 @@ def test_another_sender_must_wait_for_silence(silence, code):
         (2**62, Status.REFUSAL_SEQUENCE_JUMP),
     ],
 )
-def test_commands_come_in_order_and_do_not_jump(step, code):
+def test_sequence_order_and_jumps(step, code):
     stream = Stream()
     stream.send(0)
     assert stream.send(MS, step=step) == code
@@ -167,7 +167,7 @@ def test_commands_come_in_order_and_do_not_jump(step, code):
     ("ahead", "jumps"),
     [(0, False), (30 * MS, False), (30 * MS + 1, True), (-30 * MS, False), (-30 * MS - 1, True), (-40 * MS, True)],
 )
-def test_a_senders_clock_goes_on_as_the_arms_does(ahead, jumps):
+def test_sender_clock_must_advance_with_arm_clock(ahead, jumps):
     stream = Stream()
     stream.send(0)
     assert stream.send(40 * MS, ahead=ahead) == (Status.REFUSAL_CLOCK_JUMP if jumps else 0)
@@ -176,7 +176,7 @@ def test_a_senders_clock_goes_on_as_the_arms_does(ahead, jumps):
 
 
 @pytest.mark.parametrize("jump", [{"ahead": 10**9}, {"ahead": -(10**9)}, {"step": 2**62}, {"step": -(2**62)}])
-def test_a_sender_that_really_jumped_begins_anew_when_its_last_accepted_command_has_expired(jump):
+def test_sender_restarts_after_jump_and_expiry(jump):
     stream, (name, size) = Stream(), next(iter(jump.items()))
     stream.send(0)
     first = stream.send(MS, **jump)
@@ -189,14 +189,14 @@ def test_a_sender_that_really_jumped_begins_anew_when_its_last_accepted_command_
     assert stream.send(51 * MS + 1, **goes_on) is False
 
 
-def test_a_senders_clock_that_stands_still_jumps():
+def test_stopped_sender_clock_is_a_jump():
     stream = Stream()
     stream.send(0)
     assert stream.send(1, ahead=-1) == Status.REFUSAL_CLOCK_JUMP
     assert stream.send(2, ahead=-1) is False  # it went on since the last accepted one
 
 
-def test_commands_that_are_missing_are_counted():
+def test_missing_commands_are_counted():
     stream = Stream()
     for k, step in enumerate((5, 1, 3, 1, 2)):
         stream.send(k * MS, step=step)
@@ -207,7 +207,7 @@ def test_commands_that_are_missing_are_counted():
     assert stream.stream.lost == 2 + 1 + 999
 
 
-def test_off_follows_a_hold_of_the_same_sender():
+def test_off_requires_hold_of_the_same_sender():
     stream = Stream()
     assert stream.send(0, Command.OFF) == Status.REFUSAL_SUDDEN_OFF
     for before, allowed in ((Command.EFFORT, False), (Command.POSITION, False), (Command.HOLD, True)):
@@ -219,7 +219,7 @@ def test_off_follows_a_hold_of_the_same_sender():
     assert stream.send(60 * MS, Command.OFF, sender=6) == Status.REFUSAL_SUDDEN_OFF
 
 
-def test_a_reset_is_a_change_from_false_to_true():
+def test_reset_is_a_change_from_false_to_true():
     stream = Stream()
     asked = [stream.send(k * MS, reset=reset) for k, reset in enumerate([True, True, False, True, True, False, True])]
     assert asked == [False, False, False, True, False, False, True]
@@ -228,7 +228,7 @@ def test_a_reset_is_a_change_from_false_to_true():
     assert stream.send(60 * MS, sender=6, reset=True) is False
 
 
-def test_who_was_heard_can_be_forgotten():
+def test_forget_discards_the_sender():
     stream = Stream()
     stream.send(50 * MS)
     stream.stream.forget()
@@ -239,7 +239,7 @@ def test_who_was_heard_can_be_forgotten():
     assert stream.stream.lost == 0
 
 
-def test_the_command_in_force_has_numbers_of_its_own():
+def test_command_in_force_is_copied():
     command = Bench().command(effort=np.ones(N))
     force = CommandInForce()
     force.take(command)
@@ -252,7 +252,7 @@ def test_the_command_in_force_has_numbers_of_its_own():
 
 @pytest.mark.parametrize("mode", [Command.OFF, Command.HOLD, Command.POSITION, Command.EFFORT])
 @pytest.mark.parametrize("reset", [False, True])
-def test_only_a_hold_resets(mode, reset):
+def test_reset_requires_hold(mode, reset):
     code = content_refusal(Bench().command(mode, reset_fault=reset))
     assert code == (Status.REFUSAL_BAD_RESET if reset and mode != Command.HOLD else Status.REFUSAL_NONE)
 
@@ -335,7 +335,7 @@ def test_every_setting_has_bounds():
 
 
 @pytest.mark.parametrize("value", ["false", 1, None])
-def test_an_operator_resumes_unless_it_is_set_otherwise(value):
+def test_resume_requires_operator_by_default(value):
     assert GuardSettings().resume_automatically is False
     with pytest.raises(StationError, match="guard settings: resume_automatically must be true or false; got"):
         GuardSettings(resume_automatically=value)

@@ -160,5 +160,5 @@ def check_many(count):
 
 
 @pytest.mark.parametrize("count", [300, pytest.param(10_000, marks=pytest.mark.slow)])
-def test_the_output_is_finite_and_inside_the_limits_whatever_comes(count):
+def test_output_is_finite_and_limited_for_any_input(count):
     check_many(count)

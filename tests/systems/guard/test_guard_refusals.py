@@ -25,7 +25,7 @@ from dvrk_drake.systems.guard.settings import GuardSettings
         ({"reset_fault": True}, Status.REFUSAL_BAD_RESET),
     ],
 )
-def test_bad_commands_are_refused_and_end_in_a_hold(fields, code):
+def test_bad_commands_are_refused_and_lead_to_hold(fields, code):
     bench = Bench(modes=WITH_OFF).started()
     for _ in range(52):
         assert bench.send(**fields) == code
@@ -70,7 +70,7 @@ def test_foreign_messages_are_counted_and_interrupt_nothing(mode, fields, code, 
     assert (bench.guard.fault_code, bench.guard.sender_id) == (Status.FAULT_NONE, 5)
 
 
-def test_foreign_messages_keep_no_command_in_force():
+def test_foreign_messages_do_not_extend_expiry():
     bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
     for _ in range(60):
         bench.send(sender=6)
@@ -93,7 +93,7 @@ def test_foreign_messages_keep_no_command_in_force():
     ],
 )
 @pytest.mark.parametrize("watched", [False, True])
-def test_a_copied_sender_id_with_another_sequence_or_time_interrupts_nothing(fields, code, watched):
+def test_copied_sender_id_does_not_interrupt_the_stream(fields, code, watched):
     bench = Bench()
     bench.run(Command.EFFORT, 100 if watched else 260)
     for _ in range(200):
@@ -105,7 +105,7 @@ def test_a_copied_sender_id_with_another_sequence_or_time_interrupts_nothing(fie
     assert (bench.guard.counts.refused, bench.guard.counts.lost) == (200, 200)
 
 
-def test_a_command_that_answers_an_old_status_is_stale():
+def test_answer_to_an_old_status_is_stale():
     bench = Bench()
     bench.tick(100)
     assert bench.send(status_utime=bench.utime - 50 * MS) == Status.REFUSAL_NONE
@@ -116,7 +116,7 @@ def test_a_command_that_answers_an_old_status_is_stale():
     assert unborn.receive(bench.command(), bench.utime) == Status.REFUSAL_STALE
 
 
-def test_out_of_order_and_duplicates_are_refused_and_gaps_are_counted():
+def test_order_duplicates_and_gaps_of_commands():
     bench = Bench()
     first = bench.command()
     bench.tick()
@@ -132,7 +132,7 @@ def test_out_of_order_and_duplicates_are_refused_and_gaps_are_counted():
 
 
 @pytest.mark.parametrize("jump", [-51 * MS, -3600 * 10**6, 51 * MS, 3600 * 10**6])
-def test_a_jump_of_the_senders_clock_ends_in_a_hold_and_a_new_start(jump):
+def test_sender_clock_jump_leads_to_hold_and_restart(jump):
     bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
     base = bench.utime - 10**15
     for _ in range(50):
@@ -148,14 +148,14 @@ def test_a_jump_of_the_senders_clock_ends_in_a_hold_and_a_new_start(jump):
 
 
 @pytest.mark.parametrize("lead", [-49 * MS, 49 * MS])
-def test_a_senders_clock_may_be_off_by_the_tolerance(lead):
+def test_sender_clock_tolerance(lead):
     bench = Bench()
     bench.run(Command.HOLD, 1)
     bench.tick(50)
     assert bench.send(Command.HOLD, utime=bench.utime - 10**15 + lead) == Status.REFUSAL_NONE
 
 
-def test_the_arms_clock_jumping_forward_expires_and_backward_is_a_fault():
+def test_arm_clock_jumps_expire_commands_or_fault():
     bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
     bench.utime += 3600 * 10**6
     assert bench.tick().control_mode == Command.HOLD

@@ -60,7 +60,7 @@ def waits(bench, reason):
 @MODES
 @pytest.mark.parametrize(("take_over", "reason"), TAKEOVERS)
 @pytest.mark.parametrize("operator", [6, 7])
-def test_the_arm_is_held_until_an_operator_resumes(mode, take_over, reason, operator):
+def test_arm_holds_until_operator_resumes(mode, take_over, reason, operator):
     """The operator's command comes from the last sender or from a new one."""
     bench = Bench().started(mode)
     take_over(bench)
@@ -77,7 +77,7 @@ def test_the_arm_is_held_until_an_operator_resumes(mode, take_over, reason, oper
     assert bench.output.control_mode == mode
 
 
-def test_a_flag_that_was_always_true_does_not_resume():
+def test_constant_reset_flag_does_not_resume():
     bench = Bench().started()
     expire(bench)
     bench.run(Command.HOLD, 5, sender=6, reset_fault=True)
@@ -86,7 +86,7 @@ def test_a_flag_that_was_always_true_does_not_resume():
 
 @MODES
 @pytest.mark.parametrize("take_over", [take_over for take_over, _ in TAKEOVERS])
-def test_an_explicit_setting_resumes_automatically(mode, take_over):
+def test_setting_enables_automatic_resume(mode, take_over):
     bench = Bench(settings=GuardSettings(resume_automatically=True)).started(mode)
     take_over(bench)
     assert (bench.guard.state, bench.guard.hold_reason) == (Status.STATE_HOLD, "")
@@ -98,7 +98,7 @@ def test_an_explicit_setting_resumes_automatically(mode, take_over):
 
 
 @MODES
-def test_an_orderly_end_and_a_start_that_ends_need_no_resume(mode):
+def test_hold_command_and_ended_start_need_no_resume(mode):
     bench = Bench().started(mode)
     bench.run(Command.HOLD, 1)
     bench.tick(200)
@@ -110,7 +110,7 @@ def test_an_orderly_end_and_a_start_that_ends_need_no_resume(mode):
     assert (bench.guard.state, bench.guard.hold_reason) == (Status.STATE_HOLD, "")
 
 
-def test_a_sender_that_stops_while_it_changes_the_mode_waits_for_an_operator():
+def test_silence_during_mode_change_requires_resume():
     bench = Bench(checks=False).started(Command.EFFORT)
     bench.run(Command.POSITION, 100)
     assert bench.guard.state == Status.STATE_STARTING
@@ -122,7 +122,7 @@ def test_a_sender_that_stops_while_it_changes_the_mode_waits_for_an_operator():
 @pytest.mark.parametrize(
     "bad", [{"position": [np.nan] * N}, {"control_mode": 0}, {"position": list(Q + 9)}, {"effort": [1e308] * N}]
 )
-def test_a_refused_command_while_the_mode_changes_waits_for_an_operator(bad):
+def test_refusal_during_mode_change_requires_resume(bad):
     bench = Bench().started()
     fields = {"control_mode": Command.POSITION, "position": list(Q)}
     bench.send(**fields)
@@ -135,7 +135,7 @@ def test_a_refused_command_while_the_mode_changes_waits_for_an_operator(bad):
     assert bench.send(Command.EFFORT) == Status.REFUSAL_RESUME
 
 
-def test_refused_commands_of_one_sender_do_not_keep_an_operator_from_a_reset():
+def test_refused_commands_do_not_block_reset():
     bench = Bench().started()
     expire(bench)
     for k in range(200):
@@ -148,7 +148,7 @@ def test_refused_commands_of_one_sender_do_not_keep_an_operator_from_a_reset():
 
 
 @pytest.mark.parametrize("copied", [{"effort": [np.nan] * N}, {"reset_fault": True}, {"mode": Command.OFF}])
-def test_a_copy_that_does_not_continue_the_stream_does_not_interrupt_a_start(copied):
+def test_replayed_command_does_not_interrupt_start(copied):
     bench = Bench()
     for k in range(300):
         bench.run(Command.EFFORT, 1)
@@ -160,14 +160,14 @@ def test_a_copy_that_does_not_continue_the_stream_does_not_interrupt_a_start(cop
     assert bench.guard.state == Status.STATE_EFFORT
 
 
-def test_the_first_reason_stays():
+def test_first_hold_reason_is_kept():
     bench = Bench().started()
     expire(bench)
     call(bench)
     assert bench.guard.hold_reason == EXPIRED
 
 
-def test_motors_that_are_off_and_a_fault_stay_as_they_are():
+def test_watchdog_keeps_off_and_fault():
     bench = Bench(modes=WITH_OFF)
     bench.run(Command.HOLD, 1)
     bench.run(Command.OFF, 1)
@@ -187,7 +187,7 @@ def test_motors_that_are_off_and_a_fault_stay_as_they_are():
     )
 
 
-def test_an_arm_that_waits_may_be_switched_off_and_waits_after_that():
+def test_off_keeps_pending_resume():
     bench = Bench(modes=WITH_OFF).started()
     expire(bench)
     bench.run(Command.HOLD, 1)
@@ -197,7 +197,7 @@ def test_an_arm_that_waits_may_be_switched_off_and_waits_after_that():
     assert bench.send() == Status.REFUSAL_RESUME
 
 
-def test_one_reset_clears_a_fault_and_what_was_before_it():
+def test_reset_clears_fault_and_pending_resume():
     bench = Bench().started()
     expire(bench)
     bench.guard.report_fault("the amplifier is hot")
@@ -230,7 +230,7 @@ class WallBench(Bench):
 @pytest.mark.parametrize(
     ("milliseconds", "goes_on"), [(20, True), (48, True), (48.001, False), (50, False), (200, False), (1000, False)]
 )
-def test_a_stall_of_the_bridge_expires_what_is_in_force_by_the_wall_clock(mode, first, milliseconds, goes_on):
+def test_bridge_stall_expires_command_by_wall_clock(mode, first, milliseconds, goes_on):
     """Whether a command or a step comes first after it; with a command that was 1 ms old when it came."""
     bench = WallBench().started(mode)
     assert bench.send(mode, status_utime=bench.utime - MS) == Status.REFUSAL_NONE
@@ -257,7 +257,7 @@ def test_a_stall_of_the_bridge_expires_what_is_in_force_by_the_wall_clock(mode, 
 @pytest.mark.parametrize(
     ("milliseconds", "goes_on"), [(20, True), (50, True), (51, False), (200, False), (1000, False)]
 )
-def test_a_stall_of_the_sender_expires_what_is_in_force_by_the_arms_clock(mode, milliseconds, goes_on):
+def test_sender_stall_expires_command_by_arm_clock(mode, milliseconds, goes_on):
     bench = WallBench().started(mode)
     bench.run(mode, 1)  # received one tick before the time that the bench has now
     bench.tick(milliseconds - 1)
@@ -267,7 +267,7 @@ def test_a_stall_of_the_sender_expires_what_is_in_force_by_the_arms_clock(mode, 
     assert goes_on == (bench.guard.hold_reason == "")
 
 
-def test_a_command_that_answers_an_old_measurement_has_that_age_by_the_wall_clock_as_well():
+def test_answer_to_old_measurement_has_its_wall_clock_age():
     bench = WallBench().started()
     assert bench.send(status_utime=bench.utime - 40 * MS) == Status.REFUSAL_NONE
     bench.stall(10)
@@ -278,7 +278,7 @@ def test_a_command_that_answers_an_old_measurement_has_that_age_by_the_wall_cloc
     assert bench.guard.state == Status.STATE_HOLD
 
 
-def test_a_command_that_waited_has_the_age_of_its_measurement_by_the_wall_clock():
+def test_delayed_command_has_age_of_its_measurement():
     """As in the socket of a process that was stopped: by the arm's clock it is new."""
     bench = WallBench().started()
     answered = bench.utime
@@ -292,7 +292,7 @@ def test_a_command_that_waited_has_the_age_of_its_measurement_by_the_wall_clock(
     assert bench.guard.hold_reason.startswith("the last command expired: 50.0 ms old by the wall clock")
 
 
-def test_measurements_have_a_time_by_the_wall_clock():
+def test_measurements_have_wall_clock_times():
     now = [10**6]
     clock = WallClock(lambda: now[0])
     clock.note(5000, 200)
@@ -311,7 +311,7 @@ def test_measurements_have_a_time_by_the_wall_clock():
     assert clock.time_of(11_999, 7) == clock.now() - 7
 
 
-def test_a_clock_of_the_arm_that_went_back_has_no_times_of_its_future():
+def test_backward_arm_clock_discards_wall_clock_times():
     bench = WallBench().started()
     bench.stalled += 10**6
     bench.utime -= 10**6
@@ -319,7 +319,7 @@ def test_a_clock_of_the_arm_that_went_back_has_no_times_of_its_future():
     assert bench.guard._expiry.wall.time_of(bench.utime + 10**6 - MS, 7) == bench.guard._expiry.wall.now() - 7
 
 
-def test_a_stall_while_starting_starts_anew_and_needs_no_resume():
+def test_stall_while_starting_needs_no_resume():
     bench = WallBench()
     bench.run(Command.EFFORT, 200)
     bench.stall(60)
@@ -329,7 +329,7 @@ def test_a_stall_while_starting_starts_anew_and_needs_no_resume():
     assert bench.guard.state == Status.STATE_STARTING
 
 
-def test_the_arms_clock_expires_a_command_also_where_the_wall_clock_stands_still():
+def test_arm_clock_expires_with_stopped_wall_clock():
     bench = Bench(wall_clock=lambda: 0).started()
     bench.tick(49)
     assert bench.output.control_mode == Command.EFFORT
@@ -337,7 +337,7 @@ def test_the_arms_clock_expires_a_command_also_where_the_wall_clock_stands_still
     assert bench.guard.hold_reason == EXPIRED
 
 
-def test_a_held_pose_does_not_expire():
+def test_held_pose_does_not_expire():
     bench = WallBench()
     bench.run(Command.HOLD, 1)
     bench.stall(1000)
@@ -346,7 +346,7 @@ def test_a_held_pose_does_not_expire():
     assert bench.guard.hold_reason == ""
 
 
-def test_copies_share_the_wall_clock_and_nothing_else():
+def test_copies_share_only_the_wall_clock():
     bench = WallBench().started()
     other = copy.deepcopy(bench.guard)
     bench.stall(60)

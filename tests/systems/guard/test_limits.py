@@ -52,7 +52,7 @@ def test_limits_follow_from_the_arm_and_the_settings():
 
 
 @pytest.mark.parametrize("kp", [0.0, -1.0])
-def test_a_joint_that_nothing_holds_is_refused(kp):
+def test_joint_without_gains_is_refused(kp):
     arm = dataclasses.replace(ARM, gains=dataclasses.replace(ARM.gains, kp=list(ARM.gains.kp)))
     arm.gains.kp[-1] = kp
     with pytest.raises(StationError, match=r"MTML: gains\.kp\[6\] is .*; allowed: "):
@@ -64,7 +64,7 @@ def test_a_joint_that_nothing_holds_is_refused(kp):
 
 @pytest.mark.parametrize("row", range(N + 1))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_pose_is_beyond_from_half_of_the_margin_on(row, side):
+def test_beyond_starts_at_half_of_the_margin(row, side):
     joint = int(np.flatnonzero(A[row])[0])
     bound = (LOWER if side < 0 else UPPER)[row]
     q = Q.copy()
@@ -83,7 +83,7 @@ def test_a_pose_is_beyond_from_half_of_the_margin_on(row, side):
     assert at(0.501).endswith(f" is beyond {LOWER[row]:.4g}..{UPPER[row]:.4g}")
 
 
-def test_the_worst_limit_is_named():
+def test_beyond_describes_the_worst_limit():
     q = Q.copy()
     q[4], q[6] = UPPER[4] + 0.6 * LIMITS.margin[4], LOWER[6] - 0.7 * LIMITS.margin[6]
     assert LIMITS.beyond(q).startswith("wrist_roll = ")
@@ -93,7 +93,7 @@ def test_the_worst_limit_is_named():
 
 @pytest.mark.parametrize("row", range(N + 1))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_first_pose_is_implausible_from_half_of_the_range_beyond_a_limit(row, side):
+def test_implausible_pose_starts_at_half_of_the_range(row, side):
     joint = int(np.flatnonzero(A[row])[0])
     middle, width = (LOWER + UPPER) / 2, UPPER - LOWER
 
@@ -123,7 +123,7 @@ def start(mode, q=Q, measured=HALF, **fields):
 
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_efforts_start_near_the_measured_ones_only(joint, side):
+def test_efforts_must_start_near_measured_ones(joint, side):
     far = side * 0.1 * LIMIT[joint] * E[joint]
     assert start(Command.EFFORT, effort=HALF + 0.99 * far) == Status.REFUSAL_NONE
     assert start(Command.EFFORT, effort=HALF + 1.01 * far) == Status.REFUSAL_START_FAR
@@ -137,7 +137,7 @@ def test_efforts_start_near_the_measured_ones_only(joint, side):
 
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_positions_start_near_the_measured_ones_only(joint, side):
+def test_positions_must_start_near_measured_ones(joint, side):
     far = side * LIMITS.margin[joint] * E[joint]
     lead = KP[joint] / KD[joint] * far  # a velocity that leads as far
     assert start(Command.POSITION, position=Q + 0.99 * far) == Status.REFUSAL_NONE
@@ -154,7 +154,7 @@ def test_positions_start_near_the_measured_ones_only(joint, side):
     assert start(Command.POSITION, q=outside, position=outside, measured=2 * LIMIT) == Status.REFUSAL_NONE
 
 
-def test_a_start_exactly_as_far_as_allowed_is_near():
+def test_start_tolerance_is_inclusive():
     measured = LIMITS.command_limits + LIMITS.start_effort
     assert start(Command.EFFORT, measured=FREE, effort=LIMITS.start_effort) == Status.REFUSAL_NONE
     assert start(Command.EFFORT, measured=measured, effort=measured) == Status.REFUSAL_NONE
@@ -165,7 +165,7 @@ def test_a_start_exactly_as_far_as_allowed_is_near():
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_efforts_go_at_their_rate_to_what_is_clamped(sign):
+def test_efforts_follow_clamped_command_at_limited_rate(sign):
     command = sign * LIMIT * np.array([0.2, 1.0, 1.5, 0.04, 0.0, 3.0, -2.0])
     effort, flags = LIMITS.follow_effort(command, FREE, 1e-3)
     np.testing.assert_allclose(effort, sign * LIMIT * [0.05, 0.05, 0.05, 0.04, 0.0, 0.05, -0.05], atol=1e-12)
@@ -180,7 +180,7 @@ def test_efforts_go_at_their_rate_to_what_is_clamped(sign):
 
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_joint_that_is_too_fast_is_braked(joint, side):
+def test_fast_joint_is_braked(joint, side):
     limits = GuardLimits(ARM, GuardSettings(traverse_time=50.0))  # so slow that no wall is met early
     push, speed = side * LIMIT * E[joint], side * limits.speed * E[joint]
     for share, left in ((0.0, 1.0), (1.0, 1.0), (1.125, 0.5), (1.25, 0.0), (1.375, -0.5), (1.5, -1.0), (3.0, -1.0)):
@@ -192,7 +192,7 @@ def test_a_joint_that_is_too_fast_is_braked(joint, side):
     np.testing.assert_allclose(limits.restrain_effort(FREE, Q, 9.0 * speed)[0], -push, atol=1e-12)
 
 
-def test_the_stiffness_of_walls_is_limited():
+def test_wall_stiffness_is_limited():
     """One period late, a stiffer wall would chatter; a softer one would be wider than it need be."""
     motors = [max(LIMIT[row != 0] / np.abs(row[row != 0])) for row in A]
     stiffness = 2 * np.array(motors)[:, None] * A**2 / LIMITS.wall_width[:, None] / KP
@@ -203,7 +203,7 @@ def test_the_stiffness_of_walls_is_limited():
 
 
 @pytest.mark.parametrize("row", range(N + 1))
-def test_a_wall_is_passive(row):
+def test_wall_is_passive(row):
     """Work over closed paths through the wall, of the limit's own coordinate, at several speeds."""
     a = A[row] / (A[row] @ A[row])
     middle = Q + (0.5 * (LOWER + UPPER)[row] - A[row] @ Q) * a
@@ -228,7 +228,7 @@ def test_a_wall_is_passive(row):
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_targets_go_at_their_rate_and_stop_at_the_limits(sign):
+def test_targets_are_limited_in_rate_and_range(sign):
     step = LIMITS.speed * 1e-3
     command = Q + sign * step * [0.5, 0.5, 0.0, 1.0, 2.0, 0.0, 90.0]
     target, flags = LIMITS.limit_position(command, Q, 1e-3)
@@ -246,7 +246,7 @@ def test_targets_go_at_their_rate_and_stop_at_the_limits(sign):
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_joints_of_a_coupled_limit_stop_on_it_together(side):
+def test_joints_stop_together_on_coupled_limit(side):
     bound = (UPPER if side > 0 else LOWER)[N]
     last = Q.copy()
     last[1:3] = bound / 2 - side * 0.001
@@ -262,7 +262,7 @@ def test_joints_of_a_coupled_limit_stop_on_it_together(side):
         np.testing.assert_allclose(moved, on, atol=1e-9)
 
 
-def test_a_target_outside_comes_back_and_goes_no_further_out():
+def test_target_outside_moves_only_inward():
     last = Q.copy()
     last[5] = UPPER[5] + 0.1
     out, flags = LIMITS.limit_position(last + 0.01 * E[5], last, 0.1)
@@ -278,7 +278,7 @@ def coupled(*limits):
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_wall_outweighs_every_motor_that_pushes_on_it(side):
+def test_wall_effort_exceeds_all_pushing_motors(side):
     yaw, pitch = ARM.joint_names[0], ARM.joint_names[4]
     arm = coupled(CoupledLimit("cable", {yaw: -2.0, pitch: 0.5}, -0.5, 0.5))
     limits = GuardLimits(arm, GuardSettings(traverse_time=100.0, margin=0.001))
@@ -306,7 +306,7 @@ def test_a_wall_outweighs_every_motor_that_pushes_on_it(side):
     )
 
 
-def test_coupled_limits_that_undo_one_another_stop_the_target():
+def test_conflicting_coupled_limits_stop_target():
     yaw, shoulder, elbow = ARM.joint_names[:3]
     first = CoupledLimit("first", {shoulder: 1.0, elbow: 1.0}, -1.0, Q[1] + Q[2])
     second = CoupledLimit("second", {shoulder: 1.0, yaw: 1.0}, Q[0] + Q[1], 2.0)
@@ -329,7 +329,7 @@ def test_coupled_limits_that_undo_one_another_stop_the_target():
 
 @pytest.mark.parametrize("joint", [0, 3, 4, 5, 6])
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_velocity_leads_to_the_limit_and_no_further(joint, side):
+def test_feedforward_velocity_stops_at_limit(joint, side):
     none = np.zeros(N, np.int8)
     fast = side * 99.0 * E[joint]
     np.testing.assert_allclose(LIMITS.limit_velocity(fast, Q, none), side * LIMITS.speed * E[joint], atol=1e-12)
@@ -344,7 +344,7 @@ def test_a_velocity_leads_to_the_limit_and_no_further(joint, side):
         np.testing.assert_array_equal(LIMITS.limit_velocity(-slow, target, none), -slow)  # inward
 
 
-def test_no_velocity_where_the_position_is_not_followed():
+def test_no_feedforward_velocity_with_limited_position():
     flags = np.array([0, 1, 2, 4, 8, 16, 0], np.int8)
     velocity = 0.1 * LIMITS.speed
     np.testing.assert_array_equal(LIMITS.limit_velocity(velocity, Q, flags), np.where(flags == 0, velocity, 0.0))
@@ -352,7 +352,7 @@ def test_no_velocity_where_the_position_is_not_followed():
 
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_efforts_start_only_where_the_measured_effort_is_the_gravity_effort(joint, side):
+def test_effort_start_requires_gravity_effort(joint, side):
     """But for 0.1 of the limit, dry friction, and what a hand or a wrong model does to a wrist."""
     allowed = 0.1 * LIMIT[joint] + ARM.dry_friction()[joint] + 0.06
     command = Command()
@@ -364,7 +364,7 @@ def test_efforts_start_only_where_the_measured_effort_is_the_gravity_effort(join
         assert LIMITS.refusal_to_start(command, Q, measured, gravity) == code
 
 
-def test_dry_friction_is_that_of_the_arms_file():
+def test_dry_friction_comes_from_arm_file():
     friction = ARM.dry_friction()
     assert friction[0] == pytest.approx(0.061 + 0.034, abs=1e-12)
     # The elbow's actuator turns with the shoulder as well, and the platform's with the elbow, by 0.6697.

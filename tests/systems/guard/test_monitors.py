@@ -13,7 +13,7 @@ SETTINGS = GuardSettings()
 
 
 @pytest.mark.parametrize(("period", "slow"), [(0.001, False), (0.005, False), (0.0051, True), (0.020, True)])
-def test_a_median_above_the_allowed_one_is_found_after_half_of_the_periods(period, slow):
+def test_slow_median_period_is_found_after_50_periods(period, slow):
     monitor = PeriodMonitor(SETTINGS)
     faults = [monitor.add(period) for _ in range(200)]
     assert [bool(fault) for fault in faults] == [slow and k >= 50 for k in range(200)]
@@ -24,7 +24,7 @@ def test_a_median_above_the_allowed_one_is_found_after_half_of_the_periods(perio
 
 
 @pytest.mark.parametrize(("period", "long"), [(0.040, False), (0.041, True), (0.049, True)])
-def test_a_period_above_the_longest_one_is_found_at_once(period, long):
+def test_long_period_is_found_immediately(period, long):
     monitor = PeriodMonitor(SETTINGS)
     assert monitor.add(0.001) == ""
     text = f"the guard was not stepped for {1e3 * period:.0f} ms; allowed are 40"
@@ -32,7 +32,7 @@ def test_a_period_above_the_longest_one_is_found_at_once(period, long):
     assert monitor.add(0.001) == ""
 
 
-def test_a_guard_that_is_stepped_too_seldom_holds_until_an_operator_resumes():
+def test_slow_guard_holds_until_operator_resumes():
     """Every 20 ms, efforts at 0.9 of their limits would act on an arm that moves on meanwhile."""
     bench = Bench(checks=True)
     bench.run(Command.EFFORT, 260)
@@ -59,7 +59,7 @@ def test_a_guard_that_is_stepped_too_seldom_holds_until_an_operator_resumes():
     assert bench.guard.state == Status.STATE_EFFORT
 
 
-def test_a_guard_that_was_not_stepped_for_49_ms_holds():
+def test_guard_holds_after_49_ms_without_step():
     bench = Bench(checks=True).started()
     bench.utime += 49 * MS
     output = bench.step()
@@ -67,7 +67,7 @@ def test_a_guard_that_was_not_stepped_for_49_ms_holds():
     assert bench.guard.hold_reason == "the guard was not stepped for 49 ms; allowed are 40"
 
 
-def test_the_period_is_that_of_the_wall_clock_if_there_is_one():
+def test_period_is_measured_by_wall_clock():
     """A simulated arm's own clock counts its ticks, however late they are."""
     wall = [10**9]
     bench = Bench(checks=True, wall_clock=lambda: wall[0])
@@ -95,7 +95,7 @@ def reversals(monitor, wave, seconds=6.0):
 
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("frequency", [1.5, 5.0, 20.0, 100.0])
-def test_efforts_that_jump_between_their_limits_are_found_after_some_reversals(joint, frequency):
+def test_oscillating_efforts_are_found(joint, frequency):
     unit = np.eye(N)[joint] * LIMIT
     wave = lambda t: unit * np.sign(np.sin(2 * np.pi * frequency * (t + 1e-4)))  # noqa: E731
     time, found = reversals(OscillationMonitor(SETTINGS, ARM), wave)
@@ -113,12 +113,12 @@ def test_efforts_that_jump_between_their_limits_are_found_after_some_reversals(j
         pytest.param(lambda t: LIMIT * (t > 1), id="a steady push"),
     ],
 )
-def test_efforts_of_normal_use_do_not_oscillate(wave):
+def test_normal_efforts_are_no_oscillation(wave):
     assert reversals(OscillationMonitor(SETTINGS, ARM), wave) == (None, None)
 
 
 @pytest.mark.parametrize(("half_period", "restart", "found"), [(0.1, 99, True), (0.1, 4, False), (5.0, 99, False)])
-def test_reversals_fade_and_a_restart_forgets_them(half_period, restart, found):
+def test_reversals_decay_and_restart_resets_them(half_period, restart, found):
     monitor, joints = OscillationMonitor(SETTINGS, ARM), []
     for k in range(20):
         if k % restart == 0:
@@ -127,7 +127,7 @@ def test_reversals_fade_and_a_restart_forgets_them(half_period, restart, found):
     assert any(joint is not None for joint in joints) == found
 
 
-def test_a_guard_lets_efforts_change_their_sign_slowly():
+def test_guard_accepts_slow_sign_changes():
     bench = Bench().started()
     for k in range(5000):
         effort = (-1.0) ** (k // 600) * LIMIT * np.eye(N)[2]
@@ -136,7 +136,7 @@ def test_a_guard_lets_efforts_change_their_sign_slowly():
     assert bench.guard.state == Status.STATE_EFFORT
 
 
-def test_a_guard_holds_an_arm_whose_effort_commands_oscillate():
+def test_guard_holds_on_oscillating_commands():
     bench = Bench().started()
     for k in range(2000):
         effort = np.sign(np.sin(2 * np.pi * 10 * 1e-3 * k)) * LIMIT * np.eye(N)[2]

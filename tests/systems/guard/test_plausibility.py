@@ -63,7 +63,7 @@ def unit(joint, size=1.0):
 
 @pytest.mark.parametrize("joint", JOINTS)
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_position_jumps_beyond_its_tolerance_only(joint, side):
+def test_position_jump_beyond_tolerance_is_found(joint, side):
     for factor, found in ((0.99, False), (1.01, True)):
         sensors = Sensors()
         sensors.move(np.zeros(N), ticks=10)
@@ -77,7 +77,7 @@ def test_a_position_jumps_beyond_its_tolerance_only(joint, side):
 
 
 @pytest.mark.parametrize("ticks", [5, 100, 107, 125, 133])
-def test_the_last_valid_pose_is_of_before_the_fault_began(ticks):
+def test_last_valid_pose_precedes_the_fault(ticks):
     """From one to two detection times before the fault is found, or the first pose."""
     sensors, v = Sensors(), unit(0, 0.5)
     first = sensors.q.copy()
@@ -93,7 +93,7 @@ def test_the_last_valid_pose_is_of_before_the_fault_began(ticks):
     assert oldest - 1e-9 <= sensors.checks.last_valid[0] <= newest + 1e-9
 
 
-def test_a_jump_is_found_however_fast_the_joint_seems_to_be():
+def test_jump_is_found_at_any_measured_velocity():
     """A velocity that is the difference of positions makes no jump plausible."""
     sensors = Sensors()
     v = unit(0, 0.3 / MS)
@@ -105,7 +105,7 @@ def test_a_jump_is_found_however_fast_the_joint_seems_to_be():
         assert ("jumps" in sensors.measure()) == found
 
 
-def test_a_late_measurement_may_have_moved_on():
+def test_late_measurement_may_differ_more():
     sensors = Sensors()
     v = unit(0, 3.0)
     sensors.move(0.5 * v, ticks=5)
@@ -116,7 +116,7 @@ def test_a_late_measurement_may_have_moved_on():
 @pytest.mark.parametrize("joint", JOINTS)
 @pytest.mark.parametrize("speed", [-1.0, 0.5, 2.0])
 @pytest.mark.parametrize(("measured", "relative"), [("stuck", 1.0), ("inverted", 2.0), ("zero", 1.0), ("double", 1.0)])
-def test_a_velocity_that_disagrees_with_the_position_is_found_in_time(joint, speed, measured, relative):
+def test_inconsistent_velocity_is_found(joint, speed, measured, relative):
     sensors = Sensors()
     v, q0 = unit(joint, speed), sensors.q.copy()
     q = (lambda q: q0) if measured == "stuck" else None
@@ -141,7 +141,7 @@ def test_a_velocity_that_disagrees_with_the_position_is_found_in_time(joint, spe
         (PSM, [0.068, 0.068, 0.0070, 0.103, 0.090, 0.115, 0.124]),
     ],
 )
-def test_the_smallest_drift_that_is_found(arm, smallest):
+def test_smallest_detected_drift(arm, smallest):
     """At rest, of a position whose velocity is measured as zero: the table of docs/safety.md [rad/s, m/s]."""
     for joint, drift in enumerate(smallest):
         for share, found in ((0.95, False), (1.05, True)):
@@ -150,7 +150,7 @@ def test_the_smallest_drift_that_is_found(arm, smallest):
             assert bool(fault) == found, (arm.joint_names[joint], share)
 
 
-def test_a_velocity_with_the_delay_of_a_filter_is_plausible():
+def test_filtered_velocity_is_plausible():
     """A first-order filter of 30 Hz, as in the arm files, at up to 0.4 of the speed limit in both directions."""
     sensors = Sensors()
     limit = GuardLimits(ARM, GuardSettings()).speed
@@ -163,7 +163,7 @@ def test_a_velocity_with_the_delay_of_a_filter_is_plausible():
 
 @pytest.mark.parametrize("joint", JOINTS)
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_position_that_stays_the_same_under_a_changing_effort_is_frozen(joint, side):
+def test_constant_position_under_changing_effort_is_frozen(joint, side):
     time = SETTINGS.frozen_time + COUNTS[joint] / SETTINGS.frozen_speed
     for factor, found in ((0.99, False), (1.01, True)):
         sensors = Sensors()
@@ -177,14 +177,14 @@ def test_a_position_that_stays_the_same_under_a_changing_effort_is_frozen(joint,
             assert MS * ticks == pytest.approx(time, abs=1.5 * MS)
 
 
-def test_an_effort_that_builds_up_after_power_on_is_no_fault_of_an_arm_that_lies_on_something():
+def test_effort_after_power_on_is_plausible():
     sensors = Sensors()
     sensors.move(np.zeros(N), ticks=100)
     sensors.effort = 0.9 * LIMIT
     assert sensors.move(np.zeros(N), ticks=1000)[0] == ""
 
 
-def test_a_joint_that_presses_on_something_and_gives_way_by_a_count_is_not_frozen():
+def test_joint_moving_by_a_count_is_not_frozen():
     sensors = Sensors()
     start = sensors.q.copy()
     for k in range(1000):
@@ -193,7 +193,7 @@ def test_a_joint_that_presses_on_something_and_gives_way_by_a_count_is_not_froze
         assert sensors.measure() == ""
 
 
-def test_gravity_of_joints_that_move_does_not_make_the_others_frozen():
+def test_gravity_of_moving_joints_freezes_no_other_joint():
     """The effort follows the gravity effort, which changes with the other joints' positions."""
     sensors = Sensors(model=Heavy())
     v = np.where(np.arange(N) < 3, 0.0, 0.5)
@@ -204,7 +204,7 @@ def test_gravity_of_joints_that_move_does_not_make_the_others_frozen():
 
 
 @pytest.mark.parametrize("joint", JOINTS)
-def test_a_motion_that_does_not_follow_from_the_effort_is_found(joint):
+def test_motion_inconsistent_with_effort_is_found(joint):
     """Unit inertia: an effort of its limit that accelerates the joint the other way, as with an inverted encoder."""
     strong = SETTINGS.hand_effort < 0.1 * LIMIT[joint]  # what a hand can do hides it on the others
     for sign, found in ((1, False), (-1, strong)):
@@ -219,7 +219,7 @@ def test_a_motion_that_does_not_follow_from_the_effort_is_found(joint):
         assert sensors.checks.invalid[joint] == found
 
 
-def test_the_mass_matrix_is_that_of_the_last_50_ms():
+def test_mass_matrix_is_updated_every_50_ms():
     model = Unity()
     poses = []
     model.mass_matrix = lambda q: (poses.append(q), np.eye(N))[1]
@@ -227,7 +227,7 @@ def test_the_mass_matrix_is_that_of_the_last_50_ms():
     assert 15 <= len(poses) <= 25
 
 
-def test_an_error_of_the_model_that_grows_slowly_is_accepted():
+def test_slowly_growing_model_error_is_accepted():
     sensors = Sensors()
     v = COUNTS / MS  # a count at each tick, so that nothing looks frozen
     for k in range(2000):
@@ -237,7 +237,7 @@ def test_an_error_of_the_model_that_grows_slowly_is_accepted():
 
 @pytest.mark.parametrize("joint", JOINTS)
 @pytest.mark.parametrize("measured", [0.0, -0.5])
-def test_a_commanded_effort_that_does_not_show_is_a_fault_of_the_effort(joint, measured):
+def test_missing_measured_effort_is_found(joint, measured):
     for commanded, found in ((0.29, False), (0.31, True), (-0.31, True)):
         sensors = Sensors()
         sensors.commanded = unit(joint, commanded * LIMIT[joint])
@@ -250,7 +250,7 @@ def test_a_commanded_effort_that_does_not_show_is_a_fault_of_the_effort(joint, m
             assert MS * ticks == pytest.approx(SETTINGS.silent_time, abs=1.5 * MS)
 
 
-def test_an_effort_that_is_not_commanded_need_not_show():
+def test_effort_in_hold_is_not_compared():
     """In HOLD nothing is commanded by the guard; the time begins anew after it."""
     sensors = Sensors()
     for _ in range(10):
@@ -260,7 +260,7 @@ def test_an_effort_that_is_not_commanded_need_not_show():
         assert sensors.move(np.zeros(N), ticks=1)[0] == ""
 
 
-def test_gravity_that_the_motors_bear_is_no_unexplained_effort():
+def test_compensated_gravity_is_not_unexplained():
     model = Weightless()
     model.gravity_effort = lambda q: 3 * LIMIT * np.sin(10 * q)
     for sign, found in ((1.0, False), (-1.0, True)):
@@ -274,7 +274,7 @@ def test_gravity_that_the_motors_bear_is_no_unexplained_effort():
         assert ("does not follow" in fault) == found
 
 
-def test_an_arm_without_encoder_counts_has_the_tolerance_alone():
+def test_arm_without_encoder_counts_uses_tolerance_only():
     exact = dataclasses.replace(ARM, effects=ARM.effects.without("encoder"))
     for factor, found in ((0.99, False), (1.01, True)):
         sensors = Sensors(exact)
@@ -282,7 +282,7 @@ def test_an_arm_without_encoder_counts_has_the_tolerance_alone():
         assert ("jumps" in sensors.measure()) == found
 
 
-def test_an_effort_that_follows_late_is_shown():
+def test_delayed_measured_effort_is_plausible():
     sensors = Sensors()
     for k in range(500):
         sensors.commanded = 0.9 * LIMIT * np.sin(0.02 * k)
@@ -290,7 +290,7 @@ def test_an_effort_that_follows_late_is_shown():
         assert sensors.move(COUNTS / MS)[0] == ""
 
 
-def test_prismatic_joints_have_a_tenth_of_the_tolerance():
+def test_prismatic_joints_use_a_tenth_of_the_tolerance():
     checks = Sensors(PSM)
     checks.q = checks.q + 0.0012 * np.eye(7)[2]
     assert checks.measure() == f"{PSM.joint_names[2]}: the position jumps"
@@ -301,7 +301,7 @@ def test_prismatic_joints_have_a_tenth_of_the_tolerance():
 
 @pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])
 @pytest.mark.parametrize("joint", JOINTS)
-def test_a_joint_without_a_valid_position_keeps_its_gravity_effort_and_the_others_are_held(mode, joint):
+def test_invalid_joint_gets_gravity_effort_others_are_held(mode, joint):
     bench = Bench(model=Heavy(), checks=True).at_rest()
     bench.run(mode, 300)
     bench.q = Q + unit(joint, 0.3)
@@ -331,7 +331,7 @@ def test_a_joint_without_a_valid_position_keeps_its_gravity_effort_and_the_other
 @pytest.mark.parametrize(
     ("name", "file"), [("mtml", "mtm_one.csv"), ("psm", "psm_one.csv"), ("psm", "psm_one_205g_insertion.csv")]
 )
-def test_nothing_is_found_in_the_motions_of_real_arms(shared_data, name, file):
+def test_no_false_alarms_on_recordings_of_real_arms(shared_data, name, file):
     """With the nominal model, at 200 Hz: also where it is wrong and rows are late, no check finds anything."""
     arm = load_arm(name)
     recording = read_recording(shared_data / "trajectories" / file, arm).in_joint_coordinates(arm)
@@ -345,7 +345,7 @@ def test_nothing_is_found_in_the_motions_of_real_arms(shared_data, name, file):
             assert checks.check(dt, q, v, effort, None) == "", recording.where(row)
 
 
-def test_an_arm_that_was_moved_while_nothing_was_measured_is_where_it_is_found():
+def test_motion_during_a_gap_is_accepted():
     for gap, fault in ((50, Status.FAULT_IMPLAUSIBLE), (150, Status.FAULT_NONE)):
         bench = Bench(checks=True)
         bench.tick(10)
@@ -355,7 +355,7 @@ def test_an_arm_that_was_moved_while_nothing_was_measured_is_where_it_is_found()
         assert bench.guard.fault_code == fault
 
 
-def test_a_reset_takes_the_position_as_valid_again():
+def test_reset_marks_position_as_valid():
     bench = Bench(model=Heavy(), checks=True).at_rest()
     bench.q = Q + unit(3, 0.3)
     assert bench.tick().control_mode == Command.EFFORT
@@ -369,7 +369,7 @@ def test_a_reset_takes_the_position_as_valid_again():
     np.testing.assert_array_equal(bench.tick().joint_flags & Status.FLAG_IMPLAUSIBLE != 0, unit(0).astype(bool))
 
 
-def test_a_second_joint_that_fails_in_a_fault_has_no_feedback_either():
+def test_second_invalid_joint_gets_no_feedback():
     bench = Bench(model=Heavy(), checks=True).at_rest()
     for joint, flags in ((2, [2]), (5, [2, 5])):
         bench.q = bench.q + unit(joint, 0.3)
@@ -380,7 +380,7 @@ def test_a_second_joint_that_fails_in_a_fault_has_no_feedback_either():
         bench.tick(50)
 
 
-def test_an_arm_without_power_is_not_checked():
+def test_arm_without_power_is_not_checked():
     bench = Bench(checks=True, modes=(Command.OFF,))
     bench.run(Command.HOLD, 1)
     bench.run(Command.OFF, 1)
@@ -392,7 +392,7 @@ def test_an_arm_without_power_is_not_checked():
     assert bench.guard.fault_code == Status.FAULT_NONE
 
 
-def test_an_effort_that_the_coupled_actuators_do_not_have_is_not_missed():
+def test_saturated_coupled_actuators_are_plausible():
     """All of the elbow's effort turns the shoulder's actuator as well, which saturates: tau_2 = 1.464 - 1.753."""
     sensors = Sensors()
     sensors.commanded = np.array([0.0, 0.35, -1.0, 0.0, 0.0, 0.0, 0.0]) * LIMIT

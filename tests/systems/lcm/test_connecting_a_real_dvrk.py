@@ -136,12 +136,12 @@ class Scene:
 
 
 @pytest.mark.parametrize("message", [Command, Status])
-def test_every_field_is_on_the_page(message):
+def test_page_documents_every_field(message):
     text = DOCUMENT.read_text(encoding="utf-8")
     assert not [name for name in message.__slots__ if f"`{name}`" not in text]
 
 
-def test_efforts_act_after_the_start_guard_and_a_dead_controller_is_followed_by_a_hold():
+def test_efforts_act_and_end_in_hold_without_controller():
     scene = Scene(lambda scene, k: k < 400 and scene.send(Command.EFFORT), 500).run()
     assert scene.topics(0, 250) == {"servo_jp"}
     assert scene.topics(260, 445) == {"servo_jf"}
@@ -154,7 +154,7 @@ def test_efforts_act_after_the_start_guard_and_a_dead_controller_is_followed_by_
     np.testing.assert_allclose(scene.statuses[400].effort_commanded, HELD, atol=1e-12)
 
 
-def test_a_measurement_that_stops_ends_efforts():
+def test_missing_measurements_end_efforts():
     def script(scene, k):
         scene.send(Command.EFFORT)
         scene.crtk.age = max(0, k - 300) * 1e-3
@@ -169,7 +169,7 @@ def test_a_measurement_that_stops_ends_efforts():
     assert len({status.utime for status in scene.statuses[300:]}) == 1
 
 
-def test_a_measurement_that_is_told_twice_has_one_time_however_long_the_bridge_computes():
+def test_repeated_measurement_keeps_its_time():
     """A state at 500 Hz in a loop at 1 kHz that takes a while: as one measurement, it is recorded once."""
 
     def script(scene, k):
@@ -184,7 +184,7 @@ def test_a_measurement_that_is_told_twice_has_one_time_however_long_the_bridge_c
     assert len(set(utimes)) == 50
 
 
-def test_an_arm_that_is_switched_off_is_sent_no_pose_and_held_where_it_fell():
+def test_arm_after_off_is_held_at_measured_pose():
     def script(scene, k):
         crtk = scene.crtk
         if k == 300:
@@ -214,7 +214,7 @@ def test_off_is_not_accepted():
     assert scene.statuses[-1].refusal_code == Status.REFUSAL_BAD_MODE
 
 
-def test_off_disables_the_arm_of_a_bridge_that_accepts_it():
+def test_off_disables_arm_if_bridge_accepts_it():
     scene = Scene(lambda scene, k: scene.send(Command.OFF if k >= 300 else Command.HOLD), 320)
     scene.modes = (Command.POSITION, Command.EFFORT, Command.OFF)
     scene.run()
@@ -237,7 +237,7 @@ def test_a_second_controller_is_ignored_and_counted():
     assert (last.num_refused, last.fault_code, last.command_sender_id) == (0, Status.FAULT_NONE, 3)
 
 
-def test_a_bridge_with_a_key_takes_signed_commands_only_and_signs_its_statuses():
+def test_bridge_with_key_verifies_and_signs():
     key = MessageKey(bytes(range(32)))
 
     def script(scene, k):
@@ -258,7 +258,7 @@ def test_a_bridge_with_a_key_takes_signed_commands_only_and_signs_its_statuses()
     assert {status.mac_size for status in scene.statuses} == {16}
 
 
-def test_a_tenth_of_the_limits_as_the_checklist_has_it():
+def test_tenth_of_the_limits_of_the_checklist():
     (text,) = set(re.findall(r"`(GuardSettings\(.*?\))`", DOCUMENT.read_text(encoding="utf-8")))
     settings = eval(text)
     scene = Scene(lambda scene, k: scene.send(Command.EFFORT, effort=list(HELD if k < 300 else ARM.effort_limits)), 600)

@@ -21,7 +21,7 @@ from dvrk_drake.systems.lcm.dvrk_status import DvrkStatusReceiver
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_a_controller_starts_acts_and_is_replaced_by_a_hold(name):
+def test_controller_starts_acts_and_hold_follows(name):
     lcm = DrakeLcm("memq://")
     arm, controller = SimulatedArm(lcm, name), Controller(lcm, name)
     run(lcm, 300, arm, controller)
@@ -92,7 +92,7 @@ def test_of_two_controllers_the_first_stays_in_command():
     assert arm.drift() < 1e-3
 
 
-def test_own_gravity_compensation_makes_a_second_one_start_too_far():
+def test_second_gravity_compensation_is_refused_at_start():
     lcm = DrakeLcm("memq://")
     driver = DvrkDriver(gravity_compensation=True)
     arm, controller = SimulatedArm(lcm, driver=driver), Controller(lcm)
@@ -102,7 +102,7 @@ def test_own_gravity_compensation_makes_a_second_one_start_too_far():
     assert (status.guard_state, status.refusal_code) == (Status.STATE_HOLD, Status.REFUSAL_START_FAR)
 
 
-def test_own_gravity_compensation_carries_an_arm_that_is_commanded_no_effort():
+def test_own_gravity_compensation_with_zero_command():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, driver=DvrkDriver(gravity_compensation=True))
     sender = Sending(lcm, effort=np.zeros(7))
@@ -138,7 +138,7 @@ def test_a_fault_is_reset_through_the_sender():
     assert arm.statuses[-1].guard_state == Status.STATE_HOLD
 
 
-def test_off_lets_the_arm_fall_if_its_driver_accepts_it():
+def test_arm_falls_in_off_if_driver_accepts_it():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, driver=DvrkDriver(control_modes=["off"]))
     sender = Sending(lcm, control_mode=[float(Command.HOLD)])
@@ -150,7 +150,7 @@ def test_off_lets_the_arm_fall_if_its_driver_accepts_it():
     assert arm.drift() > 0.01
 
 
-def test_after_off_efforts_are_refused_only_while_the_arm_is_braked():
+def test_efforts_after_off_are_refused_while_braking():
     lcm = DrakeLcm("memq://")
     driver = DvrkDriver(control_modes=["effort", "off"], guard=GuardSettings(start_time=0.05))
     arm = SimulatedArm(lcm, driver=driver)
@@ -174,7 +174,7 @@ def test_after_off_efforts_are_refused_only_while_the_arm_is_braked():
     assert shares[refused].min() > 0.09 and shares[~refused].max() < 0.11
 
 
-def test_the_sender_asks_for_a_hold_unless_it_is_given_finite_numbers():
+def test_sender_commands_hold_without_finite_numbers():
     lcm = DrakeLcm("memq://")
     effort, q_v = np.arange(7.0), np.arange(14.0)
     cases = [
@@ -209,7 +209,7 @@ def full_status(arm_name="MTML", n=7, utime=1):
     return status
 
 
-def test_the_status_receiver_knows_nothing_before_the_first_status_and_ignores_what_is_not_of_its_arm():
+def test_status_receiver_outputs_nan_without_valid_status():
     lcm = DrakeLcm("memq://")
     builder = DiagramBuilder()
     statuses = StatusFilter("MTML", 7)
@@ -237,7 +237,7 @@ def test_the_status_receiver_knows_nothing_before_the_first_status_and_ignores_w
         assert after(bad) == good
 
 
-def test_the_hardware_station_ignores_statuses_of_the_past():
+def test_hardware_station_ignores_old_statuses():
     lcm = DrakeLcm("memq://")
     arm, controller = SimulatedArm(lcm), Controller(lcm)
     old = []
@@ -257,7 +257,7 @@ def test_the_hardware_station_ignores_statuses_of_the_past():
         np.testing.assert_allclose(q, POSES["mtml"], atol=1e-3)
 
 
-def test_each_context_has_a_guard_of_its_own():
+def test_each_context_has_its_own_guard():
     lcm = DrakeLcm("memq://")
     arm, controller = SimulatedArm(lcm), Controller(lcm)
     run(lcm, 300, arm, controller)
@@ -286,7 +286,7 @@ def test_driver_is_loaded_from_yaml_and_checked():
         type(driver.guard)(margin=float("nan"))
 
 
-def test_with_a_key_only_its_owners_talk_to_each_other(tmp_path):
+def test_messages_require_the_same_key(tmp_path):
     create_key_file(tmp_path / "a.key")
     lcm, driver = DrakeLcm("memq://"), DvrkDriver(key_file=str(tmp_path / "a.key"))
     arm, stranger = SimulatedArm(lcm, driver=driver), Controller(lcm)

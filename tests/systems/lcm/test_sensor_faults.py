@@ -28,7 +28,7 @@ def moving_arm():
     ("fault", "joint"),
     [("encoder stuck", ELBOW), ("position jumps", SHOULDER), ("velocity inverted", SHOULDER), ("not finite", ELBOW)],
 )
-def test_a_fault_of_a_large_joint_moves_it_by_less_than_50_mrad_until_it_is_detected(moving_arm, fault, joint):
+def test_large_joint_moves_below_50_mrad_before_detection(moving_arm, fault, joint):
     arm = moving_arm()
     outcome = arm.fail(fault, joint, at=2.6, seconds=0.5)
     assert outcome.before < 0.05
@@ -44,7 +44,7 @@ def test_a_jump_while_holding_is_a_fault(name):
     assert outcome.detected <= 2 * PERIOD and max(outcome.before, outcome.after) < 0.01
 
 
-def test_efforts_do_not_start_where_the_effort_sensor_reads_zero():
+def test_efforts_do_not_start_with_zero_effort_sensor():
     """The arm would drop: efforts begin at the measured one, and here a joint bears a quarter of its limit."""
     poses = load_arm("mtml").sample_poses(200, np.random.default_rng(0), margin=0.1)
     model = IdentifiedModel.from_arm(load_arm("mtml"))
@@ -74,7 +74,7 @@ def run_until_fault(arm, seconds):
     return None
 
 
-def test_a_controller_without_damping_is_stopped():
+def test_controller_without_damping_is_stopped():
     """The wrist roll with kd = 0 and ten times ki, which swings ever wider."""
     arm = FaultyArm("mtml", "effort", effects=False)
     gains = arm.arm.gains
@@ -89,7 +89,7 @@ def test_a_controller_without_damping_is_stopped():
 
 
 @pytest.mark.parametrize("frequency", [3.0, 25.0])
-def test_efforts_that_jump_between_the_limits_are_stopped(frequency):
+def test_efforts_jumping_between_limits_are_stopped(frequency):
     """Commands between -1 and 1 of a limit, around the gravity effort, from a controller that is out of its mind."""
     arm = FaultyArm("mtml", "gravity")
     answer = arm.controller.answer

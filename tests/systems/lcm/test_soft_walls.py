@@ -12,7 +12,7 @@ from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_a_feed_forward_velocity_pushes_no_joint_beyond_its_limit(name):
+def test_feedforward_velocity_keeps_joints_inside_limits(name):
     """Positions that stand just inside the limits, with velocities that lead outward; no stop of the plant helps."""
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
@@ -32,7 +32,7 @@ def test_a_feed_forward_velocity_pushes_no_joint_beyond_its_limit(name):
     assert arm.statuses[-1].guard_state == Status.STATE_POSITION
 
 
-def test_an_effort_and_the_arms_own_gravity_compensation_stay_inside_the_limits_together():
+def test_effort_plus_gravity_compensation_stays_limited():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, driver=DvrkDriver(gravity_compensation=True))
     sender = Sending(lcm, effort=np.zeros(7))
@@ -64,7 +64,7 @@ def pushed(name, push, seconds):
 
 @pytest.mark.parametrize(("name", "row"), [("mtml", k) for k in range(8)] + [("psm", k) for k in range(7)])
 @pytest.mark.parametrize("side", [-1, 1])
-def test_all_the_effort_that_motors_have_pushes_no_joint_beyond_its_limit(name, row, side):
+def test_full_motor_effort_keeps_joints_inside_limits(name, row, side):
     # Neither friction nor damping nor a stop of the plant helps: the soft wall does it alone.
     arm = load_arm(name)
     push = side * np.sign(arm.limit_matrix()[0][row]) * arm.effort_limits
@@ -74,7 +74,7 @@ def test_all_the_effort_that_motors_have_pushes_no_joint_beyond_its_limit(name, 
 
 
 @pytest.mark.parametrize(("name", "joint"), [("mtml", 3), ("mtml", 5), ("mtml", 6), ("psm", 3), ("psm", 4), ("psm", 6)])
-def test_a_wrist_that_leans_on_a_soft_wall_comes_to_rest(name, joint):
+def test_wrist_on_soft_wall_comes_to_rest(name, joint):
     """The light joints, on which a wall that is too stiff for a period of delay makes the motors hammer."""
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
@@ -93,7 +93,7 @@ def test_a_wrist_that_leans_on_a_soft_wall_comes_to_rest(name, joint):
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_a_limp_arm_falls_into_the_soft_wall(name):
+def test_unpowered_arm_falls_into_soft_wall(name):
     worst, status = pushed(name, np.zeros(7), 2.0)
     assert worst < 0.5
     assert status.guard_state == Status.STATE_EFFORT
