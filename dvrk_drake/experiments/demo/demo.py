@@ -1,4 +1,4 @@
-"""Complete workflow on a simulated arm: collect, identify, validate, release, hold. Writes all results to one folder."""
+"""Complete workflow on a simulated arm: collect, identify, validate, release, hold. Writes results to one folder."""
 
 from __future__ import annotations
 

@@ -223,9 +223,7 @@ class _SpawningExecutor(ProcessPoolExecutor):
     """Process pool whose workers ignore Ctrl-C. The parent process ends them, so they print no tracebacks."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        before = signal.pthread_sigmask(
-            signal.SIG_BLOCK, {signal.SIGINT}
-        )  # a process inherits the signal mask of its parent
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit the signal mask
         try:
             return super().submit(fn, *args, **kwargs)
         finally:

@@ -31,7 +31,7 @@ RESERVED = ("study", "case", "variation", "pose", "seed", "error")
 
 @dataclass
 class RandomPoses:
-    """Number `count` of random poses, uniform in the joint box and inside the coupled limits; see `Arm.sample_poses`."""
+    """Number `count` of random poses, uniform in the joint box and inside the coupled limits (`Arm.sample_poses`)."""
 
     count: int = field(default=0, metadata=within(1, 10**6))
     seed: int = field(default=0, metadata=within(0, 2**63 - 1))

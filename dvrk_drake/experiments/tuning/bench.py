@@ -223,7 +223,7 @@ def bench_of(arm: str, condition: Condition = NOMINAL) -> Bench:
 
 
 class JointOnBench:
-    """Implementation of `procedure.JointUnderTest` that releases the joint at `step` from the middle pose of the arm."""
+    """Implementation of `procedure.JointUnderTest` that releases the joint at `step` from the middle pose."""
 
     def __init__(self, bench: Bench, joint: int) -> None:
         """Selects the joint with this index. The other joints are held with the arm's own gains."""
