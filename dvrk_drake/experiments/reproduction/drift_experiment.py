@@ -44,7 +44,7 @@ class Release:
         parts: Simulated effects of the ground-truth arm, as for `ArmEffects.only`.
         model: File of the controller's model.
         start: Release pose (n,) [rad, m], at rest with unloaded friction.
-        led: Whether the arm first approaches the pose from a distance of `APPROACH` and rests, which loads its friction.
+        led: Whether the arm first approaches the pose from a distance of `APPROACH`, which loads its friction.
         damped: Whether the controller damps the motion in addition to compensating gravity (mode "damped").
         hysteresis_ratio: Compensated share of the hysteresis that moves an arm back after an approach.
         duration: Duration [s].

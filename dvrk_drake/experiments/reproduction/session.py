@@ -177,9 +177,9 @@ class Lead:
 
 
 def led(lead: Lead) -> OperatorForces:
-    """What the hand feels along a path through random poses."""
+    """Simulates the interaction forces along a path through random poses."""
     model = IdentifiedModel.load(lead.model) if lead.model else None
-    # Which friction there is, a controller knows from the same files as the arm; its weight it has to identify.
+    # The controller uses the friction of the arm files, but an identified gravity model.
     friction = Friction.of_arm(load_arm(PAPER_ARM))
     compensation = Compensation(lead.name, model, lead.friction_ratio, friction)
     path = random_path(lead.arm, lead.poses, seed=lead.seed)
