@@ -56,7 +56,7 @@ ARM = load_arm(PAPER_ARM)
 # Table I.
 
 
-def test_table_1_of_the_plant_is_the_papers():
+def test_dh_table_of_plant_matches_paper():
     table, worst = recomputed_table(ARM)
     expected = np.array([published_row(row) for row in published.TABLE_1])
     assert worst < 1e-12
@@ -68,14 +68,14 @@ def test_table_1_of_the_plant_is_the_papers():
 
 
 @pytest.mark.parametrize("parameters", [published.PARAMETERS, tuple(np.linspace(-1, 2, 12))])
-def test_torque_of_the_papers_parameters_is_that_of_its_regressor(parameters):
+def test_paper_torque_matches_its_regressor(parameters):
     q = ARM.sample_poses(30, np.random.default_rng(2))
     expected = [published.CONTROLLED_WITH * paper_regressor(pose) @ parameters for pose in q]
     np.testing.assert_allclose(paper_torque(ARM, q, parameters), expected, atol=1e-11)
 
 
 @pytest.mark.slow
-def test_the_papers_model_in_our_parameters_is_the_same_and_can_be_zeroed():
+def test_paper_model_in_base_parameters_and_zeroed():
     q = ARM.sample_poses(30, np.random.default_rng(3))
     model = paper_model(ARM)
     np.testing.assert_allclose(model.holding_torque(q), paper_torque(ARM, q), atol=1e-12)
@@ -84,7 +84,7 @@ def test_the_papers_model_in_our_parameters_is_the_same_and_can_be_zeroed():
     np.testing.assert_allclose(zeroed[:, :4], model.holding_torque(q)[:, :4], atol=1e-12)
 
 
-def test_published_parameters_are_least_squares_with_the_g_that_the_paper_used(shared_data):
+def test_published_parameters_are_least_squares_solution(shared_data):
     recording = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
     Y = published.IDENTIFIED_WITH * np.array([paper_regressor(pose) for pose in recording.q])
     fitted = np.linalg.lstsq(Y.reshape(-1, 12), recording.measured_effort().ravel(), rcond=None)[0]
@@ -96,7 +96,7 @@ def test_published_parameters_are_least_squares_with_the_g_that_the_paper_used(s
 # What is published.
 
 
-def test_published_means_are_those_of_the_data(shared_data):
+def test_published_means_match_data(shared_data):
     figure_4 = PaperRecordings.find(shared_data / "mtm_static").figure_4
     np.testing.assert_allclose(published.FIGURE_4_MEANS, figure_4.mean(axis=0), rtol=3e-3, atol=0)  # three digits
     with open(shared_data / "mtm_static/paper_fig5_fig6_drift_trials.csv") as stream:
@@ -119,7 +119,7 @@ def no_recordings(monkeypatch):
     monkeypatch.delenv("DVRK_DRAKE_SHARED", raising=False)
 
 
-def test_figure_4_without_its_recording_is_refused_in_one_line(no_recordings, tmp_path, capsys):
+def test_figure_4_without_recording_gives_one_line_error(no_recordings, tmp_path, capsys):
     output = tmp_path / "out"
     assert main(["reproduce", "fig4", "--folder", str(output)]) == 2
     error = refusal(capsys.readouterr().err)
@@ -128,7 +128,7 @@ def test_figure_4_without_its_recording_is_refused_in_one_line(no_recordings, tm
     assert not output.exists()
 
 
-def test_a_folder_without_the_recording_is_refused(no_recordings, tmp_path, capsys):
+def test_rejects_folder_without_recording(no_recordings, tmp_path, capsys):
     assert main(["reproduce", "all", "--data", str(tmp_path), "--folder", str(tmp_path / "out")]) == 2
     assert str(tmp_path) in capsys.readouterr().err
     assert PaperRecordings.find(None).folder is None
@@ -136,12 +136,12 @@ def test_a_folder_without_the_recording_is_refused(no_recordings, tmp_path, caps
         _ = PaperRecordings.find(None).poses
 
 
-def test_the_recordings_are_found_where_the_tests_find_theirs(monkeypatch, shared_data):
+def test_finds_recordings_by_environment_variable(monkeypatch, shared_data):
     monkeypatch.setenv("DVRK_DRAKE_SHARED", str(shared_data.parent))
     assert len(PaperRecordings.find(None).poses) == 72
 
 
-def test_unknown_figures_are_refused(tmp_path):
+def test_rejects_unknown_figures(tmp_path):
     with pytest.raises(DvrkDrakeError, match="fig9"):
         reproduce(["fig9"], tmp_path, PaperRecordings(None))
     assert get_args(get_type_hints(command)["what"]) == (*NAMES, "all")
@@ -169,7 +169,7 @@ def test_table_1_alone_is_a_page(no_recordings, tmp_path):
     assert (tmp_path / "table1.csv").stat().st_size > 0
 
 
-def test_what_is_finished_is_written_though_the_rest_fails(no_recordings, monkeypatch, tmp_path):
+def test_finished_figures_are_written_if_others_fail(no_recordings, monkeypatch, tmp_path):
     def fails(session):
         raise KeyboardInterrupt
 
@@ -180,7 +180,7 @@ def test_what_is_finished_is_written_though_the_rest_fails(no_recordings, monkey
     assert "L3 = 0.3645 | 0.3645" in page and "fig7 was not finished" in page
 
 
-def test_shares_have_wilsons_interval():
+def test_shares_have_wilson_interval():
     # E. B. Wilson, 1927: (p + z^2/2n +- z sqrt(p(1-p)/n + z^2/4n^2)) / (1 + z^2/n), z = 1.96.
     z, n = 1.959963984540054, 200
     p = 190 / n
@@ -189,7 +189,7 @@ def test_shares_have_wilsons_interval():
     assert share(190, 200) == f"190 of 200 (95.0 %, 95 % interval {low:.1f}..{high:.1f} %)"
 
 
-def test_a_joint_is_held_if_it_never_left():
+def test_joint_is_held_if_it_never_leaves_band():
     positions = np.zeros((3, 5, 7))
     positions[0, 2, 4] = 0.0151  # there and back
     positions[1, -1, 4] = -0.0149
@@ -213,7 +213,7 @@ def truth(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_what_is_known_exactly_is_held_and_what_is_not_falls(truth, tmp_path):
+def test_exact_model_holds_arm_and_nominal_model_does_not(truth, tmp_path):
     exact, nothing = tmp_path / "exact.yaml", tmp_path / "nothing.yaml"
     truth.model.save(exact)
     with_zeroed(truth.model, range(7)).save(nothing)
@@ -229,7 +229,7 @@ def test_what_is_known_exactly_is_held_and_what_is_not_falls(truth, tmp_path):
 
 
 @pytest.mark.slow
-def test_true_arm_is_what_its_model_says(truth):
+def test_ground_truth_arm_matches_its_model(truth):
     q = ARM.sample_poses(20, np.random.default_rng(7))
     effects = truth.model.holding_torque(q) - IdentifiedModel.from_arm(truth.arm).holding_torque(q)
     assert np.abs(effects[:, 3]).max() > 0.01  # cables
@@ -237,7 +237,7 @@ def test_true_arm_is_what_its_model_says(truth):
     assert np.abs(truth.model.holding_torque(q) - effects - drawn).max() > 0.02  # not the drawing
 
 
-def test_positions_in_the_damping_term_leave_a_joint_undamped(tmp_path):
+def test_positions_in_damping_term_leave_joint_undamped(tmp_path):
     arm = paper_simulated_arm(ARM, tmp_path / "paper.sdf")
     (faulty, shapes), (right, _) = swings(arm, faulty=True), swings(arm, faulty=False)
     undamped = np.flatnonzero(np.abs(faulty.real) < 1e-9)
@@ -248,7 +248,7 @@ def test_positions_in_the_damping_term_leave_a_joint_undamped(tmp_path):
     assert slowest_swing(arm) == pytest.approx(published.FIGURE_7_READ["J2 period"], rel=0.25)
 
 
-def test_the_papers_controller_pulls_to_zero_on_its_arm(tmp_path):
+def test_paper_controller_moves_its_arm_to_zero(tmp_path):
     arm = paper_simulated_arm(ARM, tmp_path / "paper.sdf")
     q = simulate_paper_controller(arm, 0.1, faulty=True)
     assert q.shape == (round(0.1 / PERIOD) + 1, 7)
@@ -266,14 +266,14 @@ def test_the_papers_controller_pulls_to_zero_on_its_arm(tmp_path):
     np.testing.assert_allclose(q[1] - q[0], moved, rtol=0.02, atol=1e-7)
 
 
-def test_psm_keeps_its_remote_centre_and_its_wrist_axes_apart():
+def test_psm_remote_centre_and_wrist_axes():
     remote, angle = mechanism_errors(load_arm("psm"))
     assert remote < 1e-9
     assert angle == pytest.approx(np.pi / 2, abs=1e-9)
 
 
 @pytest.mark.slow
-def test_a_led_arm_stays_if_its_wide_hysteresis_is_compensated(tmp_path):
+def test_hysteresis_compensation_holds_arm_after_approach(tmp_path):
     arm = load_arm(PAPER_ARM)
     truth, exact = GroundTruth(arm, IdentifiedModel.from_arm(arm), False, ""), tmp_path / "exact.yaml"
     truth.model.save(exact)
@@ -299,7 +299,7 @@ def exact_laboratory(truth, folder, executor, sample_sizes):
 
 
 @pytest.mark.slow
-def test_figure_5_writes_what_it_names_and_holds_with_an_exact_model(truth, tmp_path):
+def test_figure_5_writes_files_and_exact_model_holds(truth, tmp_path):
     sample_sizes = SampleSizes(releases=3, paper_releases=2, hand_guided_releases=1, duration=1.0)
     with ThreadPoolExecutor(1) as executor:
         section = reproduce_figure_5(exact_laboratory(truth, tmp_path, executor, sample_sizes))
@@ -317,7 +317,7 @@ def test_figure_5_writes_what_it_names_and_holds_with_an_exact_model(truth, tmp_
 
 
 @pytest.mark.slow
-def test_the_hand_feels_less_with_each_compensation(truth, tmp_path):
+def test_compensation_reduces_operator_force(truth, tmp_path):
     with ThreadPoolExecutor(1) as executor:
         section = reproduce_transparency(exact_laboratory(truth, tmp_path, executor, SampleSizes(path_poses=2)))
     force = [float(row[1]) for row in section.tables[0].rows]

@@ -20,7 +20,7 @@ PSM = load_arm("psm")
 ZERO = "[0,0,0.1,0,0,0,0]"
 
 
-def test_reaches_its_targets_at_their_times_and_rests_there():
+def test_reaches_targets_on_time_and_rests():
     scenario = load_scenario(str(EXAMPLE), ["effort_noise=0"])
     simulation = simulate(scenario)
     recording = simulation.recording
@@ -41,7 +41,7 @@ def test_reaches_its_targets_at_their_times_and_rests_there():
 
 
 @pytest.mark.slow
-def test_the_led_handle_arrives_while_joint_4_sticks():
+def test_handle_reaches_goal_while_joint_4_sticks():
     """What examples/simulated_effects.yaml says of joint 4: the handle's pose is six numbers, and joints 6 and 7 do its part."""
     example = str(ROOT / "examples" / "simulated_effects.yaml")
     with_friction, without = (
@@ -65,7 +65,7 @@ def test_the_led_handle_arrives_while_joint_4_sticks():
     assert np.abs(with_friction - led)[4:].max() > 0.1
 
 
-def test_same_scenario_same_bytes_and_the_seed_is_of_the_noise(tmp_path):
+def test_scenario_is_deterministic_and_seed_changes_noise(tmp_path):
     files = []
     for i, seed in enumerate((1, 1, 2)):
         path = tmp_path / f"{i}.csv"
@@ -82,7 +82,7 @@ def test_same_scenario_same_bytes_and_the_seed_is_of_the_noise(tmp_path):
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
 @pytest.mark.parametrize("mode", ["hold", "gravity"])
-def test_every_arm_holds_where_it_starts(name, mode):
+def test_every_arm_holds_its_start_pose(name, mode):
     simulation = simulate(load_scenario(name, ["duration=0.5", f"controller.mode={mode}"]))
     q = simulation.recording.q
     arm = load_arm(name)
@@ -91,7 +91,7 @@ def test_every_arm_holds_where_it_starts(name, mode):
     assert (simulation.desired is None) == (mode == "gravity")
 
 
-def test_another_mounting_is_held_by_its_own_model_and_not_by_the_files(tmp_path):
+def test_mounting_requires_its_own_gravity_model(tmp_path):
     model = tmp_path / "upright.yaml"
     IdentifiedModel.from_arm(PSM).save(model)
     settings = ["duration=0.5", "controller.mode=gravity", "gravity=[0,-9.81,0]", f"start={ZERO}"]
@@ -103,7 +103,7 @@ def test_another_mounting_is_held_by_its_own_model_and_not_by_the_files(tmp_path
     assert moved[1] > 0.05
 
 
-def test_gains_of_the_scenario_are_used():
+def test_scenario_gains_are_used():
     limp = "controller.gains={kp: [0.02,0.02,0.5,0.01,0.01,0.01,0.01], kd: [0,0,0,0,0,0,0], ki: [0,0,0,0,0,0,0]}"
     target = "targets=[{time: 0.5, pose: [0.1,0,0.1,0,0,0,0]}]"
     moved = []
@@ -114,7 +114,7 @@ def test_gains_of_the_scenario_are_used():
     assert abs(moved[1]) < 0.02
 
 
-def test_a_recording_of_it_is_read_by_the_other_verbs(tmp_path, capsys, monkeypatch):
+def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")  # headings on one line
     model, recording, errors = (str(tmp_path / name) for name in ("model.yaml", "held.csv", "errors.json"))
     IdentifiedModel.from_arm(PSM).save(model)
@@ -184,14 +184,14 @@ def test_a_recording_of_it_is_read_by_the_other_verbs(tmp_path, capsys, monkeypa
         ("start=[0,", "--set start=[0,: not YAML"),
     ],
 )
-def test_nonsense_is_refused_in_one_line(setting, message, capsys, tmp_path):
+def test_invalid_settings_give_one_line_error(setting, message, capsys, tmp_path):
     output = tmp_path / "out.csv"
     assert main(["simulate", "--arm", "psm", "--set", setting, "--output", str(output)]) == 2
     assert message in refusal(capsys.readouterr().err)
     assert not output.exists()
 
 
-def test_files_that_are_no_scenarios_are_refused(tmp_path):
+def test_rejects_files_that_are_not_scenarios(tmp_path):
     path = tmp_path / "scenario.yaml"
     with pytest.raises(ScenarioError, match="no such file"):
         load_scenario(str(path))
@@ -205,7 +205,7 @@ def test_files_that_are_no_scenarios_are_refused(tmp_path):
             load_scenario(str(path))
 
 
-def test_an_arm_can_be_a_file(tmp_path):
+def test_arm_from_file(tmp_path):
     path = tmp_path / "ours.yaml"
     path.write_text((MODELS_FOLDER / "arms/mtml.yaml").read_text().replace("name: MTML", "name: OURS"))
     scenario = load_scenario(str(path), ["duration=0.02"])
@@ -213,14 +213,14 @@ def test_an_arm_can_be_a_file(tmp_path):
     assert main(["simulate", "--arm", str(path), "--set", "duration=0.02"]) == 0
 
 
-def test_an_unknown_instrument_is_named(tmp_path):
+def test_error_names_unknown_instrument(tmp_path):
     arm, scenario = tmp_path / "psm9.yaml", tmp_path / "scenario.yaml"
     arm.write_text("name: PSM9\nmechanism: psm\ninstrument: scissors\nposition_limits: {}\n")
     scenario.write_text(f"arm: {arm}\n")
     assert main(["simulate", str(scenario)]) == 2
 
 
-def test_targets_need_a_controller_that_follows_them():
+def test_targets_need_mode_hold():
     scenario = Scenario(arm="psm", targets=[Target(1.0, [0, 0, 0.1, 0, 0, 0, 0])])
     scenario.check()
     scenario.controller.mode = "gravity"

@@ -24,13 +24,13 @@ def resting(seconds):
     return PiecewisePolynomial.ZeroOrderHold([0.0, seconds], np.array([REST, REST]).T)
 
 
-def test_a_hand_that_holds_a_compensated_arm_still_feels_nothing():
+def test_no_force_on_hand_holding_compensated_arm():
     forces = simulate_operator(ARM, resting(1.5), Compensation("gravity", MODEL))
     assert forces.rms_force < 1e-6 and forces.rms_torque < 1e-6
     assert forces.deviation.max() < 1e-6
 
 
-def test_a_hand_that_holds_a_limp_arm_still_does_the_work_of_lifting_it():
+def test_hand_carries_weight_of_unpowered_arm():
     """At rest J' F = holding torque: where the arm came to rest in the hand's grip."""
     forces = simulate_operator(ARM, resting(3.0), Compensation("nothing"))
     assert forces.rms_force > 1.0
@@ -42,7 +42,7 @@ def test_a_hand_that_holds_a_limp_arm_still_does_the_work_of_lifting_it():
 
 
 @pytest.mark.slow
-def test_each_compensation_takes_more_off_the_hand():
+def test_each_compensation_reduces_operator_force():
     path = random_path(ARM, poses=3)
     friction = ARM.effects.only(["friction", "encoder", "delay"])
     listed = [Compensation("nothing"), Compensation("gravity", MODEL), Compensation("friction", MODEL, 0.6)]
@@ -52,7 +52,7 @@ def test_each_compensation_takes_more_off_the_hand():
     assert gravity.rms_torque > both.rms_torque
 
 
-def test_the_path_of_a_recording_keeps_inside_the_limits_and_has_its_speed():
+def test_recorded_path_respects_limits_and_speed():
     t = np.linspace(3.0, 5.0, 50)
     middle, half = (ARM.position_upper + ARM.position_lower) / 2, (ARM.position_upper - ARM.position_lower) / 2
     middle[1:3], half[1:3] = 0.1, 0.0  # within what the parallelogram allows
@@ -77,7 +77,7 @@ def test_the_path_of_a_recording_keeps_inside_the_limits_and_has_its_speed():
     np.testing.assert_allclose(recorded_path(ARM, moved, 0.5).value(2.0), path.value(2.0), atol=1e-12)
 
 
-def test_a_psm_is_led_at_its_instrument():
+def test_psm_is_moved_at_its_instrument():
     psm = load_arm("psm")
     assert (handle_frame(ARM), handle_frame(psm)) == ("dh_7", "dh_6")
     pose = np.clip(0.1, psm.position_lower, psm.position_upper)
@@ -88,7 +88,7 @@ def test_a_psm_is_led_at_its_instrument():
     assert simulate_operator(psm, path, Compensation("nothing")).rms_force > 0.5
 
 
-def test_the_verb_writes_its_table(tmp_path, capsys, monkeypatch):
+def test_command_writes_table(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("dvrk_drake.experiments.transparency.random_path", lambda arm: resting(1.2))
     model, table = tmp_path / "ours.yaml", tmp_path / "table.csv"
     MODEL.save(model)
@@ -113,6 +113,6 @@ def test_the_verb_writes_its_table(tmp_path, capsys, monkeypatch):
         (["--path", "nowhere.csv"], "nowhere.csv"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(arguments, said, capsys):
+def test_bad_input_gives_one_line_and_exit_code_2(arguments, said, capsys):
     assert main(["transparency", "--arm", "mtml", *arguments]) == 2
     assert said in refusal(capsys.readouterr().err)

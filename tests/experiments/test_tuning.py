@@ -77,7 +77,7 @@ def analytic_ultimate(M, b, lag):
 
 
 @pytest.mark.parametrize(("M", "b", "ticks"), [(0.1, 0.08, 2), (0.1, 0.3, 2), (0.02, 0.08, 3), (0.3, 0.15, 1)])
-def test_ultimate_gain_and_period_are_the_analytic_ones(M, b, ticks):
+def test_ultimate_gain_and_period_match_analytic_values(M, b, ticks):
     sampling = Sampling(ticks=ticks)
     gain, period = analytic_ultimate(M, b, (ticks + 0.5) * sampling.period)
     found = find_ultimate_gain(LinearJoint(M, sampling, b))
@@ -87,7 +87,7 @@ def test_ultimate_gain_and_period_are_the_analytic_ones(M, b, ticks):
     assert found.growth == pytest.approx(1.0, abs=0.01)
 
 
-def test_without_friction_every_gain_swings_up():
+def test_frictionless_joint_oscillates_with_every_gain():
     # A double integrator with delay has no stable proportional gain at all: what is found is the least one with which
     # a release is watched for the four swings, two periods, that it takes to tell.
     M = 0.05
@@ -96,13 +96,13 @@ def test_without_friction_every_gain_swings_up():
     )
 
 
-def test_a_joint_that_never_swings_is_said_to():
+def test_reports_joint_without_oscillation():
     found = find_ultimate_gain(LinearJoint(0.02, Sampling(), 50.0))
     assert not found.sustained
     assert found.gain == 20.0 * LinearJoint.effort_limit / LinearJoint.step
 
 
-def test_the_procedure_damps_a_linear_joint():
+def test_procedure_damps_linear_joint():
     sampling = Sampling()
     result = tune_joint(LinearJoint(0.1, sampling, 0.2))
     assert result.damped
@@ -114,7 +114,7 @@ def test_the_procedure_damps_a_linear_joint():
 
 
 @pytest.mark.parametrize("ratio", [0.02, 0.1, -0.05])
-def test_growth_and_period_of_a_known_oscillation(ratio):
+def test_growth_and_period_of_known_oscillation(ratio):
     w = 40.0
     t = 1e-3 * np.arange(1501)
     x = 0.3 + 0.05 * np.exp(-ratio * w * t) * np.cos(w * np.sqrt(1 - ratio**2) * t)
@@ -124,7 +124,7 @@ def test_growth_and_period_of_a_known_oscillation(ratio):
     assert found.sustained == (ratio < 0)
 
 
-def test_what_sticks_or_creeps_does_not_oscillate():
+def test_sticking_or_creeping_is_no_oscillation():
     t = 1e-3 * np.arange(1000)
     assert judge_oscillation(t, np.full(1000, 0.05), 1e-4).growth == 0.0
     assert judge_oscillation(t, 0.05 * np.exp(-5 * t), 1e-4).growth == 0.0
@@ -143,7 +143,7 @@ def poles(loop, gains, sampling):
 @pytest.mark.parametrize("viscous", [0.0, 0.5])
 @pytest.mark.parametrize("ratio", [0.5, 0.8, 1.0])
 @pytest.mark.parametrize("ticks", [1, 2, 3])
-def test_placed_gains_have_the_wanted_damping(ratio, ticks, viscous):
+def test_pole_placement_gives_desired_damping(ratio, ticks, viscous):
     sampling = Sampling(ticks=ticks)
     M = 0.2
     kp, kd = place(M, FAR_BELOW, ratio, sampling, viscous)
@@ -155,7 +155,7 @@ def test_placed_gains_have_the_wanted_damping(ratio, ticks, viscous):
     assert polynomial[1] / (2 * w) == pytest.approx(ratio, rel=0.04)
 
 
-def test_ignoring_the_lags_would_not():
+def test_pole_placement_without_lags_is_inaccurate():
     # So that the test above can fail: the textbook's kp = M w^2, kd = 2 z M w are off by more than it allows.
     sampling, M, z = Sampling(ticks=3), 0.2, 0.8
     slowest = poles(SampledLoop(M, sampling), single(M * FAR_BELOW**2, 2 * z * M * FAR_BELOW), sampling)
@@ -163,7 +163,7 @@ def test_ignoring_the_lags_would_not():
     assert abs(polynomial[1] / (2 * np.sqrt(polynomial[2])) / z - 1) > 0.08
 
 
-def test_margins_are_where_the_loop_becomes_unstable():
+def test_margins_match_stability_limits():
     sampling, M = Sampling(), 0.1
     kp, kd = place(M, 40.0, 0.8, sampling)
     ki = 4.0 * kp
@@ -177,7 +177,7 @@ def test_margins_are_where_the_loop_becomes_unstable():
         assert SampledLoop(M, later).is_stable(single(kp, kd, ki)) == stable
 
 
-def test_only_the_joint_that_takes_part_most_is_slowed_down():
+def test_only_dominant_joint_is_slowed_down():
     arm = load_arm("mtml")
     sampling, design = sampling_of(arm), design_arm(arm)
     alone = [design_joint(fact, sampling) for fact in design.facts]
@@ -192,7 +192,7 @@ def test_only_the_joint_that_takes_part_most_is_slowed_down():
     assert all(loop.is_stable(design.gains) for loop in loops)
 
 
-def test_the_least_damped_mode_names_its_joint():
+def test_least_damped_mode_identifies_joint():
     sampling = Sampling()
     loop = SampledLoop(np.diag([0.1, 0.01]), sampling)
     for kd, joint in (([0.0, 0.2], 0), ([2.0, 0.0], 1)):
@@ -201,11 +201,11 @@ def test_the_least_damped_mode_names_its_joint():
         np.testing.assert_allclose(shares, np.eye(2)[joint], atol=1e-9)
 
 
-def test_an_unstable_loop_has_no_margins():
+def test_unstable_loop_has_no_margins():
     assert SampledLoop(0.1, Sampling()).margins(single(100.0, 0.0)).phase == 0.0
 
 
-def test_joints_together_are_the_joints_alone_if_nothing_couples_them():
+def test_uncoupled_joints_match_single_joints():
     sampling, gains = Sampling(), Gains([20.0, 3.0], [2.0, 0.2], [30.0, 1.0])
     together = SampledLoop(np.diag([0.1, 0.01]), sampling).closed_loop(gains)
     alone = [
@@ -217,7 +217,7 @@ def test_joints_together_are_the_joints_alone_if_nothing_couples_them():
     np.testing.assert_allclose(found[-8:], expected[-8:], atol=1e-9)
 
 
-def test_a_design_keeps_its_margins_and_says_what_limits_it():
+def test_design_keeps_margins_and_reports_limitation():
     sampling = Sampling()
     fact = JointFacts((0.05, 0.2), dry_friction=0.1, viscous=0.0, gravity=0.5, count=3e-5, band=1e-3, effort_limit=2.0)
     design = design_joint(fact, sampling)
@@ -238,7 +238,7 @@ def test_a_design_keeps_its_margins_and_says_what_limits_it():
     assert later.frequency < 0.8 * design_joint(fact, sampling).frequency
 
 
-def test_the_mass_matrix_has_linkage_and_rotors():
+def test_mass_matrix_includes_linkage_and_rotors():
     # Along a motion of the independent joints the kinetic energy of the whole tree is v' M v / 2.
     from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 
@@ -255,7 +255,7 @@ def test_the_mass_matrix_has_linkage_and_rotors():
     assert 0.5 * v @ M @ v == pytest.approx(plant.CalcKineticEnergy(context), rel=1e-9)
 
 
-def test_measures_of_a_known_step():
+def test_measures_of_known_step():
     arm = load_arm("psm")
     n, t = arm.num_joints, 1e-3 * np.arange(round(1e3 * DURATION) + 1)
     q = np.zeros((len(t), n))
@@ -279,7 +279,7 @@ def test_measures_of_a_known_step():
     np.testing.assert_allclose(measured.oscillation, [0, 0, 0, 0, 0.2, 0, 0], rtol=1e-2, atol=1e-12)
 
 
-def test_best_gains_settle_most_often_and_then_fastest():
+def test_best_gains_settle_most_often_then_fastest():
     arm = load_arm("psm")
     never, rest = np.full(7, np.inf), np.zeros(7)
     settling = {
@@ -295,14 +295,14 @@ def test_best_gains_settle_most_often_and_then_fastest():
     assert comparison.best(["never", "fails"]) == "fails"
 
 
-def test_published_gains_are_per_second_and_of_an_mtm():
+def test_published_gains_are_per_second_and_for_mtm():
     gains = published_gains(load_arm("mtmr"))
     # One sample of 10 ms with the error 1 adds Ki to the effort.
     assert gains.ki[3] * 0.01 == pytest.approx(4e-4)
     assert published_gains(load_arm("psm")) is None
 
 
-def test_gains_go_through_a_file_into_a_scenario(tmp_path):
+def test_scenario_reads_gains_file(tmp_path):
     arm = load_arm("mtml")
     gains = Gains([round(1.1 * k, 4) for k in arm.gains.kp], arm.gains.kd, arm.gains.ki)
     path = tmp_path / "gains.yaml"
@@ -314,7 +314,7 @@ def test_gains_go_through_a_file_into_a_scenario(tmp_path):
     assert load_scenario(str(scenario)).controller.gains == gains
 
 
-def test_gains_of_a_file_are_what_an_arm_is_held_with(tmp_path):
+def test_holding_uses_gains_of_file(tmp_path):
     arm, error = load_arm("mtml"), 0.01
     n, sender_commands = arm.num_joints, []
     status = lcmt_dvrk_status()
@@ -349,7 +349,7 @@ def test_gains_of_a_file_are_what_an_arm_is_held_with(tmp_path):
         ("- 1\n", "must be keys and values, not .*; allowed in a file of gains: kp, kd, ki"),
     ],
 )
-def test_what_is_no_file_of_gains_is_refused(tmp_path, text, said):
+def test_rejects_invalid_gains_files(tmp_path, text, said):
     path = tmp_path / "gains.yaml"
     path.write_text(text)
     with pytest.raises(ControllerError, match=said):
@@ -362,7 +362,7 @@ def refused(capsys, *arguments):
     return refusal(capsys.readouterr().err)
 
 
-def test_the_verbs_refuse_bad_options(tmp_path, capsys):
+def test_commands_reject_invalid_options(tmp_path, capsys):
     assert 'unknown arm "mtm"' in refused(capsys, "tune", "--arm", "mtm")
     assert 'Invalid value "guess" for --method' in refused(capsys, "tune", "--arm", "psm", "--method", "guess")
     assert "its folder does not exist" in refused(
@@ -378,7 +378,7 @@ def test_the_verbs_refuse_bad_options(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_insertion_of_a_psm_swings_up_where_the_equations_say():
+def test_psm_insertion_ultimate_gain_matches_analytic():
     """Viscous friction and delay alone. Drake steps with the velocity at a step's end: only the ticks are a lag."""
     b, arm = 2.0, load_arm("psm")
     effects = ArmEffects(
@@ -394,7 +394,7 @@ def test_the_insertion_of_a_psm_swings_up_where_the_equations_say():
 
 
 @pytest.mark.slow
-def test_the_designed_gains_settle_every_joint_of_a_psm(tmp_path, monkeypatch):
+def test_designed_gains_settle_all_psm_joints(tmp_path, monkeypatch):
     # One process beside this one: each more compiles the arm again.
     monkeypatch.setattr("dvrk_drake.experiments.tuning.tuning.local_executor", partial(local_executor, 1))
     tuning = tune_arm("psm", ["model"], conditions=CONDITIONS[:1], poses=1)

@@ -1,1 +1,1 @@
-"""What `dvrk-drake demo` shows."""
+"""Demonstrations of `dvrk-drake demo`."""

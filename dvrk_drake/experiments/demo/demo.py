@@ -1,4 +1,4 @@
-"""The whole way on a simulated arm: collect, identify, validate, release, hold; everything written to one folder."""
+"""Complete workflow on a simulated arm: collect, identify, validate, release, hold. Writes results to one folder."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 POSES, FRESH_POSES = 40, 15
 #: Effort noise of one sample, as a share of the effort limit.
 EFFORT_NOISE = 0.01
-#: Farthest that the true centres of mass are from the model's along each axis [m].
+#: Maximum displacement of the true centres of mass along each axis [m].
 MAX_SHIFT = 0.002
-#: Release: pose held, then let go, then driven home; phases end at these times [s].
+#: End times of the phases of the release: pose held, arm released, arm driven home [s].
 HELD_UNTIL, RELEASED_UNTIL, HOME_UNTIL = 0.5, 4.5, 7.5
 STEP_DURATION = 4.0
-#: Between two samples of a motion [s].
+#: Sample period of a motion [s].
 SAMPLE_PERIOD = 0.01
-#: What a reader of the drift must know.
+#: Note on the interpretation of the drift.
 NO_DRY_FRICTION = (
     "Dry friction is not simulated here: every error of the model moves the released arm. On a real arm dry friction "
     "resists this drift."
@@ -50,15 +50,15 @@ NO_DRY_FRICTION = (
 
 @dataclass(frozen=True)
 class DemoPlan:
-    """What the demo does with one kind of arm; poses in rad and m.
+    """Plan of the demo for one type of arm, with poses in rad and m.
 
     Attributes:
-        effects: what its true arm has beside the model [N m].
-        release: where it is held, then let go.
-        step: where the step to `home` starts.
-        home: where both end.
-        step_title: of the step's plot.
-        closure: how the loops of the true arm's linkage are held, see `add_arm`.
+        effects: Effects of the ground-truth arm that the nominal model does not have [N m].
+        release: Pose in which the arm is held and then released.
+        step: Start pose of the step to `home`.
+        home: Final pose of the release and of the step.
+        step_title: Title of the plot of the step.
+        closure: Method that closes the loops of the ground-truth arm's linkage, see `add_arm`.
     """
 
     effects: tuple[DriveEffect, ...]
@@ -76,7 +76,7 @@ MTM_PLAN = DemoPlan(
         DriveEffect("joint.wrist_pitch", "cable sine", 1.0, -0.03),
     ),
     release=(0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5),
-    # The paper's Fig. 7: J5, J3 and J2 off home; q2 + q3 is beyond a real linkage's stop.
+    # Start pose of the paper's Fig. 7. Its q2 + q3 is beyond the stop of a real linkage.
     step=(0.0, -0.22, -0.79, 0.0, 3.13, 0.0, 0.0),
     home=(0.0,) * 7,
     step_title="Step of the paper's Fig. 7 to zero, gravity + PID",
@@ -104,17 +104,17 @@ class DemoResult:
     """Models, errors and motions of one run; m, k samples of n joints.
 
     Attributes:
-        arm: which arm.
-        identification: of the collected poses.
-        fresh: errors of the identified model at the fresh poses.
-        fresh_paper: errors of the paper's least squares at the same poses.
-        release_time: (m,) [s].
-        released: (m, n) positions of the release with the identified model [rad, m].
-        released_nominal: (m, n) the same with the model that the SDF states.
-        drift: (n,) largest distance from the pose of the release, by model.
-        step_time: (k,) [s].
-        step: (k, n) positions of the step home [rad, m].
-        step_error: (n,) distance from home at the end [rad, m].
+        arm: Arm of the demo.
+        identification: Identification from the collected poses.
+        fresh: Errors of the identified model at poses that were not used for identification.
+        fresh_paper: Errors of the paper's least-squares method at the same poses.
+        release_time: Times (m,) of the release [s].
+        released: Positions (m, n) after the release with the identified model [rad, m].
+        released_nominal: Positions (m, n) after the release with the nominal model of the SDF [rad, m].
+        drift: Largest distance (n,) from the pose of the release, by model.
+        step_time: Times (k,) of the step [s].
+        step: Positions (k, n) of the step to home [rad, m].
+        step_error: Final distance (n,) from home [rad, m].
     """
 
     arm: Arm
@@ -136,16 +136,17 @@ def run_demo(
     seed: int = 0,
     progress: Progress = lambda step, share: None,
 ) -> DemoResult:
-    """Runs it and writes `output`, an existing folder.
+    """Runs the demo and writes its results to an existing folder.
 
     Args:
-        output: for model.yaml, poses.csv, fresh_poses.csv and arm.html, a Meshcat recording; `plot_demo` adds plots.
-        arm_name: which arm.
-        seed: of the true arm, the poses and the noise.
-        progress: called with what is being done and the finished share of it, 0..1.
+        output: Folder for model.yaml, poses.csv, fresh_poses.csv and arm.html, a Meshcat recording. `plot_demo` adds
+            plots.
+        arm_name: Name of the arm.
+        seed: Seed of the ground-truth arm, the poses and the noise.
+        progress: Function called with the current step and its finished share, 0..1.
 
     Raises:
-        ArmError: an arm that the demo has no plan for.
+        ArmError: The demo has no plan for this arm.
     """
     if arm_name not in PLANS:
         raise ArmError(f'the demo has no plan for "{arm_name}"; it has for {", ".join(PLANS)}')
@@ -165,7 +166,7 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
 
     def collect(count: int, what: str) -> Recording:
         poses = arm.sample_poses(count, generator, margin=0.1)
-        # A person turns platform and handle (or roll) by a hand's reach, not by turns.
+        # A person turns the platform and the handle (or the roll joint) within the range of a wrist, not by full turns.
         poses[:, [3, 6]] = np.clip(poses[:, [3, 6]], -1.5, 1.5)
         return collect_static_poses(
             station(),
@@ -221,7 +222,7 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
 def _closed_loop(
     station: ArmStation, model: IdentifiedModel, q_start: Sequence[float]
 ) -> tuple[Simulator, VectorLogSink, GravityPidController, ConstantVectorSource]:
-    """The simulated arm at q_start, the log of its state, its controller, and the desired state."""
+    """Returns a simulator of the arm at q_start, the log of its state, its controller, and the desired state."""
     controller = GravityPidController(model)
     desired = ConstantVectorSource(_at_rest(q_start))
     builder = DiagramBuilder()
@@ -244,7 +245,7 @@ def _release(
     meshcat: Meshcat | None,
     progress: Callable[[float], object],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Holds a pose, releases the arm under gravity compensation, drives it home; t (m,) and q (m, n)."""
+    """Holds a pose, releases the arm under gravity compensation, drives it home; returns t (m,) and q (m, n)."""
     simulator, log, controller, desired = _closed_loop(station, model, plan.release)
     root = simulator.get_mutable_context()
     settings = controller.GetMyMutableContextFromRoot(root)
@@ -263,7 +264,7 @@ def _release(
 def _step(
     station: ArmStation, model: IdentifiedModel, plan: DemoPlan, progress: Callable[[float], object]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """From the plan's step to its home under gravity + PID; t (m,) and q (m, n)."""
+    """Simulates the step to home with gravity compensation and PID control; returns t (m,) and q (m, n)."""
     simulator, log, _, desired = _closed_loop(station, model, plan.step)
     root = simulator.get_mutable_context()
     desired.get_mutable_source_value(desired.GetMyMutableContextFromRoot(root)).SetFromVector(_at_rest(plan.home))

@@ -1,4 +1,4 @@
-"""A master arm leads a patient side manipulator, side by side in one Meshcat: a played hand, or yours on sliders."""
+"""Teleoperation of a PSM by a master arm in one Meshcat scene, with a simulated hand or with live controls."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from dvrk_drake.systems.hand import PoseTrajectorySource
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 
 SCALE = 0.4
-#: Where the arms start [rad, m]: the handle before the operator, the instrument in the middle of its range.
+#: Start poses of the arms [rad, m]: the handle in front of the operator, the instrument in the middle of its range.
 START_MASTER = np.array([0.0, 0.25, -0.1, 0.0, 1.2, 0.0, 0.0])
 START_FOLLOWER = np.array([0.0, 0.0, 0.13, 0.0, 0.0, 0.0, 0.5])
-#: Where the bases stand [m], alike in orientation: face to face, so that handle and tip are side by side.
+#: Positions of the bases [m], with equal orientation. The arms face each other, with handle and tip side by side.
 PLACES = {"mtml": (0.0, 0.45, 0.05), "psm": (0.0, -0.22, 0.0)}
 CAMERA, TARGET, ZOOM = (1.7, 0.45, 0.5), (0.0, -0.12, 0.08), 2.6
-#: Of the played motion [s]: the clutch is closed in these intervals.
+#: Intervals of the simulated motion in which the clutch is closed [s].
 ENGAGED = ((0.5, 9.7), (11.2, 16.0))
 DURATION = 16.0
 PERIOD = 0.02
@@ -38,16 +38,17 @@ BLUE, GREEN, GREY = Rgba(0.1, 0.35, 0.75), Rgba(0.1, 0.7, 0.2), Rgba(0.55, 0.55,
 
 @dataclass(frozen=True)
 class TeleoperationResult:
-    """How well the tip followed the handle, over all samples (one every `PERIOD`) with a closed clutch.
+    """Tracking errors of the tip over all samples (one per `PERIOD`) with a closed clutch.
 
-    Errors are those of the tip's displacement and rotation since the clutch closed, against the scaled displacement and
-    the rotation of the handle; both measured.
+    The errors compare the measured displacement and rotation of the tip since the clutch closed with the scaled
+    displacement and the rotation of the handle.
 
     Attributes:
-        handle_path: length of the handle's way with a closed clutch [m].
-        rms_position_error, max_position_error: [m].
-        rms_rotation_error, max_rotation_error: [rad].
-        max_motion_held: farthest that the tip was from where the clutch opened, while it was open [m].
+        handle_path: Length of the handle's path with a closed clutch [m].
+        rms_position_error, max_position_error: RMS and maximum position error [m].
+        rms_rotation_error, max_rotation_error: RMS and maximum rotation error [rad].
+        max_motion_held: Maximum distance of the tip from its position at the opening of the clutch, while it is open
+            [m].
     """
 
     handle_path: float
@@ -60,7 +61,7 @@ class TeleoperationResult:
 
 @dataclass(frozen=True)
 class _Samples:
-    """Of every `PERIOD`: whether the follower followed, the handle's and the tip's pose in their bases."""
+    """Samples at every `PERIOD`: whether the follower is active, and the poses of handle and tip in their bases."""
 
     following: list[bool]
     X_MG: list[RigidTransform]
@@ -70,12 +71,12 @@ class _Samples:
 def play_teleoperation(
     meshcat: Meshcat | None = None, duration: float = DURATION, progress: Callable[[float], object] = lambda share: None
 ) -> TeleoperationResult:
-    """Plays a hand that draws, turns the handle, lets the clutch go, comes back and draws on; records it in `meshcat`.
+    """Simulates a hand that draws, turns the handle, opens the clutch, returns and continues; records the animation.
 
     Args:
-        meshcat: where the arms and their paths are drawn; see `start_scene`.
-        duration: how much of it [s]; the whole takes `DURATION`.
-        progress: called with the finished share, 0..1.
+        meshcat: Meshcat that shows the arms and their paths; see `start_scene`.
+        duration: Simulated part of the motion [s]. The whole motion takes `DURATION`.
+        progress: Function called with the finished share, 0..1.
     """
     builder = DiagramBuilder()
     arms = builder.AddSystem(_make_arms(meshcat))
@@ -107,9 +108,9 @@ def play_teleoperation(
 
 
 def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
-    """Simulates in real time with hand, clutch, jaw and scale on Meshcat's controls, until Stop or `duration` [s].
+    """Simulates in real time with Meshcat controls for hand, clutch, jaw and scale, until Stop or `duration` [s].
 
-    A lamp above the master is green while the follower follows.
+    A lamp above the master is green while the follower is active.
     """
     from pydrake.visualization import MeshcatPoseSliders  # imports matplotlib
 
@@ -145,7 +146,7 @@ def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
 
 
 def start_scene(port: int | None = None) -> Meshcat:
-    """A Meshcat with the camera on both arms, and places for them; on a free port unless one is given."""
+    """Starts a Meshcat with the camera on both arms and frames for them; uses a free port unless one is given."""
     meshcat = start_meshcat(port=port, camera=CAMERA, target=TARGET, zoom=ZOOM)
     for name, p_WB in PLACES.items():
         meshcat.SetTransform(name, RigidTransform(np.array(p_WB)))
@@ -157,17 +158,17 @@ def _make_arms(meshcat: Meshcat | None) -> TeleoperatedArms:
 
 
 def _moved(X: RigidTransform, move: RigidTransform) -> RigidTransform:
-    """X turned and displaced about its own origin, along the axes of its base."""
+    """Returns X rotated about its own origin and displaced, both along the axes of its base."""
     return RigidTransform(move.rotation() @ X.rotation(), X.translation() + move.translation())
 
 
 def _ramp(t: float, start: float, end: float) -> float:
-    """0 before `start`, 1 after `end`, smooth between."""
+    """Returns 0 before `start`, 1 after `end`, and a smooth transition between them."""
     return float(np.sin(np.pi / 2 * np.clip((t - start) / (end - start), 0, 1)) ** 2)
 
 
 def _hand_motion(X_MG0: RigidTransform) -> PiecewisePose:
-    """The handle's way from its pose X_MG0; see `ENGAGED` for what the follower has of it."""
+    """Returns the motion of the handle from its pose X_MG0; the follower is active in the intervals `ENGAGED`."""
 
     def move(t: float) -> RigidTransform:
         eight, circle = 2 * np.pi * _ramp(t, 0.7, 4.5), 2 * np.pi * _ramp(t, 11.5, 15.2)
@@ -191,7 +192,7 @@ def _jaw_motion() -> PiecewisePolynomial:
 
 
 def _segments(following: list[bool]) -> list[range]:
-    """Ranges of samples with the same state of the clutch."""
+    """Returns the ranges of samples with the same state of the clutch."""
     changes = np.flatnonzero(np.diff(np.array(following, float))) + 1
     bounds = [0, *changes.tolist(), len(following)]
     return [range(a, b) for a, b in pairwise(bounds)]
@@ -231,12 +232,12 @@ def _rms(values: list[float]) -> float:
 
 
 def _points(poses: list[RigidTransform], segment: range) -> NDArray[np.float64]:
-    """(3, m) origins."""
+    """Returns the origins (3, m) of the poses."""
     return np.array([poses[i].translation() for i in segment]).T
 
 
 def _draw_paths(meshcat: Meshcat, samples: _Samples) -> None:
-    """Lines in the arms' bases: blue with a closed clutch, grey with an open one."""
+    """Draws the paths in the arms' bases, blue with a closed clutch and grey with an open one."""
     for k, segment in enumerate(_segments(samples.following)):
         color = BLUE if samples.following[segment[0]] else GREY
         for name, poses in (("mtml", samples.X_MG), ("psm", samples.X_FT)):

@@ -1,1 +1,1 @@
-"""The paper's experiments redone; `reports.reproduction` sets them beside the published numbers."""
+"""Reproduction of the paper's experiments; `reports.reproduction` compares them with the published numbers."""

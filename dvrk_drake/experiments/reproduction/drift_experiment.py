@@ -1,4 +1,4 @@
-"""An arm that is let go at a pose, under gravity compensation alone: the paper's Fig. 5 and 6, many times."""
+"""Drift of an arm that is released under gravity compensation, as in the paper's Fig. 5 and 6, for many poses."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
 
-#: Between two samples [s].
+#: Sample period [s].
 SAMPLE_PERIOD = 0.02
-#: How long it is watched [s], and within how much of where it was let go it is held [rad], [m].
+#: Duration of a release [s], and maximum distance from the release pose of an arm that counts as held [rad], [m].
 DURATION = 10.0
 BAND = 0.015, 0.0015
-#: From how far it is led to where it is let go [rad], [m], in what time, and how long it is held there [s].
+#: Approach to the release pose: distance [rad], [m], duration [s], and holding time at the end [s].
 APPROACH, LEADING, RESTING = (0.2, 0.02), 1.0, 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Release:
-    """One of them.
+    """Release of an arm at one pose.
 
     Attributes:
-        arm: name of the arm that the controller knows.
-        ground_truth_arm: what is simulated.
-        parts: of the true arm's effects that it has, as `ArmEffects.only` takes them.
-        model: file of the controller's model.
-        start: (n,) pose at which it rests when it is let go [rad, m], its friction unloaded.
-        led: the arm first comes there from `APPROACH` beside it, held until it rests, so that its friction is loaded.
-        damped: whether the controller brakes beside carrying the weight, in mode "damped".
-        hysteresis_ratio: share that the controller compensates of the hysteresis that moves a led arm back.
-        duration: [s].
-        seed: of the effects' noise.
+        arm: Name of the arm in the controller.
+        ground_truth_arm: Arm to simulate.
+        parts: Simulated effects of the ground-truth arm, as for `ArmEffects.only`.
+        model: File of the controller's model.
+        start: Release pose (n,) [rad, m], at rest with unloaded friction.
+        led: Whether the arm first approaches the pose from a distance of `APPROACH`, which loads its friction.
+        damped: Whether the controller damps the motion in addition to compensating gravity (mode "damped").
+        hysteresis_ratio: Compensated share of the hysteresis that moves an arm back after an approach.
+        duration: Duration [s].
+        seed: Seed of the effects' noise.
     """
 
     arm: str
@@ -64,7 +64,7 @@ class Release:
 
 
 def release(case: Release) -> NDArray[np.float64]:
-    """True positions (samples, n) every `SAMPLE_PERIOD` from the release on."""
+    """Simulates a release; returns the true positions (samples, n) at every `SAMPLE_PERIOD` after it."""
     arm = load_arm(case.arm)
     name = arm.name.lower()
     effects = case.ground_truth_arm.effects.only(case.parts)
@@ -90,12 +90,12 @@ def release(case: Release) -> NDArray[np.float64]:
 
 
 def _mode(case: Release) -> Mode:
-    """From the release on."""
+    """Returns the mode of the controller after the release."""
     return "damped" if case.damped else "gravity"
 
 
 def _way(case: Release, arm: Arm) -> PiecewisePolynomial:
-    """To where it is let go, in `LEADING`."""
+    """Returns the trajectory to the release pose, which takes `LEADING`."""
     q = from_where = np.asarray(case.start, float)
     if case.led:
         sides = np.random.default_rng(case.seed).choice([-1.0, 1.0], arm.num_joints)
@@ -112,34 +112,34 @@ def _model(path: str) -> IdentifiedModel:
 def release_all(
     cases: Sequence[Release], executor: Executor, progress: Callable[[float], object] = lambda share: None
 ) -> NDArray[np.float64]:
-    """Positions (cases, samples, n) of each; they do not depend on the executor."""
+    """Simulates all releases; returns positions (cases, samples, n), which do not depend on the executor."""
     futures = [executor.submit(release, case) for case in cases]
     return np.array(await_results(futures, progress))
 
 
 @dataclass(frozen=True, eq=False)
 class Drifts:
-    """What releases gave: `positions` (cases, samples, n) of `arm`."""
+    """Results of releases: `positions` (cases, samples, n) of `arm`."""
 
     arm: Arm
     positions: NDArray[np.float64]
 
     @property
     def final(self) -> NDArray[np.float64]:
-        """(cases, n) where it ended, from where it was let go."""
+        """Final displacements (cases, n) from the release poses."""
         return self.positions[:, -1] - self.positions[:, 0]
 
     @property
     def largest(self) -> NDArray[np.float64]:
-        """(cases, n) furthest that it ever was from where it was let go."""
+        """Largest distances (cases, n) from the release poses."""
         return np.abs(self.positions - self.positions[:, :1]).max(axis=1)
 
     @property
     def held(self) -> NDArray[np.bool_]:
-        """(cases, n) whether the joint stayed within `BAND` all the time."""
+        """Whether each joint (cases, n) always stayed within `BAND`."""
         return self.largest <= self.arm.per_joint(*BAND)
 
     @property
     def num_held(self) -> int:
-        """Cases in which every joint was held."""
+        """Number of cases in which every joint was held."""
         return int(np.count_nonzero(np.all(self.held, axis=1)))

@@ -13,16 +13,16 @@ from dvrk_drake.experiments.reproduction.published import LENGTHS, TableRow
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 
-#: Of how many poses the rows are found.
+#: Number of poses from which the rows are computed.
 POSES = 20
 
 
 def recomputed_table(arm: Arm) -> tuple[NDArray[np.float64], float]:
-    """Rows (n, 5) sign, offset [rad], d [m], alpha [rad], a [m] from the plant's motion, and the largest error of any
-    transform that they give [m, or as a rotation matrix's entry].
+    """Computes the DH table from the motion of the plant, and the largest error of its transforms.
 
-    The frames `paper_0..7` are fixed to the links; how they move against each other is the plant's doing, so a joint
-    that turned about another axis than its row's would show as an error.
+    The rows (n, 5) are sign, offset [rad], d [m], alpha [rad], a [m]. The error is in m or an entry of a rotation
+    matrix. The frames `paper_0..7` are fixed to the links, and the plant determines their relative motion. A joint
+    with another axis than that of its row would therefore cause an error.
     """
     plant = make_arm_plant(arm)
     poses = np.vstack([np.zeros(arm.num_joints), arm.sample_poses(POSES, np.random.default_rng(0))])
@@ -44,7 +44,7 @@ def recomputed_table(arm: Arm) -> tuple[NDArray[np.float64], float]:
 
 
 def _transforms(plant: MultibodyPlant, arm: Arm, q: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Of each joint, from the table's frame before it to the one behind it (4, 4)."""
+    """Returns the transform (4, 4) of each joint between the frames of the table before and after it."""
     context = plant.CreateDefaultContext()
     set_arm_positions(plant, context, arm, q)
     frames = [plant.GetFrameByName(f"paper_{i}") for i in range(arm.num_joints + 1)]
@@ -52,24 +52,27 @@ def _transforms(plant: MultibodyPlant, arm: Arm, q: NDArray[np.float64]) -> list
 
 
 def _standard(theta: float, d: float, alpha: float, a: float) -> NDArray[np.float64]:
-    """Rz(theta) Tz(d) Tx(a) Rx(alpha) (4, 4)."""
+    """Returns the transform Rz(theta) Tz(d) Tx(a) Rx(alpha) (4, 4)."""
     c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
     return np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1.0]])
 
 
 def published_row(row: TableRow) -> NDArray[np.float64]:
-    """(5,) sign, offset [rad], d [m], alpha [rad], a [m] of a row of Table I, with the arm's real lengths."""
+    """Returns sign, offset [rad], d [m], alpha [rad], a [m] (5,) of a row of Table I, with the arm's real lengths."""
     d, a = ((-1) ** symbol.startswith("-") * LENGTHS[symbol.lstrip("-")] + 0.0 for symbol in (row.d, row.a))
     return np.array([row.sign, row.offset, d, row.alpha, a])
 
 
-#: Poses at which the mechanism is measured.
+#: Number of poses at which the mechanism is evaluated.
 PSM_POSES = 200
 
 
 def mechanism_errors(arm: Arm) -> tuple[float, float]:
-    """Furthest that the shaft's axis ever passes from the remote centre [m], and the least angle between the axes of
-    wrist pitch and wrist yaw [rad], over random poses."""
+    """Computes the errors of the PSM's mechanism over random poses.
+
+    These are the maximum distance of the shaft axis from the remote centre [m], and the minimum angle between the axes
+    of wrist pitch and wrist yaw [rad].
+    """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     remote, angle = 0.0, np.pi
@@ -84,7 +87,7 @@ def mechanism_errors(arm: Arm) -> tuple[float, float]:
 
 
 def _axis(plant: MultibodyPlant, context: Context, joint: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A point of a hinge's axis and its direction in the world, whose origin is the remote centre."""
+    """Returns a point and the direction of a joint axis in the world frame, whose origin is the remote centre."""
     hinge = plant.GetJointByName(joint)
     X_WJ = hinge.frame_on_parent().CalcPoseInWorld(context)
     return X_WJ.translation(), X_WJ.rotation() @ hinge.revolute_axis()

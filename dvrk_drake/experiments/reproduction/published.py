@@ -1,6 +1,6 @@
 """The paper's published numbers and its recordings.
 
-`paper_model` makes a model of the paper's twelve parameters, which our controller runs.
+`paper_model` converts the paper's twelve parameters to a model for our controller.
 
 Source: Rutfield, Zia, Boos, Santoso, Sujumnong, "Gravity Compensation Control of da Vinci Robot", WPI 2015, and the
 team's repository WPI-AIM/dvrk_gravity_comp. Drifts are read off the team's plots.
@@ -25,12 +25,12 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.recordings.recording import Recording, read_recording
 
-#: Real lengths of Table I's symbols [m]; L1 is of no joint's concern and 0 in the SDF.
+#: Real lengths of the symbols in Table I [m]. L1 does not affect any joint and is 0 in the SDF.
 LENGTHS = {"0": 0.0, "L1": 0.0, "L2": 0.2794, "L3": 0.3645, "L4": 0.1506}
 
 
 class TableRow(NamedTuple):
-    """A row of Table I: theta = sign q + offset, then d and a as symbols and alpha, in rad."""
+    """Row of Table I: sign and offset [rad] with theta = sign q + offset, then d and a as symbols, and alpha [rad]."""
 
     sign: int
     offset: float
@@ -52,7 +52,7 @@ TABLE_1 = (
 
 #: The twelve parameters [kg m] in the paper's order, identified with g = 9.9 m/s^2 and used with 9.81.
 PARAMETERS = (0.0414, -0.0192, 0.0328, 0.0095, -0.0033, -0.0003, -0.0071, -0.0188, -0.0015, -0.0003, -0.0001, 0.0005)
-#: The link (from 1) and the axis of its frame of Table I whose first moment each of them is, lumped with others.
+#: Link (from 1) and axis, in its frame of Table I, of the first moment that each parameter is, lumped with others.
 PARAMETER_PLACES = (
     (2, "x"),
     (2, "y"),
@@ -69,36 +69,37 @@ PARAMETER_PLACES = (
 )
 IDENTIFIED_WITH, CONTROLLED_WITH = 9.9, 9.81
 
-#: Fig. 4, mean over the 72 poses [(N m)^2], J2..J7.
+#: Mean squared errors of Fig. 4 over the 72 poses [(N m)^2], J2..J7.
 FIGURE_4_MEANS = (8.14e-3, 7.96e-3, 1.97e-3, 4.62e-4, 3.98e-5, 1.92e-5)
 
-#: Final drift [rad], J2..J7: the trials of Fig. 5 and 6, and the mean absolute one of the team's five trials of either.
+#: Final drift [rad], J2..J7: trials of Fig. 5 and 6, and mean absolute drift over the team's five trials of each.
 FIGURE_5 = (0.0102, 0.0051, -0.0138, -0.174, -0.021, 0.0)
 FIGURE_6 = (0.0101, -0.0099, 0.0050, -0.003, -0.316, -0.071)
 FIGURE_5_MEANS = (0.070, 0.020, 0.0085, 1.29, 0.315, 0.730)
 FIGURE_6_MEANS = (0.013, 0.041, 0.038, 0.491, 0.481, 0.742)
 
-#: Fig. 7: start [rad], gains at 100 Hz (N m/rad, N m s/rad, N m/rad a sample), masses of base and links [kg].
+#: Fig. 7: start [rad], gains at 100 Hz (N m/rad, N m s/rad, N m/rad per sample), masses of base and links [kg].
 FIGURE_7_START = (0.0, -0.22, -0.79, 0.0, 3.13, 0.0, 0.0)
 FIGURE_7_KP = (0.5, 0.8, 0.85, 3.7, 0.5, 0.02, 0.006)
 FIGURE_7_KV = (1.95, 0.95, 1.75, 0.2, 0.1, 0.8, 0.08)
 FIGURE_7_KI = (1e-5, 5e-5, 1e-4, 4e-4, 1e-6, 1e-7, 1e-8)
 FIGURE_7_MASSES = (0.9, 1.0, 0.9, 0.8, 0.4, 0.2, 0.2, 0.1)
-#: Of the joints whose damping term got positions.
+#: Indices of the joints whose damping term used positions instead of velocities.
 FIGURE_7_FAULTY = (4, 5, 6)
-#: Read off Fig. 7: period of J2 [s], |J2| after 59 s, amplitude of J6, of J7 early and late [rad].
+#: Values read off Fig. 7: period of J2 [s], |J2| after 59 s, amplitude of J6, early and late amplitudes of J7 [rad].
 FIGURE_7_READ = {"J2 period": 22.0, "J2 at 59 s": 0.075, "J6": 0.022, "J7 early": 0.0115, "J7 late": 0.0155}
 
 
-#: More poses than parameters, for the change to our base parameters.
+#: Number of poses for the conversion to our base parameters; it must exceed the number of parameters.
 _POSES = 40
 
 
 def paper_torque(arm: Arm, q: ArrayLike, parameters: Sequence[float] = PARAMETERS) -> NDArray[np.float64]:
-    """Torque (m, n) of the paper's twelve parameters [kg m] at poses q (m, n): its equation 8 with g = 9.81 m/s^2.
+    """Computes the torque (m, n) of the paper's twelve parameters [kg m] at poses q (m, n).
 
-    Each parameter is the first moment h of one link in its frame of Table I, so P = g sum z . R_i h_i, and
-    dP/dq_j = g sum z . (w_j x R_i h_i), w_j the angular velocity that joint j gives link i.
+    This is equation 8 of the paper with g = 9.81 m/s^2. Each parameter is a component of the first moment h of one
+    link in its frame of Table I. Hence P = g sum z . R_i h_i and dP/dq_j = g sum z . (w_j x R_i h_i), where w_j is the
+    angular velocity of link i due to joint j.
     """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
@@ -111,13 +112,13 @@ def paper_torque(arm: Arm, q: ArrayLike, parameters: Sequence[float] = PARAMETER
             frame = plant.GetFrameByName(f"paper_{link}")
             h_W = value * frame.CalcPoseInWorld(context).rotation().matrix()[:, "xyz".index(axis)]
             J = plant.CalcJacobianAngularVelocity(context, JacobianWrtVariable.kV, frame, world, world)
-            # In a serial chain: joints of the linkage's other bars turn none of these links.
+            # The links form a serial chain. Joints of the other bars of the linkage do not rotate them.
             torque[k] += CONTROLLED_WITH * np.cross(J[:, tree].T, h_W)[:, 2]
     return torque
 
 
 def paper_model(arm: Arm) -> IdentifiedModel:
-    """The model whose torque is `paper_torque`, in our base parameters: they span the same."""
+    """Returns a model with the torque `paper_torque` in our base parameters, which span the same torques."""
     q = arm.sample_poses(_POSES, np.random.default_rng(0))
     model = IdentifiedModel.from_arm(arm)
     Y = model.static_model.regressor(q)
@@ -129,33 +130,33 @@ def paper_model(arm: Arm) -> IdentifiedModel:
 
 
 def with_zeroed(model: IdentifiedModel, joints: Sequence[int]) -> IdentifiedModel:
-    """The model with no torque on `joints` (from 0), as the paper's Fig. 6 has it."""
+    """Returns the model with zero torque on `joints` (from 0), as in the paper's Fig. 6."""
     statistics = [
         dataclasses.replace(s, feedforward_scale=0.0) if j in joints else s for j, s in enumerate(model.joints)
     ]
     return dataclasses.replace(model, joints=statistics)
 
 
-#: The paper's identification set; the squared errors behind its Fig. 4, if somebody has them.
+#: Files of the paper's identification set and of the squared errors of its Fig. 4 (optional).
 STATIC, FIGURE_4 = "mtm_2015_good72.csv", "paper_fig4_squared_errors.csv"
-#: The arm that was recorded: a right one, by the moment of its wrist's brackets (docs/public_recordings.md).
+#: Arm that was recorded. The moment of its wrist brackets shows that it is an MTMR (docs/public_recordings.md).
 PAPER_ARM = "mtmr"
-#: Names the folder above data/mtm_static, as the tests have it.
+#: Environment variable with the folder that contains data/mtm_static; the tests use the same variable.
 VARIABLE = "DVRK_DRAKE_SHARED"
 
 
 @dataclass(frozen=True)
 class PaperRecordings:
-    """The files in `folder`; `folder` is None where there is none."""
+    """Files of the paper's recordings in `folder`, which is None if there are none."""
 
     folder: Path | None
 
     @classmethod
     def find(cls, folder: str | Path | None) -> PaperRecordings:
-        """In `folder`, else below the folder that the environment variable DVRK_DRAKE_SHARED names.
+        """Finds the files in `folder`, or else below the folder of the environment variable DVRK_DRAKE_SHARED.
 
         Raises:
-            RecordingError: `folder` was given and has no such recording.
+            RecordingError: `folder` was given and does not contain the recording.
         """
         if folder is not None:
             if not (Path(folder) / STATIC).is_file():
@@ -167,10 +168,10 @@ class PaperRecordings:
 
     @property
     def poses(self) -> Recording:
-        """The paper's 72 poses.
+        """Reads the paper's 72 poses.
 
         Raises:
-            RecordingError: there are none.
+            RecordingError: The recording does not exist.
         """
         if self.folder is None:
             raise RecordingError(f"needs {STATIC}: name its folder with --data; {_where_from()}")
@@ -178,10 +179,10 @@ class PaperRecordings:
 
     @property
     def figure_4(self) -> NDArray[np.float64] | None:
-        """(72, 6) squared errors [(N m)^2] of J2..J7 as published, or None.
+        """Reads the published squared errors (72, 6) of J2..J7 [(N m)^2]; returns None if there is no file.
 
         Raises:
-            RecordingError: the file is not that.
+            RecordingError: The file does not contain these errors.
         """
         if self.folder is None or not (path := self.folder / FIGURE_4).is_file():
             return None

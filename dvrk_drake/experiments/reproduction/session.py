@@ -1,4 +1,4 @@
-"""What the figures of one run share: the folder, the recordings, the workers, and arms that are identified once."""
+"""Shared resources of the figures of one run: folder, recordings, workers, and identified arms."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from dvrk_drake.recordings.recording import Recording, write_recording
 
 @dataclass(frozen=True)
 class SampleSizes:
-    """How much is done; smaller numbers are for tests.
+    """Sample sizes of the experiments. Tests use smaller ones.
 
     Attributes:
-        collected: poses that an arm is identified from.
-        releases: random poses that ours is released at.
-        paper_releases: the first of these, for the paper's parameters.
-        hand_guided_releases: the first of these, for ours led there first.
-        psm_releases: for the PSM.
-        path_poses: that a hand leads the arm through.
-        duration: of a release [s].
+        collected: Number of poses for the identification of an arm.
+        releases: Number of random release poses with our model.
+        paper_releases: Number of these poses for the paper's parameters.
+        hand_guided_releases: Number of these poses for our model with a previous approach.
+        psm_releases: Number of release poses of the PSM.
+        path_poses: Number of poses on the path of an operator.
+        duration: Duration of a release [s].
     """
 
     collected: int = 40
@@ -55,7 +55,7 @@ class SampleSizes:
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """A true arm, poses collected on it, and the model that was identified from them, with its file."""
+    """Ground-truth arm, poses collected on it, and the model identified from them, with its file."""
 
     truth: GroundTruth
     poses: Recording
@@ -65,15 +65,15 @@ class Identified:
 
 @dataclass(eq=False)
 class ReproductionSession:
-    """Everything is made when it is first asked for.
+    """Session of the reproduction. All resources are created at their first use.
 
     Attributes:
-        folder: that the results go to.
-        recordings: of the paper's arm.
-        executor: what is simulated runs there.
-        progress: called with the step and its finished share, 0..1.
-        sample_sizes: how much is done.
-        seed: of true arms, poses and noise.
+        folder: Folder of the results.
+        recordings: Recordings of the paper's arm.
+        executor: Executor of the simulations.
+        progress: Function called with the step and its finished share, 0..1.
+        sample_sizes: Sample sizes of the experiments.
+        seed: Seed of ground-truth arms, poses and noise.
     """
 
     folder: Path
@@ -85,7 +85,7 @@ class ReproductionSession:
 
     @cached_property
     def mtm(self) -> Identified:
-        """The paper's arm if its recording is there, else one unlike its drawing; identified."""
+        """Identified MTM: the paper's arm if its recording is available, else a perturbed ground-truth arm."""
         self.progress("finding the true MTM", 0.0)
         if self.recordings.folder is None:
             truth = perturbed_ground_truth(PAPER_ARM, self.folder, self.seed)
@@ -95,12 +95,12 @@ class ReproductionSession:
 
     @cached_property
     def psm(self) -> Identified:
-        """A PSM unlike its drawing; identified."""
+        """Identified PSM, a perturbed ground-truth arm."""
         return self._identified(perturbed_ground_truth("psm", self.folder, self.seed), "psm")
 
     @cached_property
     def paper_file(self) -> Path:
-        """The file of the paper's own parameters; on another arm than the paper's, of its method on the same poses."""
+        """File of the paper's parameters. On another arm, the paper's method is applied to the same poses."""
         mtm, path = self.mtm, self.folder / "paper_model.yaml"
         if mtm.truth.is_paper_arm:
             paper_model(load_arm(PAPER_ARM)).save(path)
@@ -121,8 +121,10 @@ class ReproductionSession:
         hysteresis_ratio: float = 0.0,
         longest: float = DURATION,
     ) -> Drifts:
-        """Of the arm `name`, at `poses` (m, n), under the model in a file, for at most `longest` [s]; `parts`,
-        `damped`, `led` and `hysteresis_ratio`: see `Release`."""
+        """Releases the arm `name` at `poses` (m, n) with the model of a file for at most `longest` [s].
+
+        See `Release` for `parts`, `damped`, `led` and `hysteresis_ratio`.
+        """
         duration = min(self.sample_sizes.duration, longest)
         every = Release(
             name, truth.arm, tuple(parts), str(model), poses[0], damped, led, hysteresis_ratio, duration, self.seed
@@ -132,12 +134,12 @@ class ReproductionSession:
         return Drifts(truth.arm, positions)
 
     def random_poses(self, name: str, count: int) -> NDArray[np.float64]:
-        """(count, n) anywhere inside the limits; the first ones are the same whatever the count."""
+        """Returns random poses (count, n) inside the limits. The first ones do not depend on the count."""
         poses = [load_arm(name).sample_poses(1, np.random.default_rng([self.seed, i]))[0] for i in range(count)]
         return np.array(poses)
 
     def zeroed(self, model: Path) -> Path:
-        """The file of the same model without torque on joints 5-7."""
+        """Returns the file of the same model without torque on joints 5-7."""
         path = model.with_stem(model.stem + "_zeroed")
         with_zeroed(IdentifiedModel.load(model), FIGURE_7_FAULTY).save(path)
         return path
@@ -164,7 +166,7 @@ class ReproductionSession:
 
 @dataclass(frozen=True, eq=False)
 class Lead:
-    """One hand on one arm, as a process can be given it; `model` is a file, "" for limp motors."""
+    """Picklable description of an operator who moves an arm; `model` is a file, or "" for unpowered motors."""
 
     name: str
     arm: Arm
@@ -175,9 +177,9 @@ class Lead:
 
 
 def led(lead: Lead) -> OperatorForces:
-    """What the hand feels along a path through random poses."""
+    """Simulates the interaction forces along a path through random poses."""
     model = IdentifiedModel.load(lead.model) if lead.model else None
-    # Which friction there is, a controller knows from the same files as the arm; its weight it has to identify.
+    # The controller uses the friction of the arm files, but an identified gravity model.
     friction = Friction.of_arm(load_arm(PAPER_ARM))
     compensation = Compensation(lead.name, model, lead.friction_ratio, friction)
     path = random_path(lead.arm, lead.poses, seed=lead.seed)

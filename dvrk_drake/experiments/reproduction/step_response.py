@@ -1,4 +1,4 @@
-"""Fig. 7: a simulated MTM is told to go to zero, by the paper's controller and by ours."""
+"""Step response of a simulated MTM to zero, with the paper's controller and with ours (Fig. 7)."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
-#: Watched for so long [s]: the paper's, ours.
+#: Durations of the simulation with the paper's controller and with ours [s].
 DURATION, OUR_DURATION = 60.0, 10.0
-#: Between two samples of the paper's controller, which is also how often we look [s].
+#: Period of the paper's controller, and sample period of all results [s].
 PERIOD = 0.01
-#: What the paper's model gives each link about each axis [kg m^2]: its PSM's file says so, and the period of its J2.
+#: Inertia of each link about each axis in the paper's model [kg m^2], from its PSM file and from the period of J2.
 LINK_INERTIA = 1.0
-#: Of what the paper's chain does not have [kg, kg m^2]: the bars and rotors of the linkage.
+#: Mass and inertia of bars and rotors of the linkage [kg, kg m^2], which the paper's model does not have.
 _NOTHING = 1e-6
 
 
 def paper_simulated_arm(arm: Arm, path: Path) -> Arm:
-    """The arm with the paper's point masses at the joints; writes its SDF."""
+    """Returns the arm with the paper's point masses at the joints; writes its SDF."""
     plant = make_arm_plant(arm)
     carried = [plant.GetJointByName(name).child_body().name() for name in arm.joint_names]
     links = []
@@ -54,10 +54,10 @@ def paper_simulated_arm(arm: Arm, path: Path) -> Arm:
 def simulate_paper_controller(
     arm: Arm, duration: float, faulty: bool, progress: Callable[[float], object] = lambda share: None
 ) -> NDArray[np.float64]:
-    """q (samples, n) every `PERIOD` under the paper's equation 11, with its node's fault or without.
+    """Simulates the paper's equation 11, with or without the fault of its node; returns q (samples, n) per `PERIOD`.
 
-    Joints 6 and 7 start at their published amplitudes: the rest of the start lies in a plane and never moves them, as
-    whatever disturbed Gazebo did.
+    Joints 6 and 7 start at their published amplitudes. The published start pose lies in a plane and does not excite
+    them. In Gazebo an unknown disturbance excited them.
     """
     plant = make_arm_plant(arm)
     simulator = Simulator(plant)
@@ -88,7 +88,7 @@ def simulate_paper_controller(
 
 
 def simulate_ours(ground_truth_arm: Arm, model: IdentifiedModel, duration: float) -> NDArray[np.float64]:
-    """q (samples, n) every `PERIOD` under gravity compensation and PID, with all effects but the stops."""
+    """Simulates gravity compensation and PID with all effects except the stops; returns q (samples, n) per `PERIOD`."""
     arm = load_arm(PAPER_ARM)
     station = ArmStation(arm, plant_arm=ground_truth_arm, effects=ground_truth_arm.effects.without("stops"))
     builder = DiagramBuilder()
@@ -107,10 +107,12 @@ def _gravity(plant: MultibodyPlant, simulator: Simulator, arm: Arm) -> NDArray[n
 
 
 def swings(arm: Arm, faulty: bool) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """The arm about zero under the paper's gains, its node's fault or velocities in all damping terms; no integral.
+    """Computes the oscillation modes of the arm about zero with the paper's gains, without the integral term.
+
+    With `faulty`, the damping terms have the fault of the paper's node. Otherwise they use velocities.
 
     Returns:
-        Eigenvalues (k,) [1/s] with positive imaginary part, and the joints' parts (n, k) of their eigenvectors.
+        Eigenvalues (k,) [1/s] with positive imaginary part, and the joint components (n, k) of their eigenvectors.
     """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
@@ -129,7 +131,7 @@ def swings(arm: Arm, faulty: bool) -> tuple[NDArray[np.complex128], NDArray[np.c
 
 
 def slowest_swing(arm: Arm) -> float:
-    """Longest period [s] of a swing that moves joint 2, with the fault."""
+    """Returns the longest period of the modes that move joint 2, with the fault [s]."""
     values, vectors = swings(arm, faulty=True)
     moves = np.abs(vectors[1]) > 0.1 * np.abs(vectors).max(axis=0)
     return float(2 * np.pi / values.imag[moves].min())

@@ -1,1 +1,1 @@
-"""Many simulations: poses, seeds and parameter errors on all cores or a cluster."""
+"""Simulation studies over poses, seeds and parameter errors, on all cores or on a cluster."""

@@ -1,4 +1,4 @@
-"""What one number or one yes or no says of a simulated run: settling time, drift, whether a pose was held.
+"""Measures of a simulated run: numbers such as settling time and drift, and criteria such as a held pose.
 
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
@@ -19,14 +19,14 @@ from dvrk_drake.models.schema_fault import number_fault, within
 
 @dataclass
 class Measure:
-    """A measure of a run, as a study names it.
+    """Measure of a run in a study file.
 
     Attributes:
-        kind: one of `KINDS`.
-        name: its column in the results; the kind if left out.
-        band: [rad; m on a joint that slides]; the kind's own if left out.
-        time: [s]; the kind's own if left out.
-        joints: the joints that count, by name; all if left out.
+        kind: Kind of the measure, one of `KINDS`.
+        name: Column in the results. Default: the kind.
+        band: Tolerance band [rad; m for a prismatic joint]. Default: that of the kind.
+        time: Duration [s]. Default: that of the kind.
+        joints: Names of the evaluated joints. Default: all.
     """
 
     kind: str = ""
@@ -37,29 +37,29 @@ class Measure:
 
     @property
     def column(self) -> str:
-        """What it is called in the results."""
+        """Name of the column in the results."""
         return self.name or self.kind
 
     @property
     def unit(self) -> str:
-        """Of its numbers; "" of a share, and of a yes or no."""
+        """Unit of the values; "" for a share and for a boolean measure."""
         return KINDS[self.kind].unit
 
     @property
     def is_answer(self) -> bool:
-        """Whether it is a yes or no, not a number."""
+        """Whether the measure is boolean, not a number."""
         return isinstance(self.worst, bool)
 
     @property
     def worst(self) -> float | bool:
-        """What a run counts as that could not be simulated to its end."""
+        """Value for a run that could not be simulated to its end."""
         return KINDS[self.kind].worst
 
     def check(self, scenario: Scenario) -> None:
-        """Refuses what makes no sense for a scenario.
+        """Checks that the measure is valid for a scenario.
 
         Raises:
-            StudyError: names the field, its value, and what is allowed.
+            StudyError: A field is invalid. The message gives the field, its value, and the accepted values.
         """
         if self.kind not in KINDS:
             raise StudyError(f'kind is "{self.kind}"; allowed: {", ".join(KINDS)}')
@@ -85,7 +85,7 @@ class Measure:
             raise StudyError("overshoot needs a scenario with targets")
 
     def __call__(self, scenario: Scenario, simulation: Simulation) -> float | bool:
-        """Of a run: the worst of its joints."""
+        """Computes the measure of a run: the worst value of its joints."""
         arm = scenario.mounted_arm
         columns = [arm.joint_names.index(name) for name in self.joints or arm.joint_names]
         times, poses = scenario.knots()
@@ -115,10 +115,11 @@ class Measure:
 
 
 class _Run(NamedTuple):
-    """Of the k joints that count: t (m,); q, error from the wanted pose, effort_share (m, k); way, goal (k,).
+    """Data of a run for the k evaluated joints.
 
-    `arrival` [s] is when the last target is to be reached, after `way` from the pose before, left at `departure`, and
-    no hand holds the arm any more.
+    These are t (m,), and q, the error from the desired pose and effort_share (m, k), and `way` and goal (k,).
+    `arrival` [s] is the time of the last target, or of the release by the hand if that is later. The last motion
+    starts at `departure` and has the displacement `way`.
     """
 
     t: NDArray[np.float64]
@@ -131,12 +132,12 @@ class _Run(NamedTuple):
     goal: NDArray[np.float64]
 
     def last(self, time: float) -> NDArray[np.bool_]:
-        """(m,) the samples of the last `time` [s]."""
+        """Returns a mask (m,) of the samples in the last `time` [s]."""
         return self.t >= self.t[-1] - time - 1e-9
 
 
 def _arrival(scenario: Scenario) -> float:
-    """When the last target is reached and no hand holds the arm any more [s]."""
+    """Returns the time of the last target, or of the release by the hand if that is later [s]."""
     return max(float(scenario.knots()[0][-1]), *(point.time for point in scenario.hand.path), 0.0)
 
 
@@ -182,7 +183,7 @@ def _ran_away(run: _Run, band: float, time: float) -> bool:
 
 
 class Kind(NamedTuple):
-    """How a measure is computed: of a run, with band and time, whose defaults are None where there is no such thing."""
+    """Function that computes a measure from a run, band and time, with the defaults; None if a value is not used."""
 
     of: Callable[[_Run, float, float], float | bool]
     unit: str
@@ -191,19 +192,19 @@ class Kind(NamedTuple):
     worst: float | bool
 
 
-#: The kinds of measures: of true positions at the recorded times, and of measured efforts, over the joints that count.
-#: The wanted pose is where the controller leads the arm; in other modes than "hold" it is the pose at the release (the
-#: start, or when the hand lets go), and nothing before counts.
+#: Kinds of measures. They are computed from the true positions and the measured efforts of the evaluated joints at the
+#: recorded times. The desired pose is that of the controller. In modes other than "hold" it is the pose at the release
+#: (at the start, or when the hand releases the arm), and earlier samples are excluded.
 #:
-#: settling_time: from the last target's time until all joints stay within `band` of the end's wanted pose; infinite if
+#: settling_time: Time from the last target until all joints stay within `band` of the final desired pose; infinite if
 #: they do not.
-#: overshoot: beyond the last target, in the direction of the way there.
-#: steady_error: distance from the wanted pose, mean over the last `time`.
-#: drift: largest distance, in the last `time`, from the pose at its beginning.
-#: drift_rate: slope of the straight line through the last `time`.
-#: effort_share: largest effort over the joint's limit.
-#: held: within `band` of the wanted pose for `time` from the last target's time, or from the release.
-#: ran_away: further than `band` from the wanted pose at any time.
+#: overshoot: Distance beyond the last target, in the direction of the motion to it.
+#: steady_error: Distance from the desired pose, mean over the last `time`.
+#: drift: Largest distance in the last `time` from the pose at the start of this interval.
+#: drift_rate: Slope of a line fitted to the last `time`.
+#: effort_share: Largest effort divided by the joint's limit.
+#: held: Whether the arm stays within `band` of the desired pose for `time` after the last target or the release.
+#: ran_away: Whether the arm is ever further than `band` from the desired pose.
 KINDS = {
     "settling_time": Kind(_settling_time, "s", 1e-3, None, math.inf),
     "overshoot": Kind(_overshoot, "rad", None, None, math.inf),

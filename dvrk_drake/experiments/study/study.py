@@ -1,4 +1,4 @@
-"""Runs a study, on the cores of this computer or on a Dask cluster; each result goes into the table as it comes."""
+"""Execution of a study on the local cores or on a Dask cluster. Each result is written to the table immediately."""
 
 from __future__ import annotations
 
@@ -30,29 +30,30 @@ if TYPE_CHECKING:
     from distributed import Client
 
 Result = TypeVar("Result")
-#: Called with the number of rows that are there, and the number of all cases.
+#: Function called with the number of available rows and the number of all cases.
 Progress = Callable[[int, int], None]
 
 
 def run_study(
     study: Study, executor: Executor, output: str | Path, progress: Progress = lambda done, all_cases: None
 ) -> dict[int, Row]:
-    """Runs the cases that `output` does not have yet; the results do not depend on the executor, nor on interruptions.
+    """Runs the missing cases of `output`. The results depend neither on the executor nor on interruptions.
 
     Args:
-        study: what to run.
-        executor: of the standard interface: threads, processes, a Dask client's `get_executor(pure=False)`. Its workers
-            need this package, and the files that the scenario names.
-        output: CSV file, or `.parquet`. See `StudyTable`. What is there of the same study is kept.
-        progress: called at the start and for each row.
+        study: Study to run.
+        executor: Standard executor: threads, processes, or a Dask client's `get_executor(pure=False)`. Its workers
+            need this package and the files that the scenario names.
+        output: CSV file or `.parquet`, see `StudyTable`. Existing rows of the same study are kept.
+        progress: Function called at the start and for each row.
 
     Returns:
-        The rows by the number of their case, all of them.
+        All rows by the number of their case.
 
     Raises:
-        StudyError: the study or the output are refused, or some cases could not be run because workers were lost: those
-            that were run are in the output, and the same call goes on with the rest. Then its cause is the first loss.
-        ScenarioError, ArmError, ModelError: the scenario, or one of its variations, is refused.
+        StudyError: The study or the output is invalid, or some cases failed because workers were lost. In the latter
+            case the output contains the finished cases, the same call continues with the others, and the cause of the
+            error is the first loss.
+        ScenarioError, ArmError, ModelError: The scenario or one of its variations is invalid.
     """
     study.check()
     table_type = ParquetStudyTable if Path(output).suffix == ".parquet" else StudyTable
@@ -71,7 +72,7 @@ def run_study(
                 else:
                     table.append(case, future.result())
                     progress(len(table.rows), len(study.cases))
-        except BrokenExecutor as broken:  # by submit
+        except BrokenExecutor as broken:  # raised by submit
             losses.append((case, broken))
         finally:
             for future in futures:
@@ -91,10 +92,10 @@ def _loss(future: Future[Row]) -> BaseException | None:
 
 
 def run_case(scenario: Scenario, measures: Sequence[Measure]) -> Row:
-    """Simulates a scenario and measures it; a simulation that diverges is a row too, with its error."""
+    """Simulates a scenario and computes its measures. The row of a diverging simulation contains the error."""
     try:
         simulation = simulate(scenario)
-    except (RuntimeError, ArithmeticError, ValueError) as error:  # what Drake and numpy raise
+    except (RuntimeError, ArithmeticError, ValueError) as error:  # errors raised by Drake and NumPy
         return Row({}, " ".join(f"{type(error).__name__}: {error}".split()))
     lost = ~np.all(np.isfinite(np.hstack([simulation.state_true, simulation.recording.measured_effort()])), axis=1)
     if np.any(lost):
@@ -102,19 +103,19 @@ def run_case(scenario: Scenario, measures: Sequence[Measure]) -> Row:
     return Row({measure.column: measure(scenario, simulation) for measure in measures})
 
 
-#: How often a pool is made again whose worker was killed (by the system where memory ends, say).
+#: Maximum number of pools: a pool is replaced when a worker was killed, e.g. by the system for lack of memory.
 MAX_POOLS = 3
-#: Google's allocator, as Debian's and Ubuntu's package libtcmalloc-minimal4 and Fedora's gperftools-libs install it.
+#: Google's allocator, from the package libtcmalloc-minimal4 (Debian, Ubuntu) or gperftools-libs (Fedora).
 TCMALLOC = "libtcmalloc_minimal.so.4"
-#: How long a scheduler may take to answer, and to have its first worker [s].
+#: Maximum time for a scheduler to answer and to get its first worker [s].
 TIMEOUT = 10
 
 
 def run_study_locally(study: Study, output: str | Path, workers: int | None, progress: Progress) -> dict[int, Row]:
-    """As `run_study` on this computer; where a worker is killed, what it and its pool left is run by another pool.
+    """Runs a study like `run_study` on this computer. If a worker is killed, a new pool runs the remaining cases.
 
     Raises:
-        StudyError: as `run_study`, or `MAX_POOLS` pools lost a worker.
+        StudyError: As for `run_study`, or `MAX_POOLS` pools lost a worker.
     """
     for pool in range(MAX_POOLS):
         try:
@@ -128,12 +129,12 @@ def run_study_locally(study: Study, output: str | Path, workers: int | None, pro
 
 @contextmanager
 def local_executor(workers: int | None = None) -> Iterator[Executor]:
-    """Processes of this computer, one a core by default; they end with the block, at once if it is left by an error.
+    """Provides worker processes on this computer, by default one per core.
 
-    They are spawned, not forked: a script that uses this needs `if __name__ == "__main__":`. They also end when this
-    process is killed.
+    The workers end with the block, immediately if it is left by an error, and also when this process is killed. They
+    are spawned, not forked. A script that uses this function needs `if __name__ == "__main__":`.
     """
-    # All this is read by a worker when it starts. More threads of BLAS in it would only wait for those of the others.
+    # Workers read these variables at their start. BLAS threads in each worker would only compete for the cores.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     os.environ.update(_allocator_environment())
@@ -150,7 +151,7 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
 
 
 def await_results(futures: Sequence[Future[Result]], progress: Callable[[float], object]) -> list[Result]:
-    """The results of all futures in their order, or the first error; `progress` is called with the finished share."""
+    """Returns the results of all futures in their order; raises the first error. Reports the finished share."""
     for done, future in enumerate(as_completed(futures), start=1):
         future.result()
         progress(done / len(futures))
@@ -158,10 +159,11 @@ def await_results(futures: Sequence[Future[Result]], progress: Callable[[float],
 
 
 def _allocator_environment() -> dict[str, str]:
-    """Variables that give a new process a faster memory allocator; none where one is set, or on another system.
+    """Returns environment variables that select a faster memory allocator for new processes.
 
-    Drake's solver allocates some thousand small blocks in every step: with glibc's allocator a third of a step. With
-    tcmalloc, or glibc's with caches of more than 7 blocks of a size, it takes less.
+    There are none if an allocator is already selected, or on other systems. Drake's solver allocates some thousand
+    small blocks in every step, which takes a third of the step with glibc's default settings. It is faster with
+    tcmalloc, and with glibc if more than 7 blocks per size are cached.
     """
     if sys.platform != "linux" or {"LD_PRELOAD", "GLIBC_TUNABLES"} & set(os.environ):
         return {}
@@ -176,14 +178,14 @@ def _library_folders() -> list[Path]:
 
 @contextmanager
 def dask_executor(address: str) -> Iterator[Executor]:
-    """The workers of the Dask scheduler at `address`, e.g. "tcp://192.168.0.5:8786"; the extra `dask`.
+    """Connects to the workers of a Dask scheduler, e.g. "tcp://192.168.0.5:8786". Requires the extra `dask`.
 
-    The workers need this package in the same versions, and the files that the scenario names at the same paths. One
-    thread each is best (`dask worker --nthreads 1`): simulations of one process wait for each other. The log of the
-    client is silenced: what matters becomes a StudyError.
+    The workers need the same versions of this package, and the files that the scenario names at the same paths. One
+    thread per worker is best (`dask worker --nthreads 1`), since simulations in one process block each other. The log
+    of the client is disabled; errors are raised as StudyError.
 
     Raises:
-        StudyError: distributed is not installed, no scheduler answers there, or it has no workers or unfit ones.
+        StudyError: distributed is not installed, the scheduler does not answer, or it has no suitable workers.
     """
     if not re.fullmatch(r"tcp://\S+:\d+", address):
         raise StudyError(f'"{address}" is no address of a scheduler; allowed: tcp://HOST:PORT')
@@ -203,7 +205,7 @@ def dask_executor(address: str) -> Iterator[Executor]:
         except TimeoutError as error:
             raise StudyError(f"{address}: the scheduler has no workers; start some: dask worker {address}") from error
         _check_workers(client)
-        # What is pure would be computed once for all studies of the cluster, and kept.
+        # The cluster would cache the results of pure functions and share them between studies.
         yield client.get_executor(pure=False)
 
 
@@ -218,10 +220,10 @@ def _check_workers(client: Client) -> None:
 
 
 class _SpawningExecutor(ProcessPoolExecutor):
-    """Its workers do not hear Ctrl-C: the process that they work for ends them, without their tracebacks."""
+    """Process pool whose workers ignore Ctrl-C. The parent process ends them, so they print no tracebacks."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a process keeps its parent's mask
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit the signal mask
         try:
             return super().submit(fn, *args, **kwargs)
         finally:

@@ -1,4 +1,4 @@
-"""What to run many times, as a file: the schema of a study, read strictly, and the cases that it asks for.
+"""Schema and strict reader of study files, and the cases of a study.
 
 No postponed annotations here: yaml_load_typed reads the types at run time.
 """
@@ -25,13 +25,13 @@ from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
-#: The columns of the results beside start and measures.
+#: Columns of the results, except those of the start pose and the measures.
 RESERVED = ("study", "case", "variation", "pose", "seed", "error")
 
 
 @dataclass
 class RandomPoses:
-    """`count` poses, uniform in the joint box and inside the coupled limits; see `Arm.sample_poses`."""
+    """Number `count` of random poses, uniform in the joint box and inside the coupled limits (`Arm.sample_poses`)."""
 
     count: int = field(default=0, metadata=within(1, 10**6))
     seed: int = field(default=0, metadata=within(0, 2**63 - 1))
@@ -40,7 +40,7 @@ class RandomPoses:
 
 @dataclass
 class Variation:
-    """The scenario changed by settings "key=value", under a name."""
+    """Named variation of the scenario, given by settings "key=value"."""
 
     name: str = ""
     set: list[str] = field(default_factory=list)
@@ -48,9 +48,10 @@ class Variation:
 
 @dataclass(frozen=True)
 class Case:
-    """One run: number `index` from 0, of a `variation`, from the `start` that is pose number `pose` from 0.
+    """One run of a study.
 
-    `seed` is what the scenario gets.
+    It has the number `index` (from 0), the name of a `variation`, the number `pose` (from 0) of its `start`, and the
+    `seed` of the scenario.
     """
 
     index: int
@@ -65,14 +66,14 @@ class Study:
     """Schema of a study file: a scenario over poses, seeds and variations. One study gives one table of results.
 
     Attributes:
-        scenario: name of an arm, or path of a scenario's YAML file, relative to the folder that the command runs in.
-        set: settings "key=value" of the scenario, as `dvrk-drake simulate --set` takes them.
-        poses: where the arm starts, one list of n numbers [rad, m] each; the scenario's own start if left out.
-        random_poses: as many random ones, instead of `poses`.
-        seeds: each pose is run with each of them. A run's own seed is drawn from it and the pose's number, so that
-            runs are independent; variations share it, so that they differ in nothing else.
-        variations: each is run from each pose with each seed; the scenario as it is if left out.
-        measures: what is computed of each run.
+        scenario: Name of an arm, or path of a scenario's YAML file, relative to the current working folder.
+        set: Settings "key=value" of the scenario, as for `dvrk-drake simulate --set`.
+        poses: Start poses, one list of n numbers [rad, m] each. Default: the start of the scenario.
+        random_poses: Random start poses, instead of `poses`.
+        seeds: Seeds, each of which is combined with each pose. The seed of a run is drawn from this seed and the number
+            of the pose, so that runs are independent. All variations use the same seeds.
+        variations: Variations, each of which is run from each pose with each seed. Default: the unchanged scenario.
+        measures: Measures that are computed for each run.
     """
 
     scenario: str = ""
@@ -85,28 +86,28 @@ class Study:
 
     @cached_property
     def scenarios(self) -> dict[str, Scenario]:
-        """Variation -> its scenario, start and seed apart.
+        """Scenarios by variation, without start pose and seed.
 
         Raises:
-            ScenarioError: a setting that a scenario refuses.
+            ScenarioError: A setting of the scenario is invalid.
         """
         return {v.name: load_scenario(self.scenario, [*self.set, *v.set]) for v in self.variations}
 
     @property
     def arm(self) -> Arm:
-        """What is simulated."""
+        """Arm that is simulated."""
         return next(iter(self.scenarios.values())).mounted_arm
 
     @cached_property
     def cases(self) -> tuple[Case, ...]:
-        """All runs; those of one pose follow each other, so that a part of a study is a smaller study."""
+        """All runs, ordered by pose, so that the first part of a study is a smaller study."""
         starts = self._starts()
         runs = [(k, seed, v.name) for k in range(len(starts)) for seed in self.seeds for v in self.variations]
         return tuple(Case(i, v, k, _seed_of_run(seed, k), tuple(starts[k])) for i, (k, seed, v) in enumerate(runs))
 
     @cached_property
     def fingerprint(self) -> str:
-        """Differs between studies whose results may differ: of all inputs, files included, and of versions."""
+        """Hash of all inputs, including files and versions. It differs between studies with different results."""
         content = {
             "versions": versions(),
             "scenarios": {name: dataclasses.asdict(scenario) for name, scenario in self.scenarios.items()},
@@ -123,20 +124,20 @@ class Study:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def scenario_of(self, case: Case) -> Scenario:
-        """What `dvrk-drake simulate` would be given to repeat a case."""
+        """Returns the scenario with which `dvrk-drake simulate` repeats a case."""
         scenario = self.scenarios[case.variation]
         controller = scenario.controller
-        if controller.model:  # workers may have another working folder
+        if controller.model:  # workers may use another working folder
             controller = dataclasses.replace(controller, model=os.path.realpath(controller.model))
         arm = scenario.mounted_arm.source
         return dataclasses.replace(scenario, arm=arm, controller=controller, start=list(case.start), seed=case.seed)
 
     def check(self) -> None:
-        """Refuses what cannot be run, before anything runs.
+        """Checks that all cases can be run, before the first one runs.
 
         Raises:
-            StudyError: names the field, its value, and what is allowed.
-            ScenarioError, ArmError, ModelError: the scenario, with the settings of a variation or from a pose.
+            StudyError: A field is invalid. The message gives the field, its value, and the accepted values.
+            ScenarioError, ArmError, ModelError: The scenario is invalid for a variation or a pose.
         """
         if not self.scenario:
             raise StudyError("scenario is missing; give an arm's name, or the path of a scenario's YAML file")
@@ -171,7 +172,7 @@ class Study:
             raise StudyError("poses and random_poses: give one of them")
 
     def _starts(self) -> list[list[float]]:
-        """Where the arm starts."""
+        """Returns the start poses of the arm."""
         if self.random_poses is not None:
             random = self.random_poses
             return self.arm.sample_poses(random.count, np.random.default_rng(random.seed), random.margin).tolist()
@@ -184,7 +185,7 @@ def load_study(path: str | Path, settings: Sequence[str] = ()) -> Study:
     """Reads a study file, adds settings "key=value" of its scenario, and checks it.
 
     Raises:
-        StudyError: the file cannot be read, has an unknown key, or asks for what makes no sense.
+        StudyError: The file cannot be read, has an unknown key, or has an invalid value.
     """
     study = load_typed_yaml(Study, path, StudyError, "a study")
     study.set = [*study.set, *settings]
@@ -196,7 +197,7 @@ def load_study(path: str | Path, settings: Sequence[str] = ()) -> Study:
 
 
 def versions() -> dict[str, str]:
-    """Of what results depend on."""
+    """Returns the versions of all software that the results depend on."""
     return {package: version(package) for package in ("dvrk-drake", "drake", "numpy")}
 
 

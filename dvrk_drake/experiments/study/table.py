@@ -1,4 +1,4 @@
-"""The results of a study: a file with a row per run, whole whatever ends the process, and their summary."""
+"""Results of a study: a file with one row per run that survives interruptions, and a summary."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from dvrk_drake.recordings.recording import column_names
 
 @dataclass(frozen=True)
 class Row:
-    """What a run gave: `values` by column of the measures; or none, and the `error` that ended it, in one line."""
+    """Result of a run: `values` by column of the measures, or no values and the `error` in one line."""
 
     values: Mapping[str, float | bool]
     error: str = ""
 
 
 class StudyTable:
-    """The results of one study in a CSV file: one row a run, under a header.
+    """Results of one study in a CSV file with a header and one row per run.
 
-    Columns: study, its fingerprint; case, the number of the run; variation; pose, the number of the start; seed, of
-    the scenario; q1..qn, the start [rad, m]; one a measure: a number, inf, true or false; error, empty unless the run
-    failed, and then its measures are. Numbers have every digit.
+    The columns are: study (its fingerprint), case (number of the run), variation, pose (number of the start pose),
+    seed (of the scenario), q1..qn (start pose [rad, m]), one column per measure (a number, inf, true or false), and
+    error. The error is empty unless the run failed; the measures of a failed run are empty. Numbers have all digits.
 
-    It is a context manager that keeps other processes off the file meanwhile.
+    The table is a context manager that locks the file against other processes.
     """
 
     def __init__(self, path: str | Path, study: Study) -> None:
-        """At `path`, which is new or was begun with the same study.
+        """Opens the table at `path`, which is new or was started with the same study.
 
         Raises:
-            StudyError: it was begun with another study, is no table of a study, or another process writes it.
-            RecordingError: it cannot be read or written.
+            StudyError: The file is of another study, is not the table of a study, or is locked by another process.
+            RecordingError: The file cannot be read or written.
         """
         self._path, self._study = Path(path), study
         self._names = [measure.column for measure in study.measures]
@@ -69,16 +69,16 @@ class StudyTable:
         self._lock.close()
 
     def append(self, case: Case, row: Row) -> None:
-        """Adds the row of a case that has none yet.
+        """Appends the row of a case that has none yet.
 
         Raises:
-            RecordingError: it cannot be written; the rows before are whole.
+            RecordingError: The row cannot be written. The earlier rows remain complete.
         """
         self._file.append(_line(self._cells(case, row)))
         self.rows[case.index] = row
 
     def sort(self) -> None:
-        """Brings the rows into the order of the cases, at once or not at all."""
+        """Sorts the rows by the number of the case, as one atomic operation."""
         with atomic_write(self._path, "wb") as stream:
             stream.write(_line(self._header))
             stream.writelines(_line(self._cells(case, self.rows[case.index])) for case in self._study.cases)
@@ -89,11 +89,11 @@ class StudyTable:
         return [*key, *map(repr, case.start), *values, row.error]
 
     def _read(self) -> dict[int, Row]:
-        """The whole rows that are there, by the number of their case."""
+        """Reads the complete rows of the file, by the number of their case."""
         content, begin = read_bytes(self._path), _line(self._header)
         whole, tail = content[: content.rfind(b"\n") + 1], content[content.rfind(b"\n") + 1 :]
         if not whole and begin.startswith(tail):
-            return {}  # new, or killed in the middle of the header
+            return {}  # new, or interrupted while writing the header
         try:
             rows = list(csv.reader(io.StringIO(whole.decode(), newline=""), strict=True))
         except (UnicodeDecodeError, csv.Error):
@@ -141,7 +141,7 @@ def _value(text: str) -> float | bool:
 
 
 def _lock(path: Path) -> IO[bytes]:
-    """Holds `path`, which is made if it is not there, until it is closed."""
+    """Locks `path` until it is closed; creates the file if it does not exist."""
     try:
         file = open(path, "ab")  # noqa: SIM115
     except OSError as error:
@@ -162,18 +162,19 @@ except ImportError:
 
 
 class ParquetStudyTable(StudyTable):
-    """A `StudyTable` whose end is a Parquet file with the same columns.
+    """Variant of `StudyTable` that writes a Parquet file with the same columns at the end.
 
-    A Parquet file cannot be read before its end is written. So rows go, as they come, into a CSV file beside it, whose
-    name is the Parquet file's and `.rows.csv`; when all are there they become the Parquet file, and that one goes.
+    A Parquet file cannot be read before it is complete. Therefore the rows are first written to a CSV file with the
+    name of the Parquet file and the suffix `.rows.csv`. When all rows are available, they are converted to the Parquet
+    file, and the CSV file is removed.
     """
 
     def __init__(self, path: str | Path, study: Study) -> None:
-        """At `path`, which is new or was made by the same study.
+        """Opens the table at `path`, which is new or was written by the same study.
 
         Raises:
-            StudyError: as of a `StudyTable`, or pyarrow is not installed.
-            RecordingError: it cannot be read or written.
+            StudyError: As for a `StudyTable`, or pyarrow is not installed.
+            RecordingError: The file cannot be read or written.
         """
         if pyarrow is None:
             raise StudyError(f"{path}: Parquet needs pyarrow: pip install 'dvrk-drake[parquet]', or name a .csv")
@@ -183,7 +184,7 @@ class ParquetStudyTable(StudyTable):
         self.rows.update(finished)
 
     def sort(self) -> None:
-        """Writes the Parquet file, in the order of the cases, at once or not at all."""
+        """Writes the Parquet file in the order of the cases, as one atomic operation."""
         content = []
         for case in self._study.cases:
             key = {"study": self._study.fingerprint, **dataclasses.asdict(case), "case": case.index}
@@ -202,7 +203,7 @@ class ParquetStudyTable(StudyTable):
 
 
 def _finished_rows(path: Path, study: Study) -> dict[int, Row]:
-    """The rows of a finished study."""
+    """Reads the rows of a finished study."""
     try:
         content = pyarrow.parquet.read_table(path).to_pylist()
     except (OSError, pyarrow.ArrowException) as error:
@@ -215,7 +216,7 @@ def _finished_rows(path: Path, study: Study) -> dict[int, Row]:
 
 @dataclass(frozen=True)
 class Share:
-    """How many of `runs` answered yes; `lower`..`upper`: Wilson's 95 % interval of the share, for independent runs."""
+    """Number of `runs` with a true measure, and Wilson's 95 % interval `lower`..`upper` for independent runs."""
 
     yes: int
     runs: int
@@ -224,7 +225,7 @@ class Share:
 
     @classmethod
     def of(cls, yes: int, runs: int) -> Share:
-        """The share of `yes` among `runs`, with its interval."""
+        """Computes the share of `yes` among `runs` and its interval."""
         from scipy.stats import binomtest  # takes 0.3 s
 
         interval = binomtest(yes, runs).proportion_ci(method="wilson")
@@ -233,7 +234,7 @@ class Share:
 
 @dataclass(frozen=True)
 class Quantiles:
-    """Of one number of all runs, each the number of a run; a run that failed counts as infinite."""
+    """Quantiles of one measure over all runs. Failed runs count as infinite."""
 
     median: float
     percentile_95: float
@@ -242,7 +243,7 @@ class Quantiles:
 
 @dataclass(frozen=True)
 class Summary:
-    """Of one variation: how many of its `runs` failed, and each measure by its column."""
+    """Summary of one variation: the number of `runs`, the number of failed runs, and each measure by its column."""
 
     variation: str
     runs: int
@@ -251,7 +252,7 @@ class Summary:
 
 
 def summarise(study: Study, rows: Mapping[int, Row]) -> list[Summary]:
-    """One a variation, over the cases that have a row in `rows`; variations without any are left out."""
+    """Returns one summary per variation over the cases in `rows`. Variations without rows are omitted."""
     summaries = []
     for variation in study.variations:
         of_it = [rows[c.index] for c in study.cases if c.variation == variation.name and c.index in rows]
@@ -262,7 +263,7 @@ def summarise(study: Study, rows: Mapping[int, Row]) -> list[Summary]:
 
 
 def values_of(measure: Measure, rows: list[Row]) -> NDArray[np.float64]:
-    """(m,) of each run; of one that failed, the worst."""
+    """Returns the value of each run (m,); failed runs have the worst value."""
     return np.array([row.values.get(measure.column, measure.worst) for row in rows], float)
 
 
@@ -270,6 +271,6 @@ def _summary_of(measure: Measure, rows: list[Row]) -> Share | Quantiles:
     values = values_of(measure, rows)
     if measure.is_answer:
         return Share.of(int(values.sum()), len(values))
-    # Values of runs, not between runs: infinite ones have no middle.
+    # Do not interpolate between runs, since values can be infinite.
     median, percentile_95 = np.quantile(values, [0.5, 0.95], method="inverted_cdf")
     return Quantiles(float(median), float(percentile_95), float(values.max()))

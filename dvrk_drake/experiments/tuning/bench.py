@@ -39,7 +39,7 @@ def band(arm: Arm) -> NDArray[np.float64]:
 
 
 def effort_limits(arm: Arm) -> NDArray[np.float64]:
-    """Returns the maximum effort (n,) of each joint with zero effort of the others, limited by the arm and its motors."""
+    """Returns the maximum effort (n,) of each joint with zero effort of the others, limited by arm and motors."""
     motors = per_actuator(arm.effects.saturation, arm.joint_names, np.inf)
     # tau_joint = J' tau_actuator: one joint's effort needs these actuator efforts.
     share = np.abs(np.linalg.inv(arm.transmission.matrix).T)
@@ -223,7 +223,7 @@ def bench_of(arm: str, condition: Condition = NOMINAL) -> Bench:
 
 
 class JointOnBench:
-    """Implements `procedure.JointUnderTest`: the joint is released at a distance of `step` from the arm's middle pose."""
+    """Implementation of `procedure.JointUnderTest` that releases the joint at `step` from the middle pose."""
 
     def __init__(self, bench: Bench, joint: int) -> None:
         """Selects the joint with this index. The other joints are held with the arm's own gains."""

@@ -96,7 +96,7 @@ class JointUnderTest(Protocol):
     """Maximum effort [N m, N]."""
 
     def respond(self, kp: float, kd: float, ki: float, duration: float) -> tuple[NDArray, NDArray]:
-        """Returns times (m,) and measured distances (m,) from the desired position; the distance at time 0 is `step`."""
+        """Returns times (m,) and measured distances (m,) from the desired position, starting with `step` at time 0."""
         ...
 
 

@@ -57,27 +57,27 @@ def test_demo_writes_everything(result):
     assert len({what for what, _ in stages}) == 4
 
 
-def test_demo_beats_zero_torque_and_the_paper_on_fresh_poses(result):
+def test_demo_beats_zero_torque_and_paper_on_new_poses(result):
     _, outcome, _ = result
     for ours, paper in zip(outcome.fresh.joints[1:], outcome.fresh_paper.joints[1:], strict=True):
         assert ours.rms_error < 0.2 * ours.rms_torque, ours
         assert ours.rms_error < paper.rms_error, (ours, paper)
 
 
-def test_demo_finds_the_springs_that_it_put_in(result):
+def test_demo_identifies_simulated_springs(result):
     _, outcome, _ = result
     found = {(e.coordinate, e.kind): e.coefficient for e in outcome.identification.model.effects}
     assert found["joint.wrist_platform", "cable sine"] == pytest.approx(0.05, abs=0.01)
     assert found["joint.wrist_pitch", "cable sine"] == pytest.approx(-0.03, abs=0.003)
 
 
-def test_demo_drifts_less_than_with_the_nominal_model_and_comes_to_rest(result):
+def test_demo_drifts_less_than_nominal_and_stops(result):
     _, outcome, _ = result
     assert outcome.drift["identified"].max() < 0.3 * outcome.drift["as drawn"].max()
     assert outcome.step_error.max() < 1e-3
 
 
-def test_drift_is_shown_as_that_of_an_arm_without_friction(result):
+def test_drift_output_states_absence_of_friction(result):
     folder, outcome, _ = result
     assert "without dry friction" in TITLES["release.png"] and demo.NO_DRY_FRICTION in TITLES["release.png"]
     console = Console(record=True, width=120, file=io.StringIO())
@@ -88,7 +88,7 @@ def test_drift_is_shown_as_that_of_an_arm_without_friction(result):
     assert demo.NO_DRY_FRICTION in printed
 
 
-def test_perturbed_links_are_physically_consistent_and_differ():
+def test_perturbed_links_are_consistent_and_differ():
     arm = load_arm("mtml")
     links = perturbed_links(arm, np.random.default_rng(3), shift=0.002)
     for link, drawn in zip(links, link_inertias(arm), strict=True):
@@ -98,7 +98,7 @@ def test_perturbed_links_are_physically_consistent_and_differ():
         assert 0 < np.abs(M.get_com() - M_drawn.get_com()).max() <= 0.002
 
 
-def test_trajectory_rests_at_each_pose_and_stays_inside_the_limits():
+def test_trajectory_rests_at_poses_inside_limits():
     arm = load_arm("mtml")
     poses = arm.sample_poses(6, np.random.default_rng(0), margin=0.02)
     trajectory, settled = visiting_trajectory(arm, poses)

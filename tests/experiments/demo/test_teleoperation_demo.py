@@ -16,7 +16,7 @@ from dvrk_drake.experiments.demo.teleoperation import (
 
 
 @pytest.mark.slow
-def test_played_hand_lets_go_and_is_followed_within_half_a_millimetre():
+def test_tip_follows_hand_within_half_a_millimetre():
     shares = []
     meshcat = start_scene()
     result = play_teleoperation(meshcat, progress=shares.append)
@@ -37,7 +37,7 @@ def pressed(name):
     return b"\x82" + b"".join(text)
 
 
-def test_live_scene_obeys_its_sliders_and_buttons(monkeypatch):
+def test_live_scene_responds_to_sliders_and_buttons(monkeypatch):
     meshcat = start_scene()
     plan = {  # time [s]: what the user does
         0.1: lambda: meshcat.SetSliderValue("hand_z", 0.05),
@@ -69,7 +69,7 @@ def test_live_scene_obeys_its_sliders_and_buttons(monkeypatch):
     np.testing.assert_allclose(tips[4.0], tips[3.5], atol=3e-4)
 
 
-def test_cli_writes_the_recording_and_the_errors(tmp_path, monkeypatch, capsys):
+def test_cli_writes_recording_and_errors(tmp_path, monkeypatch, capsys):
     short = partial(play_teleoperation, duration=0.6)
     monkeypatch.setattr("dvrk_drake.experiments.demo.teleoperation.play_teleoperation", short)
     page = tmp_path / "teleop.html"
@@ -78,11 +78,11 @@ def test_cli_writes_the_recording_and_the_errors(tmp_path, monkeypatch, capsys):
     assert "position [mm]" in capsys.readouterr().out
 
 
-def test_cli_refuses_a_place_that_cannot_be_written(tmp_path, capsys):
+def test_cli_rejects_unwritable_output(tmp_path, capsys):
     assert main(["teleop", "--output", str(tmp_path / "nowhere" / "x.html")]) == 2
     assert "its folder does not exist" in capsys.readouterr().err
 
 
-def test_cli_refuses_a_port_that_is_none(capsys):
+def test_cli_rejects_invalid_port(capsys):
     assert main(["teleop", "--port", "80"]) == 2
     assert "port 80 cannot be opened" in capsys.readouterr().err

@@ -42,7 +42,7 @@ def stepped(motion):
     return scenario, Simulation(Recording(q=q + 0.01, qd=0 * q, tau=0 * q, t=T), state(q), None, desired)
 
 
-def test_a_joint_that_drifts_evenly_has_its_rate_and_its_way():
+def test_uniform_drift_has_known_rate_and_distance():
     run = released(elbow_pitch=-0.002 * T)
     assert Measure("drift_rate")(*run) == pytest.approx(0.002)
     assert Measure("drift", time=3.0)(*run) == pytest.approx(0.006)
@@ -56,14 +56,14 @@ def test_a_joint_that_drifts_evenly_has_its_rate_and_its_way():
     assert Measure("effort_share")(*run) == pytest.approx(0.25)
 
 
-def test_only_the_joints_that_are_named_count():
+def test_only_named_joints_are_evaluated():
     run = released(wrist_roll=0.1 * T, wrist_yaw=0.001 * T)
     assert Measure("drift_rate")(*run) == pytest.approx(0.1)
     assert Measure("drift_rate", joints=["wrist_yaw"])(*run) == pytest.approx(0.001)
     assert Measure("drift_rate", joints=["elbow_pitch"])(*run) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_what_a_hand_does_before_it_lets_go_does_not_count():
+def test_motion_before_release_by_hand_is_excluded():
     scenario, simulation = released(elbow_pitch=0.3 * np.minimum(T, 5.0) + 0.001 * np.maximum(T - 5.0, 0.0))
     scenario.hand.path = [Target(0.0, [0.0] * 7), Target(5.0, [0.0] * 7)]
     assert Measure("held")(scenario, simulation) is True
@@ -74,7 +74,7 @@ def test_what_a_hand_does_before_it_lets_go_does_not_count():
         Measure("held", time=15.1).check(scenario)
 
 
-def test_a_decaying_oscillation_settles_and_overshoots_as_its_formula_says():
+def test_settling_and_overshoot_of_decaying_oscillation():
     after = np.maximum(T - 2.0, 0.0)
     ring = 0.1 * np.exp(-after) * np.sin(2 * np.pi * after)
     run = stepped(0.4 * np.clip(T / 2, 0, 1) + ring)
@@ -88,20 +88,20 @@ def test_a_decaying_oscillation_settles_and_overshoots_as_its_formula_says():
     assert Measure("steady_error")(*run) == pytest.approx(0.0, abs=1e-8)
 
 
-def test_what_never_settles_is_infinite_and_a_late_disturbance_counts():
+def test_settling_time_is_infinite_or_includes_disturbance():
     assert Measure("settling_time")(*stepped(0.4 * np.clip(T / 2, 0, 1) + 0.002)) == math.inf
     bump = np.where(T[1500] == T, 0.01, 0.0)
     assert Measure("settling_time")(*stepped(0.4 * np.clip(T / 2, 0, 1) + bump)) == pytest.approx(13.01)
 
 
-def test_arriving_early_is_settled_at_once_and_not_overshot():
+def test_early_arrival_has_no_settling_time_or_overshoot():
     run = stepped(0.4 * np.clip(T / 1.9, 0, 1))
     assert Measure("settling_time")(*run) == 0.0
     assert Measure("overshoot")(*run) == 0.0
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_that_failed_counts_as_the_worst(kind):
+def test_failed_run_has_worst_value(kind):
     scenario, simulation = stepped(0.4 * np.clip(T / 2, 0, 1))
     measure = Measure(kind)
     measure.check(scenario)
@@ -123,11 +123,11 @@ def test_a_run_that_failed_counts_as_the_worst(kind):
         (Measure("drift", joints=["elbow"]), "unknown elbow; MTML has outer_yaw, shoulder_pitch, elbow_pitch"),
     ],
 )
-def test_nonsense_is_refused(measure, message):
+def test_rejects_invalid_measures(measure, message):
     with pytest.raises(StudyError, match=message):
         measure.check(stepped(T)[0])
 
 
-def test_overshoot_needs_a_target():
+def test_overshoot_requires_target():
     with pytest.raises(StudyError, match="overshoot needs a scenario with targets"):
         Measure("overshoot").check(released()[0])

@@ -96,7 +96,7 @@ def reference(tmp_path):
     return path.read_bytes()
 
 
-def test_the_table_has_one_row_a_case_with_all_that_repeats_it(reference):
+def test_table_has_one_reproducible_row_per_case(reference):
     rows = list(csv.DictReader(reference.decode().splitlines()))
     assert [int(row["case"]) for row in rows] == list(range(24))
     assert {(row["pose"], row["variation"], row["seed"]) for row in rows} == {
@@ -119,14 +119,14 @@ def test_the_table_has_one_row_a_case_with_all_that_repeats_it(reference):
 
 
 @pytest.mark.parametrize("executor", [lambda: ThreadPoolExecutor(2), lambda: ThreadPoolExecutor(7), Backwards])
-def test_the_table_does_not_depend_on_workers_nor_on_order(executor, reference, tmp_path):
+def test_table_does_not_depend_on_workers_or_order(executor, reference, tmp_path):
     with executor() as workers:
         run_study(make_study(), workers, tmp_path / "other.csv")
     assert (tmp_path / "other.csv").read_bytes() == reference
 
 
 @pytest.mark.parametrize("cases", [0, 1, 23])
-def test_lost_workers_lose_no_rows(cases, reference, tmp_path):
+def test_lost_workers_do_not_lose_rows(cases, reference, tmp_path):
     path = tmp_path / "killed.csv"
     message = rf"^{24 - cases} of 24 cases are missing: case"
     with Dying(cases) as executor, pytest.raises(StudyError, match=message) as loss:
@@ -140,7 +140,7 @@ def test_lost_workers_lose_no_rows(cases, reference, tmp_path):
     assert path.read_bytes() == reference
 
 
-def test_a_table_cut_at_any_byte_goes_on_to_the_same(reference, tmp_path):
+def test_truncated_table_is_completed_identically(reference, tmp_path):
     path = tmp_path / "cut.csv"
     for cut in [0, 3, reference.index(b"\n"), *np.random.default_rng(0).integers(0, len(reference), 20)]:
         path.write_bytes(reference[:cut])
@@ -149,7 +149,7 @@ def test_a_table_cut_at_any_byte_goes_on_to_the_same(reference, tmp_path):
         assert path.read_bytes() == reference
 
 
-def test_a_finished_study_runs_nothing(reference, tmp_path):
+def test_finished_study_runs_nothing(reference, tmp_path):
     path = tmp_path / "done.csv"
     path.write_bytes(reference)
     with Dying(0) as executor:
@@ -170,7 +170,7 @@ def test_a_finished_study_runs_nothing(reference, tmp_path):
         {"measures": [Measure("held", time=2.0)]},
     ],
 )
-def test_going_on_with_another_study_is_refused_and_changes_nothing(change, reference, tmp_path):
+def test_rejects_table_of_another_study_unchanged(change, reference, tmp_path):
     path = tmp_path / "begun.csv"
     begun = reference[: len(reference) // 2]
     path.write_bytes(begun)
@@ -190,7 +190,7 @@ def test_going_on_with_another_study_is_refused_and_changes_nothing(change, refe
         (lambda text: text.replace(b",false,", b",nearly,", 1), "was changed by hand: could not convert"),
     ],
 )
-def test_what_is_no_table_of_it_is_refused_and_left_alone(change, message, reference, tmp_path):
+def test_rejects_other_files_and_leaves_them_unchanged(change, message, reference, tmp_path):
     path = tmp_path / "foreign.csv"
     path.write_bytes(change(reference))
     with ThreadPoolExecutor(1) as executor, pytest.raises(StudyError, match=message):
@@ -198,7 +198,7 @@ def test_what_is_no_table_of_it_is_refused_and_left_alone(change, message, refer
     assert path.read_bytes() == change(reference)
 
 
-def test_two_studies_do_not_write_one_file(tmp_path):
+def test_two_studies_cannot_write_the_same_file(tmp_path):
     path = tmp_path / "both.csv"
     with (
         StudyTable(path, make_study()),
@@ -208,7 +208,7 @@ def test_two_studies_do_not_write_one_file(tmp_path):
         run_study(make_study(), executor, path)
 
 
-def test_an_interrupted_study_keeps_its_rows_and_cancels_the_rest(reference, tmp_path):
+def test_interrupted_study_keeps_rows_and_cancels_rest(reference, tmp_path):
     path = tmp_path / "interrupted.csv"
 
     def interrupt(done, all_cases):
@@ -223,7 +223,7 @@ def test_an_interrupted_study_keeps_its_rows_and_cancels_the_rest(reference, tmp
     assert path.read_bytes() == reference
 
 
-def test_parquet_holds_what_the_csv_holds(reference, tmp_path):
+def test_parquet_matches_csv(reference, tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra parquet")
     path = tmp_path / "results.parquet"
     with Dying(9) as executor, pytest.raises(StudyError):
@@ -243,7 +243,7 @@ def test_parquet_holds_what_the_csv_holds(reference, tmp_path):
         run_study(make_study(seeds=[5]), executor, path)
 
 
-def test_shares_have_wilsons_interval_and_failed_runs_count_as_the_worst(tmp_path):
+def test_wilson_interval_counts_failed_runs_as_worst(tmp_path):
     study = make_study(random_poses=RandomPoses(60, seed=1))
     with ThreadPoolExecutor(1) as executor:
         rows = run_study(study, executor, tmp_path / "r.csv")
@@ -263,7 +263,7 @@ def test_shares_have_wilsons_interval_and_failed_runs_count_as_the_worst(tmp_pat
     assert drift.largest == math.inf
 
 
-def test_the_report_names_each_measure_and_each_error(tmp_path):
+def test_report_lists_all_measures_and_errors(tmp_path):
     study = make_study()
     with ThreadPoolExecutor(1) as executor:
         rows = run_study(study, executor, tmp_path / "r.csv")
@@ -277,7 +277,7 @@ def test_the_report_names_each_measure_and_each_error(tmp_path):
     assert (tmp_path / "study.png").stat().st_size > 10_000
 
 
-def test_a_case_repeats_as_a_scenario():
+def test_case_can_be_repeated_as_scenario():
     study = make_study()
     for case in study.cases:
         scenario = study.scenario_of(case)
@@ -288,7 +288,7 @@ def test_a_case_repeats_as_a_scenario():
     assert make_study().fingerprint == study.fingerprint
 
 
-def test_the_parameter_error_is_drawn_by_the_seed_within_its_bounds():
+def test_parameter_error_depends_on_seed_within_bounds():
     study = make_study()
     exact, wrong, _, other = (study.scenario_of(case).model for case in study.cases[:4])
     some = exact.theta != 0

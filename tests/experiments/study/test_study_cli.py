@@ -73,12 +73,12 @@ def study_refusal(capsys, path, *options):
         ((STUDY, ""), "study.yaml"),
     ],
 )
-def test_nonsense_is_refused_in_one_line(change, message, study, capsys):
+def test_invalid_settings_give_one_line_error(change, message, study, capsys):
     study.write_text(STUDY.replace(*change))
     assert message in study_refusal(capsys, study)
 
 
-def test_files_and_places_that_do_not_work_are_refused(study, tmp_path, capsys):
+def test_rejects_invalid_files_and_outputs(study, tmp_path, capsys):
     assert "no such file" in study_refusal(capsys, tmp_path / "other.yaml")
     assert "--set duration: must be key=value" in study_refusal(capsys, study, "--set", "duration")
     assert "cannot be made a folder" in study_refusal(capsys, study, "--plots", str(study))
@@ -93,12 +93,12 @@ def test_files_and_places_that_do_not_work_are_refused(study, tmp_path, capsys):
     assert study.read_text() == STUDY
 
 
-def test_numbers_of_workers_that_are_none_are_refused(study, capsys):
+def test_rejects_invalid_number_of_workers(study, capsys):
     for workers in ("0", "-1", "many"):
         assert "--workers" in study_refusal(capsys, study, "--workers", workers)
 
 
-def test_schedulers_that_are_none_are_refused(study, capsys, monkeypatch):
+def test_rejects_invalid_schedulers(study, capsys, monkeypatch):
     monkeypatch.setattr("dvrk_drake.experiments.study.study.TIMEOUT", 0.3)
     pytest.importorskip("distributed", reason="needs the extra dask")
     assert "is no address of a scheduler; allowed: tcp://HOST:PORT" in study_refusal(
@@ -107,25 +107,25 @@ def test_schedulers_that_are_none_are_refused(study, capsys, monkeypatch):
     assert "no Dask scheduler answers there" in study_refusal(capsys, study, "--scheduler", "tcp://127.0.0.1:1")
 
 
-def test_the_example_is_a_study():
+def test_example_is_valid_study():
     study = load_study(ROOT / "examples" / "release_study.yaml")
     assert len(study.cases) == 60
 
 
-def test_settings_of_the_command_line_come_after_the_files(study):
+def test_command_line_settings_override_file(study):
     load = load_study(study, ["duration=1.5"])
     assert [scenario.duration for scenario in load.scenarios.values()] == [1.5]
     assert load.fingerprint != load_study(study).fingerprint
 
 
-def test_without_poses_the_scenarios_own_start_is_taken(study):
+def test_default_pose_is_start_of_scenario(study):
     study.write_text(STUDY.replace("random_poses: {count: 3, seed: 1}", ""))
     (case,) = load_study(study).cases
     psm = load_arm("psm")
     assert case.start == tuple(np.clip(0.0, psm.position_lower, psm.position_upper))
 
 
-def test_files_that_a_study_names_may_be_relative(study, tmp_path, monkeypatch):
+def test_study_accepts_relative_paths(study, tmp_path, monkeypatch):
     (tmp_path / "scenario.yaml").write_text("arm: psm\nduration: 1\n")
     study.write_text(STUDY.replace("scenario: psm", "scenario: scenario.yaml"))
     monkeypatch.chdir(tmp_path)

@@ -91,7 +91,7 @@ def children_of(process):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds workers in /proc")
-def test_a_killed_study_goes_on_and_a_killed_worker_costs_nothing(study, started, sell, tmp_path, monkeypatch):
+def test_study_survives_killed_process_and_worker(study, started, sell, tmp_path, monkeypatch):
     monkeypatch.setattr(study_module, "simulate", formula_study.simulate)
     path = tmp_path / "killed.csv"
     command = [FORMULA, "study", study, "--output", path, "--workers", 2]
@@ -116,7 +116,7 @@ def test_a_killed_study_goes_on_and_a_killed_worker_costs_nothing(study, started
     assert path.read_bytes() == undisturbed(study)
 
 
-def test_a_dask_cluster_that_loses_a_worker_gives_the_same(study, started, tmp_path):
+def test_dask_cluster_survives_lost_worker(study, started, tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs the extra dask")
     path, address = tmp_path / "dask.csv", tmp_path / "scheduler.json"
     options = ["--no-dashboard", "--scheduler-file", address]
@@ -139,7 +139,7 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same(study, started, tmp_p
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds workers in /proc")
-def test_ctrl_c_ends_in_one_line_and_leaves_no_worker(study, started, sell, tmp_path):
+def test_ctrl_c_prints_one_line_and_ends_workers(study, started, sell, tmp_path):
     path = tmp_path / "interrupted.csv"
     sell(1)
     run = started(FORMULA, "study", study, "--output", path, "--workers", 2)
