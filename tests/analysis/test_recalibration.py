@@ -1,4 +1,4 @@
-"""Recalibration of friction from a short recording of another day: changed terms, unchanged terms, rejected recordings."""
+"""Recalibration of friction from a short recording of another day, and recordings that are rejected."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ NOISE = 0.02
 
 
 def days(name, seed=0):
-    """Returns the model of the first day, the ground truth of the second (other friction and offsets), and a generator."""
+    """Returns the model of the first day, the second day's ground truth (friction and offsets differ), and a generator."""
     arm, generator = load_arm(name), np.random.default_rng(seed)
     _, q, v, vd = fourier_motion(arm, np.random.default_rng(1000), 8.0, 8.0, 1000.0)
     bare = true_dynamics(arm, np.random.default_rng(seed), [])

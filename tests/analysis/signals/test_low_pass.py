@@ -20,7 +20,7 @@ def sine_and_cosine(x, frequency):
 @pytest.mark.parametrize("frequency", [2.0, 10.0, 18.0, 20.0, 22.0, 40.0])
 def test_low_pass_has_the_butterworth_gain_and_no_delay(frequency):
     in_phase, late = sine_and_cosine(low_pass(np.sin(2 * np.pi * frequency * T), RATE, 20.0), frequency)
-    # The gain is Butterworth's |H|^2 because the filter runs in both directions. The bilinear transform warps frequencies.
+    # The gain is Butterworth's |H|^2, because the filter runs both ways. The bilinear transform warps frequencies.
     ratio = np.tan(np.pi * frequency / RATE) / np.tan(np.pi * 20.0 / RATE)
     assert in_phase == pytest.approx(1 / (1 + ratio ** (2 * ORDER)), abs=1e-3)
     assert late == pytest.approx(0.0, abs=1e-3)

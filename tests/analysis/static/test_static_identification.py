@@ -29,7 +29,7 @@ def arm():
 
 
 def simulated(arm, poses=60, seed=0, noise=0.0, effects=(), coefficients=(), scale=1.0):
-    """Returns poses within the limits with exact holding torques plus noise, as a share of each joint's effort limit."""
+    """Returns poses within the limits with exact holding torques plus noise, a share of each joint's effort limit."""
     generator = np.random.default_rng(seed)
     model = compile_static_model(arm, tuple(effects))
     theta = np.array([*(scale * model.gravity.base_values), *coefficients])
