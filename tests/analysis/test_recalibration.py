@@ -24,7 +24,7 @@ NOISE = 0.02
 
 
 def days(name, seed=0):
-    """Returns the model of the first day, the second day's ground truth (friction and offsets differ), and a generator."""
+    """Returns the model of the first day, the second day's ground truth (other friction and offsets), a generator."""
     arm, generator = load_arm(name), np.random.default_rng(seed)
     _, q, v, vd = fourier_motion(arm, np.random.default_rng(1000), 8.0, 8.0, 1000.0)
     bare = true_dynamics(arm, np.random.default_rng(seed), [])

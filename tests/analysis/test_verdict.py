@@ -77,7 +77,7 @@ def test_the_worst_verdict_and_the_joints_that_fail():
 
 @pytest.mark.parametrize("name", ["mtmr", "psm"])
 def test_small_error_is_below_friction_and_above_noise(name):
-    """Small errors are below the dry friction of each joint but the PSM's roll, and ten times above the effort noise."""
+    """Small errors are below the dry friction of each joint but the PSM's roll, ten times above the effort noise."""
     arm = load_arm(name)
     friction = dict.fromkeys(arm.joint_names, 0.0)
     for effect in arm.effects.friction:
