@@ -167,7 +167,7 @@ def test_refit_is_validated_on_held_out_phases():
     assert np.mean(after) > np.mean(before)
 
 
-def test_from_the_command_line(tmp_path, capsys):
+def test_recalibrate_command(tmp_path, capsys):
     model, truth, generator = days("psm")
     paths = {name: str(tmp_path / name) for name in ("model.yaml", "short.csv", "new.yaml", "static.yaml")}
     model.save(paths["model.yaml"])
