@@ -1,4 +1,4 @@
-"""Friction of another day from a short recording: what is refitted, what stays, and what is refused."""
+"""Recalibration of friction from a short recording of another day, and recordings that are rejected."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ NOISE = 0.02
 
 
 def days(name, seed=0):
-    """The model of the first day, the truth of the second (friction and offsets differ), and a generator."""
+    """Returns the model of the first day, the second day's ground truth (other friction and offsets), a generator."""
     arm, generator = load_arm(name), np.random.default_rng(seed)
     _, q, v, vd = fourier_motion(arm, np.random.default_rng(1000), 8.0, 8.0, 1000.0)
     bare = true_dynamics(arm, np.random.default_rng(seed), [])
@@ -51,7 +51,7 @@ def test_friction_and_offsets_of_another_day_are_estimated(name):
     result = refit_friction(model, motion(truth, generator))
     other = motion(truth, generator, seconds=16.0, seed=6)
     before, after = errors(model, other), errors(result.model, other)
-    # The friction of the second day has the shape of the first's, so that little more than noise is left.
+    # The friction of the second day has the same shape as that of the first, so the residual is little more than noise.
     assert np.mean(before) > 2 * np.mean(after)
     assert np.all(after < 2 * NOISE)
     assert all(a.kept for a in result.actuators)
@@ -70,7 +70,7 @@ def test_rigid_bodies_and_holding_torques_are_unchanged():
     new, arm = result.model, model.arm
     assert new.dynamics.links == model.dynamics.links and new.dynamics.rotors == model.dynamics.rotors
     assert new.base_parameters == model.base_parameters
-    # An offset that a motion shows is no torque that holds an arm (`IdentifiedModel.holding_effects`).
+    # An offset estimated from a motion is not a holding torque (`IdentifiedModel.holding_effects`).
     q = arm.sample_poses(3, np.random.default_rng(0))
     offsets = np.array([a.offset for a in result.actuators])
     np.testing.assert_allclose(new.holding_torque(q), model.holding_torque(q), atol=1e-12)
@@ -139,7 +139,7 @@ def test_wrong_sign_is_rejected_in_short_recordings(name, seconds):
 
 
 def test_error_after_is_from_held_out_parts():
-    """Friction that goes wild in one part of the motion can be fitted there, but not predicted from the other parts."""
+    """Irregular friction in one part of the motion can be fitted there, but not predicted from the other parts."""
     model, truth, generator = days("psm")
     recording = motion(truth, generator).in_actuator_coordinates(truth.arm)
     tau = recording.tau.copy()
@@ -153,7 +153,7 @@ def test_error_after_is_from_held_out_parts():
 
 
 def test_refit_is_validated_on_held_out_phases():
-    """Friction that differs in one half of the phases alone is no gain for the other half."""
+    """Friction that differs in one half of the phases does not improve the prediction of the other half."""
     model, truth, generator = days("psm")
     recording = motion(truth, generator, seconds=16.0)
     before, after = predict_other_phases(model, recording, 2)
@@ -163,11 +163,11 @@ def test_refit_is_validated_on_held_out_phases():
     old = motion(model.dynamic_model, np.random.default_rng(0), seconds=16.0)
     mixed = dataclasses.replace(old, tau=np.where(half[:, None], recording.tau, old.tau))
     before, after = predict_other_phases(model, mixed, 2)
-    # Each refit learns the friction that the other half does not have.
+    # Each refit estimates friction that the other half does not have.
     assert np.mean(after) > np.mean(before)
 
 
-def test_from_the_command_line(tmp_path, capsys):
+def test_recalibrate_command(tmp_path, capsys):
     model, truth, generator = days("psm")
     paths = {name: str(tmp_path / name) for name in ("model.yaml", "short.csv", "new.yaml", "static.yaml")}
     model.save(paths["model.yaml"])

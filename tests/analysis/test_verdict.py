@@ -1,4 +1,4 @@
-"""The verdict on each joint of a model: the rule, its evidence, and where `validate` and `run` take it from."""
+"""Verdict on each joint of a model: the rule, its evidence, and its use in `validate` and `run`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from dvrk_drake.recordings.recording import Recording, read_recording, write_rec
         (1.0, 0.51, "usable", "do not use"),
         (1.0, 0.99, "usable", "do not use"),
         (1.0, 1.01, "do not use", "do not use"),
-        # The limit is 10: up to 0.2 is small, whatever the ratio.
+        # The effort limit is 10, so errors up to 0.2 are small at any ratio.
         (0.01, 0.19, "usable", "usable"),
         (0.01, 0.21, "do not use", "do not use"),
         (0.01, 0.003, "good", "good"),
@@ -77,7 +77,7 @@ def test_the_worst_verdict_and_the_joints_that_fail():
 
 @pytest.mark.parametrize("name", ["mtmr", "psm"])
 def test_small_error_is_below_friction_and_above_noise(name):
-    """Below the dry friction of each joint but the PSM's roll, ten times above the noise of measured efforts."""
+    """Small errors are below the dry friction of each joint but the PSM's roll, ten times above the effort noise."""
     arm = load_arm(name)
     friction = dict.fromkeys(arm.joint_names, 0.0)
     for effect in arm.effects.friction:
@@ -104,7 +104,7 @@ def poses(truth, seed=0, count=20):
 
 
 def wrong_model(truth):
-    """Joints 1 and 7 are off, all others are exact."""
+    """Returns a model in which joints 1 and 7 are off and all others are exact."""
     joints = [dataclasses.replace(j, feedforward_scale=0.0) if i in (0, 6) else j for i, j in enumerate(truth.joints)]
     return dataclasses.replace(truth, joints=joints)
 
@@ -129,7 +129,7 @@ def test_disabled_joint_is_off_and_a_wrong_one_fails(truth):
 
 
 def test_measurements_at_a_stop_are_excluded(truth):
-    """One pose presses on the shoulder's stop with ten times its weight: no model predicts that."""
+    """One pose is at the shoulder's stop with ten times its gravity torque, which no model predicts."""
     recording = poses(truth)
     q = recording.q.copy()
     q[3, 1] = ARM.position_lower[1]
@@ -154,7 +154,7 @@ def test_actuators_not_driving_off_joints_are_judged(truth):
 
 @pytest.fixture
 def files(tmp_path, truth):
-    """A model, a recording that it passes, and one that has 0.3 of its torque at joint 2."""
+    """Returns a model, a recording that it passes, and a recording with 0.3 of its torque at joint 2."""
     model, good, bad = (str(tmp_path / name) for name in ("model.yaml", "good.csv", "bad.csv"))
     wrong_model(truth).save(model)
     recording = poses(truth)
@@ -185,7 +185,7 @@ def test_require_sets_the_exit_code_and_names_the_joints(files, tmp_path, capsys
 
 
 def test_closed_pipe_fails_and_keeps_the_verdicts(files):
-    """`validate ... | head -1` with pipefail: the pipe is closed before anything is written."""
+    """`validate ... | head -1` with pipefail: the pipe closes before anything is written."""
     model, _, bad = files
     read, write = os.pipe()
     os.close(read)
@@ -234,7 +234,7 @@ def test_saved_verdicts_include_all_joints(truth, tmp_path):
 
 
 def test_run_warns_before_connecting_to_the_arm(files, monkeypatch, capsys):
-    """`ready_controller`, which run and collect share, up to where it would open the network."""
+    """Runs `ready_controller`, shared by run and collect, until it would open the network."""
     from dvrk_drake.cli import lcm
 
     def stop(_):

@@ -1,4 +1,4 @@
-"""Effects that drives are known to have, those that a motion must ask for, and parts that nothing is learnt from."""
+"""Selection of drive effects: mandatory effects, candidates, and held-out folds."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -35,11 +35,11 @@ def test_effects_of_the_arm_file_are_mandatory():
     always, candidates = drive_effects(arm, moving(arm)), optional_effects(arm, moving(arm))
     assert not set(always) & set(candidates)
     assert {("cable sine", 1.0), ("cable cosine", 1.0)} <= of(always, "actuator.pitch")
-    # Beside a torque by position no other one is tried; friction is.
+    # A known position-dependent torque excludes other such candidates, but not friction.
     assert of(candidates, "actuator.pitch") == {(k, 0.0) for k in ("coulomb forward", "stribeck", "load coulomb")}
     assert ("coulomb forward", 0.0) in of(always, "actuator.jaw")
     assert {("spring", 0.0), ("cable sine", 2.0)} <= of(candidates, "actuator.jaw")
-    # What slides has no turns.
+    # Prismatic coordinates have no cable effects.
     assert not any("cable" in kind for kind, _ in of(candidates, "actuator.insertion"))
 
 
@@ -81,7 +81,7 @@ def test_held_out_folds_exclude_adjoining_rows():
         others = whole.without(first, 2)
         assert others.folds == FOLDS - 2
         np.testing.assert_allclose(others.total.dense()[0], kept.T @ kept, atol=1e-9)
-        # And again: a fold of the others, with what touches it.
+        # A second held-out fold, with its adjoining rows.
         second = others.without_fold(3)
         out = fold == (first + 2 + 3) % FOLDS
         touches |= ((fold == (first + 4) % FOLDS) & edge[:, 1]) | ((fold == (first + 6) % FOLDS) & edge[:, 0])
@@ -90,7 +90,7 @@ def test_held_out_folds_exclude_adjoining_rows():
 
 
 def test_present_effects_are_selected_and_noise_is_not():
-    """One column always, one that explains half of the effort, twenty of nothing; also without two of the parts."""
+    """One mandatory column, one that explains half of the effort, and twenty of noise; also with two folds held out."""
     true = np.zeros(22)
     true[:2] = 1.0
     for seed in range(5):

@@ -1,4 +1,4 @@
-"""Standard errors in motion against what many simulated experiments show."""
+"""Standard errors of dynamic parameters, compared with the spread of many simulated experiments."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def noise(generator, count=1):
 
 
 def independent_measurements(covariance):
-    """How many independent values tell as much of a variance as r with this covariance (r,)."""
+    """Returns the number of independent values for r values with this covariance (r,)."""
     count = len(covariance)
     pairs = 2 * np.arange(count, 0, -1)
     pairs[0] = count
@@ -38,7 +38,7 @@ def test_independent_values_of_filtered_white_noise():
 
 
 def test_an_error_that_repeats_counts_once():
-    """Four periods of the same error tell as much as one."""
+    """Four periods of the same error contain as much information as one."""
     generator = np.random.default_rng(1)
     counts = []
     for _ in range(20):
@@ -50,7 +50,7 @@ def test_an_error_that_repeats_counts_once():
 
 @pytest.mark.parametrize("repeating", [0.0, 1.0])
 def test_standard_errors_are_the_spread_of_repeated_fits(repeating):
-    """Two actuators, a motion of four periods, white noise and (or not) an error that comes again in every period."""
+    """Two actuators, a motion of four periods, white noise, and optionally an error that repeats in every period."""
     generator = np.random.default_rng(2)
     w = 2 * np.pi * np.arange(1, 4) / PERIOD
     slow, fast = (np.hstack([np.sin(f * w * T[:, None]), np.cos(f * w * T[:, None])]) for f in (1, 5))
@@ -71,7 +71,7 @@ def test_standard_errors_are_the_spread_of_repeated_fits(repeating):
         estimates.append(fit.x)
         predicted.append(np.diag(parameter_covariance(problem, fit, left, RATE, CUT_OFF, PERIOD)))
     spread, mean = np.std(estimates, axis=0), np.sqrt(np.mean(predicted, axis=0))
-    # The spread of 100 fits is known to 7 % (1 sigma).
+    # The standard error of the spread of 100 fits is 7 %.
     np.testing.assert_allclose(mean, spread, rtol=0.2, atol=0)
     assert np.mean(mean / spread) == pytest.approx(1.0, abs=0.1)
 

@@ -1,4 +1,4 @@
-"""Full dynamics of simulated arms whose truth is known, from motion to model file to prediction."""
+"""Dynamic identification of simulated arms with known parameters, from motion to model file to prediction."""
 
 import dataclasses
 from collections import Counter
@@ -28,7 +28,7 @@ RATE = 1000.0
 
 
 def simulated(name, seed):
-    """An arm with friction at every actuator, and its motion: truth, recording, generator."""
+    """Returns the ground truth of an arm with friction at every actuator, its recording, and a generator."""
     arm, generator = load_arm(name), np.random.default_rng(seed)
     motion = fourier_motion(arm, generator, 10.0, 20.0, RATE)
     truth = true_dynamics(arm, np.random.default_rng(seed), friction_everywhere(arm, motion))
@@ -54,7 +54,7 @@ def test_another_motion_is_predicted_below_the_noise(case):
 def test_cross_validated_error_is_at_least_the_noise(case):
     _, _, _, result = case
     for a in result.model.dynamics.actuators:
-        # What the low-pass leaves of white noise, and little more; the fit cannot be below the repeatability floor.
+        # The error is slightly above the filtered white noise. The fit error is not below the repeatability floor.
         assert 0.9 * a.rms_repeatability <= a.rms_fit * np.sqrt(2) and a.rms_fit < 0.03 * a.rms_effort
         assert a.rms_fit <= a.rms_cross_validation < NOISE * a.rms_effort
 
@@ -67,12 +67,12 @@ def test_true_base_parameters_and_rotors_lie_in_their_intervals(case):
     z = [(p.value - b) / p.standard_error for p, b in zip(result.model.base_parameters, beta, strict=True)]
     rotors = zip(result.model.dynamics.rotors, truth.section.rotors, strict=True)
     z += [(e.value - t.value) / e.standard_error for e, t in rotors if t.value > 0]
-    # 95 % intervals of some twenty numbers: at least 90 % inside, none far off.
+    # 95 % intervals of about twenty parameters: at least 90 % contain the true value, and no error is large.
     assert np.mean(np.abs(z) < 1.96) >= 0.9 and np.max(np.abs(z)) < 4
 
 
 def test_base_parameters_of_the_motion_lie_in_their_intervals(case):
-    """All that the motion tells of links and rotors, by name."""
+    """All identifiable parameters of links and rotors, by name."""
     _, truth, _, result = case
     base = derive_base_parameters(truth.regressor, coupled_rotors=False)
     found = result.model.dynamics.base_parameters
@@ -81,7 +81,7 @@ def test_base_parameters_of_the_motion_lie_in_their_intervals(case):
     z = [(p.value - b) / p.standard_error for p, b in zip(found, beta, strict=True) if p.identifiability > 0.5]
     assert len(z) > 20
     assert np.mean(np.abs(z) < 1.96) >= 0.9 and np.max(np.abs(z)) < 4
-    # A prior that the motion does not change keeps its variance; one that it does becomes narrower.
+    # The variance equals that of the prior if the motion is not informative, and is smaller otherwise.
     assert all(0 <= p.identifiability <= 1 for p in found) and min(p.identifiability for p in found) < 0.2
 
 
@@ -144,7 +144,7 @@ def test_model_file_round_trip(case, tmp_path):
 
 
 def test_commands_reject_an_invalid_motion(case, tmp_path, capsys):
-    """One effort of 500 N m, as a torn line of a file gives: neither identified from, nor compared, nor predicted."""
+    """One effort of 500 N m, as in a damaged line of a file, prevents identification, validation and prediction."""
     arm, _, recording, result = case
     tau = recording.tau.copy()
     tau[500, 1] = 500.0
@@ -164,7 +164,7 @@ def test_commands_reject_an_invalid_motion(case, tmp_path, capsys):
 
 
 def test_motion_without_efforts_is_predicted_not_validated(case, tmp_path, capsys):
-    """Efforts follow from positions alone: the same with and without those that were measured."""
+    """The prediction depends on positions only, so it is the same with and without measured efforts."""
     _, _, recording, result = case
     paths = {name: str(tmp_path / name) for name in ("with.csv", "without.csv", "model.yaml")}
     write_recording(recording, paths["with.csv"])
@@ -191,7 +191,7 @@ def test_actuator_coordinates_give_the_same_dynamic_model(case):
 
 
 def test_plants_and_conversions_are_computed_once(case, monkeypatch):
-    """A plant for each mounting: as expected, and as the motion shows it."""
+    """One plant for each mounting: nominal, and estimated from the motion."""
     arm, _, recording, _ = case
     made = Counter()
 

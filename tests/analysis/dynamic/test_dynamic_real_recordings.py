@@ -1,7 +1,7 @@
-"""The public excitation motions of a real MTM and PSM: what the phases of a motion predict of each other.
+"""Identification on the public excitation motions of a real MTM and PSM, with errors on held-out phases.
 
-Published, on another motion of these arms (Wang et al., RA-L 2019, recomputed): MTM 8.2 16.3 19.1 20.9 26.3 23.5 34.0,
-mean 21.2 %; PSM 10.3 18.3 19.8 13.4 24.0 21.1 26.6, mean 19.1 %. No phase's prediction may be worse than these.
+Published errors on another motion of these arms (Wang et al., RA-L 2019, recomputed) are the upper limits: MTM 8.2 16.3
+19.1 20.9 26.3 23.5 34.0, mean 21.2 %; PSM 10.3 18.3 19.8 13.4 24.0 21.1 26.6, mean 19.1 %.
 """
 
 import dataclasses
@@ -26,16 +26,16 @@ PUBLISHED = {
     "mtmr": [8.18, 16.31, 19.06, 20.90, 26.30, 23.48, 33.96],
     "psm": [10.28, 18.28, 19.76, 13.44, 23.99, 21.11, 26.62],
 }
-#: Means over the joints that are asked for on motions that were not used [%].
+#: Required means over the joints on motions that were not used for fitting [%].
 TARGET = {"mtmr": 15.0, "psm": 11.4}
-#: As computed from the files without any model (their README), of the motion that is fitted [%].
+#: Repeatability floor of the fitted motion, computed from the files without a model (see their README) [%].
 FLOOR = {"mtmr": [4.5, 15.2, 6.7, 4.3, 16.3, 10.3, 19.2], "psm": [1.4, 2.0, 15.3, 3.1, 1.4, 1.9, 2.2]}
 FILES = {"mtmr": "mtm_one.csv", "psm": "psm_one.csv"}
 
 
 @pytest.fixture(scope="module", params=FILES)
 def case(request, shared_data, tmp_path_factory):
-    """Name, arm, recording, what `dvrk-drake identify` writes of it, and the folder that all that is in."""
+    """Returns name, arm, recording, output of `dvrk-drake identify`, and the folder with its files."""
     path = shared_data / "trajectories" / FILES[request.param]
     if not path.is_file():
         pytest.skip(f"needs {path}")
@@ -56,7 +56,7 @@ def percent(model, which):
 
 
 def test_cross_validated_error_is_below_the_published_error(case):
-    """By models that know nothing of them: neither parameters nor effects nor how the base leans."""
+    """Parameters, effects and base tilt are estimated without the held-out phases."""
     name, _, _, model, _ = case
     error = percent(model, "rms_cross_validation")
     assert np.mean(error) <= TARGET[name]
@@ -78,7 +78,7 @@ def test_identified_arm_is_consistent_and_can_be_simulated(case):
 def test_validation_reproduces_the_fit_error(case):
     _, _, recording, model, _ = case
     validation = validate_motion(model, recording)
-    # The tilt enters the fit to first order, and effects of no weight are left out of the model.
+    # The fit is linear in the tilt, and the model omits negligible effects.
     fitted = percent(model, "rms_fit")
     np.testing.assert_allclose([100 * a.relative_error for a in validation.actuators], fitted, rtol=0.02, atol=0)
 
@@ -99,7 +99,7 @@ def test_commands_accept_a_real_motion(case, tmp_path):
 
 
 def test_holding_effects_do_not_increase_static_errors(case, shared_data):
-    """On poses of other years: an offset of a motion where weight acts is none at rest."""
+    """The poses are from other years. An offset that a motion shows under gravity load is not a holding torque."""
     name, _, _, model, _ = case
     if name != "mtmr":
         pytest.skip("poses at rest were recorded of the MTM")
@@ -112,14 +112,14 @@ def test_holding_effects_do_not_increase_static_errors(case, shared_data):
             for tau in (model.holding_torque(poses.q), model.static_model.torque(poses.q, theta))
         ]
         assert np.all(errors[0] <= 1.02 * errors[1] + 1e-4)
-        # Little is left of the weight at shoulder and elbow, and of the spring at the wrist pitch.
+        # The residual gravity at shoulder and elbow is small, and so is the residual spring torque at the wrist pitch.
         zero = np.sqrt(np.mean(poses.measured_effort() ** 2, axis=0))
         assert np.all(errors[0][[1, 2, 4]] < [0.15 * zero[1], 0.35 * zero[2], 0.25 * errors[1][4]])
 
 
 @pytest.fixture(scope="module")
 def another_day(case, shared_data):
-    """The model, and the same motion on another day."""
+    """Returns the model, and the same motion on another day."""
     name, arm, _, model, _ = case
     if name != "psm":
         pytest.skip("recorded on another day: only the PSM")
@@ -132,17 +132,17 @@ def errors(model, recording):
 
 
 def test_rigid_body_is_valid_on_another_day(another_day):
-    """A wrist's cables are not the same on another day; the weight that the first joints carry is."""
+    """Wrist cables differ between days. Gravity at the first joints does not."""
     model, other = another_day
     validation = validate_motion(model, other)
     error = np.array([100 * a.relative_error for a in validation.actuators])
     assert np.all(error[:3] <= PUBLISHED["psm"][:3])
-    # Friction of the wrist is what changed: it, not position or bias, is most of what a person sees there.
+    # The wrist friction changed. It is the largest part of the error there, not position or bias.
     assert all(a.friction_like > a.position_dependent for a in validation.actuators[3:])
 
 
 def test_recalibration_on_a_third_improves_the_rest(another_day):
-    """The wrist's errors fall from 21..30 % to at most 20 % on the two thirds of the recording that were not used."""
+    """The wrist errors fall from 21..30 % to at most 20 % on the two thirds of the recording that are held out."""
     model, whole = another_day
     third = len(whole) // 3
 

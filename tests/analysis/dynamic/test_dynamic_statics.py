@@ -1,4 +1,4 @@
-"""What holds an arm is its dynamics at rest: one definition of the effects, from the drive to the controller."""
+"""Holding torques equal the dynamics at rest, with the same effects in drives and controllers."""
 
 import dataclasses
 
@@ -28,13 +28,13 @@ SCALES = {"offset": 0.0, "spring": 0.4, "cable sine": 2.0, "cable cosine": 1.5}
 
 
 def all_effects(arm):
-    """Every kind that position alone decides, along every coordinate that can have it."""
+    """Returns all position-dependent effects along all coordinates that can have them."""
     effects = (ActuatorEffect(c, kind, SCALES[kind]) for c in arm.effect_coordinates for kind in POSITION_KINDS)
     return tuple(e for e in effects if not effect_fault(arm, e))
 
 
 def model_of_all_effects(name, tilt):
-    """A model of links that exist, with friction and all effects of position, and its DynamicModel."""
+    """Returns a physically consistent model with friction and position-dependent effects, and its DynamicModel."""
     generator = np.random.default_rng(3)
     arm = load_arm(name)
     arm = arm.with_gravity([float(g) for g in arm.gravity + tilt])
@@ -62,7 +62,7 @@ def case(request):
 
 
 def test_holding_torque_equals_the_dynamics_at_rest(case):
-    """But for offsets where weight acts and no cable's cosine does: of all these, only the PSM's insertion has one."""
+    """The exceptions are offsets under gravity load without a cable cosine. Here only the PSM insertion has one."""
     arm, model, dynamics = case
     kept = [e for e in dynamics.section.effects if (e.coordinate, e.kind) != ("actuator.insertion", "offset")]
     assert len(dynamics.section.effects) - len(kept) == (arm.name == "PSM")
@@ -74,7 +74,7 @@ def test_holding_torque_equals_the_dynamics_at_rest(case):
 
 
 def test_offset_is_a_holding_torque_without_gravity_load():
-    """The MTM's outer yaw is vertical as it is expected to be mounted, also if a motion shows that it leans."""
+    """The nominal axis of the MTM's outer yaw is vertical, also if a motion shows a base tilt."""
     _, model, _ = model_of_all_effects("mtmr", np.array([0.4, 0.2, 0.0]))
     offsets = [e for e in model.dynamics.effects if e.kind == "offset" and e.coordinate.startswith("actuator.")]
     level = [float(g) for g in load_arm("mtmr").gravity]

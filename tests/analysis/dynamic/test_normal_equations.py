@@ -1,4 +1,4 @@
-"""Fits from sums of squares: what is updated equals what is computed anew, and what the rows themselves give."""
+"""Fits from sums of squares: updates equal new computations and fits to the rows."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ NON_NEGATIVE = np.arange(COLUMNS) % 2 == 1
 
 @pytest.fixture(scope="module", params=range(6))
 def rows(request):
-    """Columns (r, k) of three actuators, 0 where they have none, and their efforts (r, 3)."""
+    """Returns columns (r, k) of three actuators, some of them 0, and their efforts (r, 3)."""
     generator = np.random.default_rng(request.param)
     X = np.zeros((3, ROWS, COLUMNS))
     for i, own in enumerate(OWN):
@@ -42,7 +42,7 @@ def test_sums_without_zero_columns_equal_the_full_sums(rows, total):
 
 @pytest.mark.parametrize("used", [np.arange(6), np.array([1, 3, 5]), np.array([0, 2, 4])])
 def test_adding_an_unknown_equals_a_fit_with_it(total, used):
-    """By the Schur complement, for one of any sign and one that is not negative."""
+    """The Schur complement is used for an unknown of any sign and for one that is not negative."""
     sums, precision = total.weighted(WEIGHTS), np.linspace(0.1, 3.0, COLUMNS)
     fit = NonNegativeFit(sums, precision, NON_NEGATIVE, used, np.arange(8, 12))
     for added in (None, 8, 9, 10, 11):

@@ -1,4 +1,4 @@
-"""Parameters that a recording hardly tells apart, by name."""
+"""Names of parameters that are not identifiable separately."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Filter, derivative and resampling of signals whose result is known."""
+"""Filtering, differentiation and resampling of signals with known results."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ INNER = slice(800, -800)  # away from the ends, where the filter swings in
 
 
 def sine_and_cosine(x, frequency):
-    """Coefficients of a signal in sin(2 pi f t) and cos(2 pi f t)."""
+    """Returns the coefficients of a signal in sin(2 pi f t) and cos(2 pi f t)."""
     w = 2 * np.pi * frequency * T[INNER]
     return np.linalg.lstsq(np.column_stack([np.sin(w), np.cos(w)]), x[INNER], rcond=None)[0]
 
@@ -20,7 +20,7 @@ def sine_and_cosine(x, frequency):
 @pytest.mark.parametrize("frequency", [2.0, 10.0, 18.0, 20.0, 22.0, 40.0])
 def test_low_pass_has_the_butterworth_gain_and_no_delay(frequency):
     in_phase, late = sine_and_cosine(low_pass(np.sin(2 * np.pi * frequency * T), RATE, 20.0), frequency)
-    # Butterworth's |H|^2, as it runs both ways; the bilinear transform bends the frequencies.
+    # The gain is Butterworth's |H|^2, because the filter runs both ways. The bilinear transform warps frequencies.
     ratio = np.tan(np.pi * frequency / RATE) / np.tan(np.pi * 20.0 / RATE)
     assert in_phase == pytest.approx(1 / (1 + ratio ** (2 * ORDER)), abs=1e-3)
     assert late == pytest.approx(0.0, abs=1e-3)
@@ -56,7 +56,7 @@ def test_central_difference_is_exact_inside_a_parabola():
     x = np.column_stack([1.0 + 2.0 * T - 3.0 * T**2, -T])
     v = central_difference(x, RATE)
     np.testing.assert_allclose(v[1:-1], np.column_stack([2.0 - 6.0 * T, np.full(len(T), -1.0)])[1:-1], atol=1e-8)
-    # One-sided at the ends: the derivative half a sample away.
+    # One-sided at the ends: the derivative half a sample inwards.
     np.testing.assert_allclose(v[[0, -1], 0], 2.0 - 6.0 * (T[[0, -1]] + np.array([0.5, -0.5]) / RATE), atol=1e-8)
 
 

@@ -1,4 +1,4 @@
-"""The slow parts of a motion: what is taken for a pose, and what it can tell."""
+"""Low-speed segments of a motion as static poses, and models that are identified from them."""
 
 from dataclasses import replace
 
@@ -30,14 +30,14 @@ def test_rests_of_a_motion_are_found_and_identify_the_arm(arm):
     recording = motion_with_pauses(arm, poses, generator)
     parts, measured = low_speed_segments(recording, arm)
     assert np.all(measured.sum(axis=1) == 1)
-    # A joint that hardly moves from one pose to the next is slow all the way: then the two rests are one pass.
+    # A joint that hardly moves between two poses is slow all the time. Both rests are then one pass.
     assert np.all(measured.sum(axis=0) >= 0.7 * len(poses))
     truth = IdentifiedModel.from_arm(arm)
     fresh = arm.sample_poses(200, generator)
     result = identify_static(parts, arm, measured=measured)
     error = np.sqrt(np.mean((result.model.holding_torque(fresh) - truth.holding_torque(fresh)) ** 2, axis=0))
     torque = np.sqrt(np.mean(truth.holding_torque(fresh) ** 2, axis=0))
-    # Yaw, pitch and insertion carry weight; the wrist's grams drown in its noise, as on a real arm.
+    # Yaw, pitch and insertion carry weight. The small torques of the wrist are below its noise, as on a real arm.
     assert np.all(error[:3] < 0.05 * torque[:3])
     assert np.all(error <= torque + 2e-3 * arm.effort_limits)
     with pytest.raises(IdentificationError, match=r"the arm moves \(joint \d at .* or the slow parts of a motion"):
@@ -63,7 +63,7 @@ def test_segments_at_1_khz_equal_those_at_200_hz(arm):
 
 
 def test_rest_ends_at_a_gap_in_the_times(arm):
-    """Where samples are missing the arm may have been anywhere."""
+    """The motion is unknown where samples are missing."""
     a, b = arm.sample_poses(2, np.random.default_rng(1), margin=0.1)
     recording = motion_with_pauses(arm, [a, b], np.random.default_rng(2), rest=2.0)
     late = recording.t >= 5.0  # in the middle of the rest at b
@@ -71,7 +71,7 @@ def test_rest_ends_at_a_gap_in_the_times(arm):
     split = replace(recording, t=recording.t + 5.0 * late, q=recording.q + sag * late[:, None])
     rests = static_poses(split, arm)
     assert len(rests) == 2
-    # Both halves are averaged as samples of one pose, each by its own later half.
+    # Both halves are averaged as samples of one pose, each over its own second half.
     np.testing.assert_allclose(rests.q[1], b + 0.5 * sag, atol=1e-4)
 
 
@@ -84,7 +84,7 @@ def test_rests_are_poses_of_all_joints(arm, rate, with_speeds):
     noisy = recording.qd + arm.per_joint(0.01, 0.001) * generator.normal(size=recording.q.shape)
     rests = static_poses(replace(recording, qd=noisy if with_speeds else None), arm)
     assert len(rests) == len(poses), "the last pose is the first again"
-    # A rest begins when the arm is slow, not when it stands.
+    # A rest begins when the arm is slow, not when it stops.
     np.testing.assert_allclose(rests.q, poses, atol=1e-4)
     truth = IdentifiedModel.from_arm(arm).holding_torque(poses)
     assert np.all(np.abs(rests.tau - truth) < 1e-3 * arm.effort_limits)
@@ -133,7 +133,7 @@ def test_few_segments_give_no_feedforward(arm):
 
 @pytest.fixture(scope="module")
 def real_parts(arm, shared_data, tmp_path_factory):
-    """Low-speed segments of two real motions: on one day, and on another with a weight."""
+    """Returns low-speed segments of two real motions: on one day, and on another day with a weight."""
 
     def parts_of(name):
         path = tmp_path_factory.mktemp("converted") / f"{name}.csv"
@@ -144,7 +144,7 @@ def real_parts(arm, shared_data, tmp_path_factory):
 
 
 def test_segments_of_a_real_motion_do_not_increase_errors(arm, real_parts):
-    """No joint of a model from its segments is worse than zero torque on another day, with or without a weight."""
+    """No joint of a model from segments is worse than zero torque on another day, with or without a weight."""
     for name, other in (("psm_one", "psm_one_205g_insertion"), ("psm_one_205g_insertion", "psm_one")):
         parts, measured = real_parts[name][1]
         model = identify_static(parts, arm, measured=measured).model

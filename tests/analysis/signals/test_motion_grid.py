@@ -1,4 +1,4 @@
-"""A motion on a grid, its folds and the efforts that a model expects of it, against motions that are known."""
+"""Resampling of known motions to a grid, folds, and predicted efforts."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -21,7 +21,7 @@ PERIOD = 4.0
 
 
 def motion(t):
-    """q, v, vd (m, n) inside the arm's limits, after 4 s the same again."""
+    """Returns q, v, vd (m, n) within the arm's limits, with a period of 4 s."""
     middle, half = (ARM.position_upper + ARM.position_lower) / 2, (ARM.position_upper - ARM.position_lower) / 2
     w, size = 2 * np.pi / PERIOD * np.array([1, 2, 1, 3, 2, 1, 2]), 0.3 * np.minimum(half, 1.0)
     wt = w * t[:, None] + np.arange(N)
@@ -62,7 +62,7 @@ def test_predicted_efforts_have_the_effort_delay(grid):
     lines = np.tile((grid.t - 5.0)[:, None], (1, N))
     rows = late.efforts_at_rows(lines)[late.inner]
     np.testing.assert_allclose(rows, grid.row_times[grid.inner, None] - 5.0 - np.array(delays), atol=1e-9)
-    # A straight line passes the low-pass as it is.
+    # The low-pass filter does not change a straight line.
     np.testing.assert_allclose(late.behind_filter(late.efforts_at_rows(lines)), rows, atol=1e-3)
 
 
@@ -79,7 +79,7 @@ def test_folds_of_a_periodic_motion_follow_the_phase(grid):
     assert period_of(grid) == pytest.approx(PERIOD, abs=1e-3)
     fold, edge = phase_folds(grid, PERIOD)
     t = grid.row_times[grid.inner]
-    # 200 rows a second, 800 a period: a row and the one a period later are in the same fold.
+    # With 200 rows per second and 800 per period, a row and the row one period later are in the same fold.
     np.testing.assert_array_equal(fold[800:1600], fold[:800])
     np.testing.assert_allclose(np.bincount(fold[:800]), 800 / FOLDS, atol=1)
     phase = (t - t[0]) % PERIOD

@@ -1,4 +1,4 @@
-"""Times, velocities and efforts of a motion that is known: what was put in is found again."""
+"""Times, velocities and efforts of known motions are recovered."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ INNER = slice(200, -200)
 
 
 def motion(t):
-    """q, v, vd (m, 3) of joints that swing at 0.3 to 1.7 Hz."""
+    """Returns q, v, vd (m, 3) of joints that oscillate at 0.3 to 1.7 Hz."""
     w = 2 * np.pi * FREQUENCIES
     wt = w * t[:, None]
     q = np.sin(wt) + 0.3 * np.sin(2 * wt + 1.0)
@@ -26,7 +26,7 @@ def motion(t):
 
 
 def recorded(at, t=None):
-    """Rows at the true times `at`, recorded with the times `t`."""
+    """Returns rows at the true times `at`, recorded with the times `t`."""
     q, v, vd = motion(at)
     return Recording(q=q, qd=v, tau=2.0 * vd + q, t=at if t is None else t, source="motion.csv")
 
@@ -80,7 +80,7 @@ def test_repeated_rows_are_omitted():
     polled = replace(whole, q=whole.q[last], qd=whole.qd[last], tau=whole.tau[last])
     np.testing.assert_array_equal(np.flatnonzero(repeated_rows(polled)), [10, 11, 200])
     np.testing.assert_array_equal(true_time(polled).rows, np.setdiff1d(np.arange(400), [10, 11, 200]))
-    # Only q repeats: something new was measured. Nothing moves: nothing new is to be expected.
+    # If only q repeats, the row is a new measurement. If nothing moves, rows may repeat.
     assert not np.any(repeated_rows(replace(whole, q=whole.q[last])))
     assert not np.any(repeated_rows(replace(polled, qd=np.zeros_like(polled.qd), q=0 * polled.q, tau=0 * polled.q)))
 
@@ -123,7 +123,7 @@ def test_signals_reproduce_the_motion(velocities):
 
 
 def delayed(lag, coulomb=0.3):
-    """Signals whose efforts (friction, inertia, gravity) are late by `lag` [s]."""
+    """Returns signals whose efforts (friction, inertia, gravity) are delayed by `lag` [s]."""
     t = np.arange(6000) / 400.0
 
     def tau(at):
@@ -142,7 +142,7 @@ def test_delay_of_the_efforts_is_estimated(lag):
     np.testing.assert_allclose(found.lag, lag, atol=1e-3)
     assert np.all(found.determined == (lag != 0.0))
     assert np.all(found.standard_error < 1e-3)
-    # Away from its own time a step of friction is not fitted fully.
+    # A step of friction is not fitted completely at another time.
     np.testing.assert_allclose(found.coulomb, 0.3, rtol=0.02 if lag == 0.0 else 0.5, atol=1e-12)
     assert np.all(found.gain >= 1.0)
 
@@ -169,7 +169,7 @@ def test_efforts_opposite_to_the_model_are_rejected():
     expected, names = motion(t)[0], ("yaw", "pitch", "roll")
     recording = Recording(q=expected, source="motion.csv")
     noise = np.random.default_rng(2).normal(size=expected.shape)
-    # Offsets, a scale and noise do not matter, nor does an effort that has nothing to do with the model.
+    # Offsets, a scale, noise and efforts that are unrelated to the model are accepted.
     refuse_opposite_efforts(recording, names, 5.0 + 0.2 * expected + 0.1 * noise, expected)
     refuse_opposite_efforts(recording, names, noise, expected)
     refuse_opposite_efforts(recording, names, 0 * expected, expected)

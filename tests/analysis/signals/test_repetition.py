@@ -1,4 +1,4 @@
-"""Periods, repeatability and noise of signals that were made with known ones."""
+"""Periods, repeatability and noise of synthetic signals with known values."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ T = np.arange(8000) / RATE  # 40 s
 
 
 def repeating(period, t=T):
-    """(m, 2) a joint with three harmonics and one with a fast second one."""
+    """Returns positions (m, 2) of a joint with three harmonics and one with a fast second harmonic."""
     w = 2 * np.pi / period * t
     return np.column_stack([np.sin(w) + 0.5 * np.cos(2 * w) + 0.2 * np.sin(3 * w), np.cos(w) + 0.9 * np.sin(5 * w)])
 
@@ -27,7 +27,7 @@ def test_a_motion_that_does_not_repeat_has_no_period():
     assert find_period(np.cumsum(generator.normal(size=(2000, 2)), axis=0), RATE) is None
     assert find_period(np.zeros((2000, 2)), RATE) is None
     assert find_period(np.column_stack([T, T**2]), RATE) is None
-    # One period and a tenth: too little of it comes twice.
+    # At 1.1 periods the overlap is too short.
     assert find_period(repeating(36.0), RATE) is None
 
 
@@ -48,7 +48,7 @@ def test_spectra_separate_noise_from_signal(period):
     signal = repeating(1.0)  # several times in each piece that a periodogram is made of
     x = signal + deviation * np.random.default_rng(3).normal(size=(len(T), 2))
     of = spectra(x, RATE, period)
-    # White noise of variance s^2 has the density 2 s^2 / rate, and a density sums up to the variance.
+    # White noise of variance s^2 has the density 2 s^2 / rate. The integral of a density is the variance.
     np.testing.assert_allclose(np.median(of.noise, axis=0), 2 * deviation**2 / RATE, rtol=0.15, atol=1e-12)
     np.testing.assert_allclose(
         np.sum(of.signal, axis=0) * of.frequency[1], np.var(signal, axis=0), rtol=0.1, atol=1e-12
@@ -62,7 +62,7 @@ def test_cut_off_is_where_noise_exceeds_the_signal():
     signal = np.sum(np.sin(2 * np.pi * tones * T[:, None] + phases), axis=1)
     x = np.column_stack([signal, np.sin(2 * np.pi * 0.2 * T)]) + 0.05 * generator.normal(size=(len(T), 2))
     found = cut_offs(spectra(x, RATE, 5.0))
-    # Five lines of 0.4 Hz are smoothed over, and the window of a periodogram leaks into the next ones.
+    # The spectrum is smoothed over five lines of 0.4 Hz, and the window of a periodogram leaks into adjacent lines.
     assert 12.0 <= found[0] < 15.0
     assert MIN_CUT_OFF <= found[1] < 4.0
 
@@ -71,7 +71,7 @@ def test_narrow_band_of_noise_is_detected():
     generator = np.random.default_rng(5)
     quiet = repeating(5.0) + 0.02 * generator.normal(size=(len(T), 2))
     assert narrow_band(spectra(quiet, RATE, 5.0), 0) is None
-    # A tone that wanders in phase, so that it does not repeat with the motion.
+    # A tone with a random phase drift, so that it does not repeat with the motion.
     phase = 2 * np.pi * 40.0 * T + np.cumsum(0.1 * generator.normal(size=len(T)))
     hum = quiet + 0.3 * np.sin(phase)[:, None] * [1.0, 0.0]
     band = narrow_band(spectra(hum, RATE, 5.0), 0)

@@ -1,4 +1,4 @@
-"""Rests of a motion and what is taken for poses, on motions that are made of them."""
+"""Rests of synthetic motions and the poses that are extracted from them."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def test_rests_are_at_the_commanded_poses():
     rests = static_poses(recording, ARM)
     np.testing.assert_allclose(rests.q, poses, atol=1e-3)
     assert rests.t is None and rests.qd is None
-    # A rest of 0.25 s is none.
+    # A stop of 0.25 s is too short for a rest.
     assert len(static_poses(moving(rest=0.15)[1], ARM)) == 0
 
 

@@ -1,4 +1,4 @@
-"""The whole way on the PSM: closed-loop plant, collected poses, identified model, command line."""
+"""Static identification of a PSM: closed-loop plant, collected poses, identified model, command line."""
 
 import json
 
@@ -33,7 +33,7 @@ def ground_truth_arm(arm, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def recording(arm, ground_truth_arm):
-    """Collected with the nominal model, so that the integrator has to make up for what is wrong with it."""
+    """Collects poses with the nominal model, so that the integrator compensates its errors."""
     generator = np.random.default_rng(6)
     laws = [DriveEffect("joint.yaw", "offset", 0.0, 0.05), DriveEffect("joint.roll", "cable sine", 1.0, 0.03)]
     effects = ArmEffects(cables=laws)
@@ -68,7 +68,7 @@ def test_true_torque_is_identified_with_the_closed_linkage(arm, ground_truth_arm
     assert np.all(error < np.maximum(0.03 * np.sqrt(np.mean(truth**2, axis=0)), 1e-3 * arm.effort_limits))
     found = {str(ActuatorEffect.of(e)) for e in model.effects}
     assert found >= {"joint.yaw offset", "joint.roll cable sine 1"}
-    # At a yaw joint a spring and lifted weight are the same torque; only one of them may be asked for.
+    # At a yaw joint the torques of a spring and of a lifted weight are equal. Only one of them may be a candidate.
     assert "joint.yaw cable sine 1" not in found
 
 

@@ -1,4 +1,4 @@
-"""Identification: exact on exact data, honest on noisy data, and the paper's numbers on the paper's data."""
+"""Static identification on exact data, on noisy data, and on the recording of the paper."""
 
 import csv
 import dataclasses
@@ -29,7 +29,7 @@ def arm():
 
 
 def simulated(arm, poses=60, seed=0, noise=0.0, effects=(), coefficients=(), scale=1.0):
-    """Poses inside the limits with exact holding torques plus noise, a share of each joint's effort limit."""
+    """Returns poses within the limits with exact holding torques plus noise, a share of each joint's effort limit."""
     generator = np.random.default_rng(seed)
     model = compile_static_model(arm, tuple(effects))
     theta = np.array([*(scale * model.gravity.base_values), *coefficients])
@@ -65,7 +65,7 @@ def test_robust_method_recovers_parameters_and_effects(arm):
 
 
 def test_standard_errors_cover_the_truth_at_the_nominal_rate(arm):
-    """The 95 % intervals of 40 noisy recordings, over all parameters that the noise lets be seen."""
+    """The 95 % intervals of 40 noisy recordings, over all parameters above the noise."""
     inside = []
     for seed in range(40):
         recording, theta = simulated(arm, noise=0.02, seed=seed)
@@ -130,7 +130,7 @@ def test_joint_without_measured_torque_has_no_feedforward(arm):
 
 
 def test_pure_friction_is_not_worse_than_zero_torque(arm):
-    """Wrist torques that have nothing to do with the pose, judged on other poses: over seeds, no harm beyond chance."""
+    """Wrist torques are unrelated to the pose. Over seeds, errors on other poses do not increase beyond chance."""
     ratios = []
     for seed in range(6):
         generator = np.random.default_rng(seed)
@@ -177,7 +177,7 @@ def test_too_few_poses_and_too_low_rank_are_rejected(arm):
 
 
 def test_repeated_samples_are_averaged_before_validation(arm):
-    """10 samples each of 12 poses with friction per pose are what their 12 averages are."""
+    """Ten samples of each of 12 poses with friction per pose give the same result as their 12 averages."""
     recording, _ = simulated(arm, poses=12)
     generator = np.random.default_rng(5)
     friction = 0.1 * arm.effort_limits * generator.uniform(-1, 1, recording.q.shape)
@@ -222,7 +222,7 @@ def test_moving_recording_is_rejected(arm):
     ):
         with pytest.raises(IdentificationError, match="the arm moves"):
             identify_static(moving, arm)
-    # Poses with the time at which they were taken: the arm moved in between, and rests in each.
+    # Poses with time stamps: the arm moves between them and rests at each.
     assert identify_static(dataclasses.replace(recording, t=8.0 * np.arange(len(recording))), arm, "paper")
 
 
@@ -284,7 +284,7 @@ def test_moved_model_files_and_version_2_files_are_loaded(tmp_path):
         IdentifiedModel.load(tmp_path / "new.yaml", load_arm("psm"))
 
 
-# The paper's own recording.
+# Recording of the paper.
 
 
 def test_paper_method_reproduces_figure_4(arm, shared_data):
@@ -338,7 +338,7 @@ def test_prediction_of_another_day_beats_zero_torque(arm, shared_data):
 
 def test_poses_at_a_stop_are_named_in_a_real_recording(arm, shared_data):
     result = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"), arm)
-    # Lines of the file; line 72 repeats the pose of line 62.
+    # Line numbers of the file. Line 72 repeats the pose of line 62.
     line = {d: int(d.where.rpartition(":")[2]) for d in result.excluded}
     assert {62, 64, 68, 74, 78} <= {line[d] for d in result.excluded if "parallelogram" in d.reason}
     assert 47 in line.values()
