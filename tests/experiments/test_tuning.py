@@ -184,7 +184,7 @@ def test_only_dominant_joint_is_slowed_down():
     slowed = [joint.limited_by == "other joints" for joint in design.joints]
     assert any(slowed) and not all(slowed)
     assert [a == b for a, b in zip(alone, design.joints, strict=True)] == [not slow for slow in slowed]
-    # With separate designs the joints are unstable together; with the joint design they are stable, also at other poses.
+    # Separate designs are unstable together. The common design is stable, also at other poses.
     harder = Sampling(sampling.period, sampling.ticks + 1, sampling.cut_off)
     loops = [SampledLoop(0.8 * M, harder) for M in mass_matrices(arm, arm.sample_poses(20, np.random.default_rng(9)))]
     together = Gains(*([getattr(joint, name) for joint in alone] for name in ("kp", "kd", "ki")))
