@@ -1,4 +1,4 @@
-"""The paper redone: published numbers against the paper's data, ours against known truths, refusals."""
+"""Reproduction of the paper: published numbers against its data, ours against known solutions, and errors."""
 
 import csv
 import dataclasses
@@ -88,12 +88,12 @@ def test_published_parameters_are_least_squares_solution(shared_data):
     recording = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
     Y = published.IDENTIFIED_WITH * np.array([paper_regressor(pose) for pose in recording.q])
     fitted = np.linalg.lstsq(Y.reshape(-1, 12), recording.measured_effort().ravel(), rcond=None)[0]
-    # Published to four digits; the last one is another number in the team's file (.0008).
+    # The parameters are published to four digits. The last one differs in the team's file (.0008).
     np.testing.assert_allclose(published.PARAMETERS[:-1], fitted[:-1], atol=5.1e-5)
     assert fitted[-1] == pytest.approx(0.0008, abs=5e-5)
 
 
-# What is published.
+# Published values.
 
 
 def test_published_means_match_data(shared_data):
@@ -102,7 +102,7 @@ def test_published_means_match_data(shared_data):
     with open(shared_data / "mtm_static/paper_fig5_fig6_drift_trials.csv") as stream:
         rows = list(csv.reader(stream))[1:]
     final = {row[0]: np.array(row[1:7], float) for row in rows}
-    # Read off plots, and rounded.
+    # Values read off plots and rounded.
     np.testing.assert_allclose(published.FIGURE_5[:5], final["Errors8_FullTorques"][:5], atol=6e-4)
     np.testing.assert_allclose(published.FIGURE_6, final["Errors1"], atol=6e-4)
     full = [abs(values) for name, values in final.items() if "Full" in name]
@@ -111,7 +111,7 @@ def test_published_means_match_data(shared_data):
     np.testing.assert_allclose(published.FIGURE_6_MEANS, np.mean(zeroed, axis=0), atol=6e-3)
 
 
-# Refusals.
+# Errors.
 
 
 @pytest.fixture
@@ -193,7 +193,7 @@ def test_joint_is_held_if_it_never_leaves_band():
     positions = np.zeros((3, 5, 7))
     positions[0, 2, 4] = 0.0151  # there and back
     positions[1, -1, 4] = -0.0149
-    positions[2] += 1.0  # stands elsewhere
+    positions[2] += 1.0  # at rest at another pose
     drifts = Drifts(ARM, positions)
     assert drifts.held[:, 4].tolist() == [False, True, True]
     assert drifts.num_held == 2
@@ -203,17 +203,17 @@ def test_joint_is_held_if_it_never_leaves_band():
     assert Drifts(load_arm("psm"), insertion).num_held == 0
 
 
-# Simulated.
+# Simulations.
 
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
-    """A true arm, derived and compiled once."""
+    """Ground-truth arm, derived and compiled once."""
     return perturbed_ground_truth(PAPER_ARM, tmp_path_factory.mktemp("truth"), seed=8)
 
 
 @pytest.mark.slow
-def test_exact_model_holds_arm_and_nominal_model_does_not(truth, tmp_path):
+def test_exact_model_holds_arm_and_zero_torque_does_not(truth, tmp_path):
     exact, nothing = tmp_path / "exact.yaml", tmp_path / "nothing.yaml"
     truth.model.save(exact)
     with_zeroed(truth.model, range(7)).save(nothing)
@@ -223,7 +223,7 @@ def test_exact_model_holds_arm_and_nominal_model_does_not(truth, tmp_path):
         held, fallen = release_all(cases, executor)
     assert held.shape == (round(1.0 / SAMPLE_PERIOD) + 1, 7)
     np.testing.assert_allclose(held[0], start, atol=1e-12)
-    assert np.abs(held - start).max() < 2e-3  # a delay and encoders' counts are all that is wrong
+    assert np.abs(held - start).max() < 2e-3  # the only errors are a delay and the encoder resolution
     assert np.abs(fallen[-1] - start)[1] > 0.1
     np.testing.assert_array_equal(release(cases[0]), held)  # bit for bit
 
@@ -234,7 +234,7 @@ def test_ground_truth_arm_matches_its_model(truth):
     effects = truth.model.holding_torque(q) - IdentifiedModel.from_arm(truth.arm).holding_torque(q)
     assert np.abs(effects[:, 3]).max() > 0.01  # cables
     drawn = IdentifiedModel.from_arm(ARM).holding_torque(q)
-    assert np.abs(truth.model.holding_torque(q) - effects - drawn).max() > 0.02  # not the drawing
+    assert np.abs(truth.model.holding_torque(q) - effects - drawn).max() > 0.02  # differs from the nominal model
 
 
 def test_positions_in_damping_term_leave_joint_undamped(tmp_path):
@@ -242,9 +242,9 @@ def test_positions_in_damping_term_leave_joint_undamped(tmp_path):
     (faulty, shapes), (right, _) = swings(arm, faulty=True), swings(arm, faulty=False)
     undamped = np.flatnonzero(np.abs(faulty.real) < 1e-9)
     assert len(undamped) == 1
-    assert np.argmax(np.abs(shapes[:, undamped[0]])) == 6  # joint 7, alone
+    assert np.argmax(np.abs(shapes[:, undamped[0]])) == 6  # only joint 7
     assert right.real.max() < -0.01
-    # That the paper's links have 1 kg m^2 each: the published period of J2 follows, within what a digitised one is.
+    # Link inertias of 1 kg m^2 reproduce the published period of J2, within the accuracy of a digitised plot.
     assert slowest_swing(arm) == pytest.approx(published.FIGURE_7_READ["J2 period"], rel=0.25)
 
 
@@ -253,7 +253,7 @@ def test_paper_controller_moves_its_arm_to_zero(tmp_path):
     q = simulate_paper_controller(arm, 0.1, faulty=True)
     assert q.shape == (round(0.1 / PERIOD) + 1, 7)
     np.testing.assert_allclose(q[0, :5], published.FIGURE_7_START[:5], atol=1e-12)
-    # Weightless under exact compensation, and at rest: at first M qdd = -(Kp, and Kv of the faulty joints) q.
+    # With exact gravity compensation and at rest, initially M qdd = -(Kp, plus Kv of the faulty joints) q.
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     set_arm_positions(plant, context, arm, q[0])
@@ -288,7 +288,7 @@ def test_hysteresis_compensation_holds_arm_after_approach(tmp_path):
 
 
 def exact_laboratory(truth, folder, executor, sample_sizes):
-    """One whose MTM was identified without any error."""
+    """Session with an MTM that was identified without error."""
     file = folder / "exact.yaml"
     truth.model.save(file)
     q = ARM.sample_poses(20, np.random.default_rng(9))
@@ -310,7 +310,7 @@ def test_figure_5_writes_files_and_exact_model_holds(truth, tmp_path):
     assert [float(x) for x in drift["published, five trials (mean)"][1:]] == list(published.FIGURE_5_MEANS)
     assert drift["ours, share held"] == ("1.000",) * 7
     assert "3 of 3 (100.0 %" in page
-    # Its torque is exact, so its error is 0 in the table that says why, and the paper's method's is not.
+    # The torque of the model is exact, so its error is 0 in the table; that of the paper's method is not.
     torques = {row[0]: np.array(row[1:], float) for row in section.tables[1].rows}
     np.testing.assert_array_equal(torques["ours"], 0.0)
     assert torques["the paper's"].max() > 0.01
@@ -321,5 +321,5 @@ def test_compensation_reduces_operator_force(truth, tmp_path):
     with ThreadPoolExecutor(1) as executor:
         section = reproduce_transparency(exact_laboratory(truth, tmp_path, executor, SampleSizes(path_poses=2)))
     force = [float(row[1]) for row in section.tables[0].rows]
-    assert force[0] > force[2] > force[3] > 0  # limp, ours, ours with friction compensation
+    assert force[0] > force[2] > force[3] > 0  # unpowered, our model, our model with friction compensation
     assert (tmp_path / "transparency.png").read_bytes().startswith(b"\x89PNG")

@@ -1,4 +1,4 @@
-"""Scenarios and `dvrk-drake simulate`: one scenario, one result; and what is refused, in one line."""
+"""Scenarios and `dvrk-drake simulate`: reproducible results and one-line errors."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_reaches_targets_on_time_and_rests():
         row = round(target.time / 0.01)
         np.testing.assert_allclose(simulation.desired[row], target.pose, atol=1e-9)
         assert np.all(np.abs(recording.q[row] - target.pose) < PSM.per_joint(5e-3, 1e-3))
-    # A second after the last: at rest there, with the cable's pull on the insertion held by the integrator.
+    # One second after the last target: at rest; the integrator compensates the cable force on the insertion.
     goal = np.array(scenario.targets[-1].pose)
     assert np.all(np.abs(recording.q[-1] - goal) < PSM.per_joint(1e-3, 1e-4))
     assert np.abs(recording.qd[-1]).max() < 1e-3
@@ -42,7 +42,7 @@ def test_reaches_targets_on_time_and_rests():
 
 @pytest.mark.slow
 def test_handle_reaches_goal_while_joint_4_sticks():
-    """What examples/simulated_effects.yaml says of joint 4: the handle's pose is six numbers, and joints 6 and 7 do its part."""
+    """Joint 4 of examples/simulated_effects.yaml: six coordinates fix the handle, and joints 6 and 7 compensate."""
     example = str(ROOT / "examples" / "simulated_effects.yaml")
     with_friction, without = (
         simulate(load_scenario(example, ["duration=3", *settings])).state_true[-1, :7]
@@ -51,7 +51,7 @@ def test_handle_reaches_goal_while_joint_4_sticks():
     arm = load_arm("mtml")
     led = np.array(load_scenario(example, []).hand.path[-1].pose)
     assert abs(led[3]) == 0.3 and abs(with_friction[3]) < 0.01
-    # Without friction joint 4 moves: the handle does not determine it.
+    # Without friction joint 4 moves, since the pose of the handle does not determine it.
     assert abs(without[3]) > 0.05
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
@@ -61,7 +61,7 @@ def test_handle_reaches_goal_while_joint_4_sticks():
         poses.append(plant.GetFrameByName("dh_7").CalcPoseInWorld(context))
     apart = poses[0].inverse() @ poses[1]
     assert np.linalg.norm(apart.translation()) < 2e-3 and apart.rotation().ToAngleAxis().angle() < 0.02
-    # Joint 4 where it was led, and the others where they are, is another pose of the handle.
+    # With joint 4 at its target and the others unchanged, the handle has another pose.
     assert np.abs(with_friction - led)[4:].max() > 0.1
 
 

@@ -1,4 +1,4 @@
-"""What a hand feels: identities of the measurement, and the order that physics demands."""
+"""Operator forces: identities of the measurement, and the expected order of the compensations."""
 
 import csv
 
@@ -31,10 +31,10 @@ def test_no_force_on_hand_holding_compensated_arm():
 
 
 def test_hand_carries_weight_of_unpowered_arm():
-    """At rest J' F = holding torque: where the arm came to rest in the hand's grip."""
+    """At rest in the hand's grip, J' F equals the holding torque."""
     forces = simulate_operator(ARM, resting(3.0), Compensation("nothing"))
     assert forces.rms_force > 1.0
-    # The handle sags until spring times way is the force, of the stiffness that Grip states.
+    # The handle sags until the spring force of the grip, with the stiffness of `Grip`, carries the arm.
     late = forces.time > 2.9
     np.testing.assert_allclose(
         np.linalg.norm(forces.force[late], axis=1), 600.0 * forces.deviation[late], rtol=0.02, atol=0
@@ -55,7 +55,7 @@ def test_each_compensation_reduces_operator_force():
 def test_recorded_path_respects_limits_and_speed():
     t = np.linspace(3.0, 5.0, 50)
     middle, half = (ARM.position_upper + ARM.position_lower) / 2, (ARM.position_upper - ARM.position_lower) / 2
-    middle[1:3], half[1:3] = 0.1, 0.0  # within what the parallelogram allows
+    middle[1:3], half[1:3] = 0.1, 0.0  # inside the limits of the parallelogram
     q = middle + (half + 0.05) * np.sin(t)[:, None]
     path = recorded_path(ARM, Recording(q=q, t=t, tau=np.zeros_like(q)), speed=0.5)
     assert path.start_time() == 0 and path.end_time() == pytest.approx(4.0)
@@ -84,7 +84,7 @@ def test_psm_is_moved_at_its_instrument():
     path = PiecewisePolynomial.ZeroOrderHold([0.0, 1.1], np.array([pose, pose]).T)
     assert (
         simulate_operator(psm, path, Compensation("SDF", IdentifiedModel.from_arm(psm))).rms_force < 1e-4
-    )  # the loops' pins give a little
+    )  # the pins of the loops are slightly compliant
     assert simulate_operator(psm, path, Compensation("nothing")).rms_force > 0.5
 
 

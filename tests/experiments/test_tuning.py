@@ -1,4 +1,4 @@
-"""Gains: what is found on a joint whose equations are known, and what the files and the command refuse."""
+"""Tuning: gains of joints with known equations, gains files, and invalid input."""
 
 import dataclasses
 import io
@@ -45,12 +45,12 @@ from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.reports.figures.tuning import plot_steps
 from dvrk_drake.reports.tuning import print_tuning
 
-#: The lags of the sampling make a loop of second order only far below 1 / (9 ms).
+#: The second-order approximation of the lags is valid only far below 1 / (9 ms).
 FAR_BELOW = 15.0
 
 
 class LinearJoint:
-    """A JointUnderTest without friction but viscous, from the equations alone."""
+    """JointUnderTest with viscous friction only, computed from its equations."""
 
     step, count, band, effort_limit = 0.05, 1e-6, 1e-3, 2.0
 
@@ -71,7 +71,7 @@ def single(kp, kd, ki=0.0):
 
 
 def analytic_ultimate(M, b, lag):
-    """K and the period of M s^2 + b s + K exp(-s lag) = 0 at s = j w."""
+    """Returns K and the period for which M s^2 + b s + K exp(-s lag) = 0 has the root s = j w."""
     w = brentq(lambda w: np.tan(w * lag) * M * w - b, 1e-6, 0.499 * np.pi / lag)
     return M * w**2 / np.cos(w * lag), 2 * np.pi / w
 
@@ -88,8 +88,8 @@ def test_ultimate_gain_and_period_match_analytic_values(M, b, ticks):
 
 
 def test_frictionless_joint_oscillates_with_every_gain():
-    # A double integrator with delay has no stable proportional gain at all: what is found is the least one with which
-    # a release is watched for the four swings, two periods, that it takes to tell.
+    # A double integrator with delay is unstable for every proportional gain. The result is the smallest gain for which
+    # the release shows the required four swings, i.e. two periods.
     M = 0.05
     assert find_ultimate_gain(LinearJoint(M, Sampling(), 0.0)).gain == pytest.approx(
         M * (2 * np.pi * 2 / RELEASE) ** 2, rel=0.06
@@ -110,7 +110,7 @@ def test_procedure_damps_linear_joint():
     t, error = LinearJoint(0.1, sampling, 0.2).respond(result.kp, result.kd, result.ki, 2.0)
     assert -error.min() < 0.05 * LinearJoint.step + LinearJoint.count
     assert np.abs(error[t > 1.6]).max() < LinearJoint.band
-    assert result.ki == 0.0  # nothing pulls at it: there is no offset
+    assert result.ki == 0.0  # there is no disturbance, hence no offset
 
 
 @pytest.mark.parametrize("ratio", [0.02, 0.1, -0.05])
@@ -128,12 +128,12 @@ def test_sticking_or_creeping_is_no_oscillation():
     t = 1e-3 * np.arange(1000)
     assert judge_oscillation(t, np.full(1000, 0.05), 1e-4).growth == 0.0
     assert judge_oscillation(t, 0.05 * np.exp(-5 * t), 1e-4).growth == 0.0
-    # Counts of an encoder are no swings.
+    # Encoder quantisation does not count as a swing.
     assert judge_oscillation(t, 3e-3 * np.round(np.sin(60 * t)), 6.1e-3).swings == 0
 
 
 def poles(loop, gains, sampling):
-    """Poles of the closed loop in s [rad/s], the slowest to decay first; those of a delay are at -infinity."""
+    """Returns the closed-loop poles in s [rad/s], least damped first; those of a delay are at -infinity."""
     z = np.linalg.eigvals(loop.closed_loop(gains)).astype(complex)
     with np.errstate(divide="ignore", invalid="ignore"):
         s = np.log(z) / sampling.period
@@ -156,7 +156,7 @@ def test_pole_placement_gives_desired_damping(ratio, ticks, viscous):
 
 
 def test_pole_placement_without_lags_is_inaccurate():
-    # So that the test above can fail: the textbook's kp = M w^2, kd = 2 z M w are off by more than it allows.
+    # Shows that the test above can fail: the textbook gains kp = M w^2, kd = 2 z M w exceed its tolerance.
     sampling, M, z = Sampling(ticks=3), 0.2, 0.8
     slowest = poles(SampledLoop(M, sampling), single(M * FAR_BELOW**2, 2 * z * M * FAR_BELOW), sampling)
     polynomial = np.real(np.poly(slowest[np.abs(slowest) > 1e-6][:2]))
@@ -170,7 +170,7 @@ def test_margins_match_stability_limits():
     margins = SampledLoop(M, sampling).margins(single(kp, kd, ki))
     for factor, stable in ((0.99 * margins.gain, True), (1.01 * margins.gain, False)):
         assert SampledLoop(M, sampling).is_stable(single(factor * kp, factor * kd, factor * ki)) == stable
-    # A delay turns the phase by w T: the margin is a time.
+    # A delay T changes the phase by w T, so the phase margin corresponds to a time.
     spare = margins.phase / margins.crossover / sampling.period
     for ticks, stable in ((int(spare), True), (int(spare) + 1, False)):
         later = Sampling(sampling.period, sampling.ticks + ticks, sampling.cut_off)
@@ -184,7 +184,7 @@ def test_only_dominant_joint_is_slowed_down():
     slowed = [joint.limited_by == "other joints" for joint in design.joints]
     assert any(slowed) and not all(slowed)
     assert [a == b for a, b in zip(alone, design.joints, strict=True)] == [not slow for slow in slowed]
-    # Alone they are not stable together, with a tick more and less inertia; as designed they are, at other poses too.
+    # Separate designs are unstable together. The common design is stable, also at other poses.
     harder = Sampling(sampling.period, sampling.ticks + 1, sampling.cut_off)
     loops = [SampledLoop(0.8 * M, harder) for M in mass_matrices(arm, arm.sample_poses(20, np.random.default_rng(9)))]
     together = Gains(*([getattr(joint, name) for joint in alone] for name in ("kp", "kd", "ki")))
@@ -224,7 +224,7 @@ def test_design_keeps_margins_and_reports_limitation():
     assert design.limited_by == "phase margin"
     assert min(margins.phase for margins in design.margins) == pytest.approx(PHASE_MARGIN, abs=0.02)
     assert min(margins.gain for margins in design.margins) > GAIN_MARGIN
-    # What sticks at the edge of its band is moved by the integral after a quarter of a second, or Ki is at its bound.
+    # The integrator moves a sticking joint after a quarter of a second, unless Ki is at its upper bound.
     assert design.ki <= (0.1 + 0.2 * 0.5) / (1e-3 * 0.25) + 1e-9
     coarse = dataclasses.replace(fact, count=1e-3, dry_friction=0.0)
     design = design_joint(coarse, sampling)
@@ -239,7 +239,7 @@ def test_design_keeps_margins_and_reports_limitation():
 
 
 def test_mass_matrix_includes_linkage_and_rotors():
-    # Along a motion of the independent joints the kinetic energy of the whole tree is v' M v / 2.
+    # For a motion of the independent joints, the kinetic energy of the whole tree is v' M v / 2.
     from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 
     arm = load_arm("mtml")
@@ -261,20 +261,20 @@ def test_measures_of_known_step():
     q = np.zeros((len(t), n))
     goal, w = step_size(arm), 10.0
     q[:] = goal * (1 - np.exp(-w * t))[:, None]
-    q[:, 1] = goal[1] * (1 - np.exp(-w * t) * (np.cos(3 * w * t) + np.sin(3 * w * t) / 3))  # no speed at first
+    q[:, 1] = goal[1] * (1 - np.exp(-w * t) * (np.cos(3 * w * t) + np.sin(3 * w * t) / 3))  # zero initial speed
     q[:, 2] = 0.5 * goal[2]
     q[:, 3] = goal[3] * (1 + 0.1 * np.sin(50 * t)) - goal[3] * (t == 0)
     effort = np.zeros((len(t), n))
     effort[:, 4] = 0.1 * arm.effort_limits[4] * np.sin(50 * t)
-    effort[t < DURATION - REST, 5] = arm.effort_limits[5]  # the motor works on the way and rests at the end
+    effort[t < DURATION - REST, 5] = arm.effort_limits[5]  # nonzero effort during the motion, zero at the end
     measured = measure_step(arm, Response(t, q, q, effort, goal))
     assert measured.settling[0] == pytest.approx(np.log(goal[0] / band(arm)[0]) / w, abs=2e-3)
     assert measured.overshoot[0] == 0.0
-    # Its speed is 10/3 w exp(-w t) sin(3 w t): the first and largest peak is at 3 w t = pi.
+    # The speed is 10/3 w exp(-w t) sin(3 w t), so the first and largest peak is at 3 w t = pi.
     assert measured.overshoot[1] == pytest.approx(np.exp(-np.pi / 3), rel=1e-3)
     assert np.isinf(measured.settling[2])
     assert measured.steady_error[2] == pytest.approx(0.5 * goal[2])
-    assert np.isinf(measured.settling[3])  # it comes into the band again and again and never stays
+    assert np.isinf(measured.settling[3])  # it enters the band repeatedly but never stays
     assert measured.overshoot[3] == pytest.approx(0.1, rel=1e-2)
     np.testing.assert_allclose(measured.oscillation, [0, 0, 0, 0, 0.2, 0, 0], rtol=1e-2, atol=1e-12)
 
@@ -297,7 +297,7 @@ def test_best_gains_settle_most_often_then_fastest():
 
 def test_published_gains_are_per_second_and_for_mtm():
     gains = published_gains(load_arm("mtmr"))
-    # One sample of 10 ms with the error 1 adds Ki to the effort.
+    # One sample of 10 ms with an error of 1 adds Ki to the effort.
     assert gains.ki[3] * 0.01 == pytest.approx(4e-4)
     assert published_gains(load_arm("psm")) is None
 
@@ -357,7 +357,7 @@ def test_rejects_invalid_gains_files(tmp_path, text, said):
 
 
 def refused(capsys, *arguments):
-    """The one line of the command before it ends with 2."""
+    """Returns the single line that the command prints before it exits with code 2."""
     assert main(arguments) == 2
     return refusal(capsys.readouterr().err)
 
@@ -379,7 +379,7 @@ def test_commands_reject_invalid_options(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_psm_insertion_ultimate_gain_matches_analytic():
-    """Viscous friction and delay alone. Drake steps with the velocity at a step's end: only the ticks are a lag."""
+    """Simulates viscous friction and delay only. Drake's time stepping adds no lag to that of the ticks."""
     b, arm = 2.0, load_arm("psm")
     effects = ArmEffects(
         friction=[DriveEffect("actuator.insertion", "viscous", coefficient=b)], delay=DelayEffect(measurement=1)
@@ -395,7 +395,7 @@ def test_psm_insertion_ultimate_gain_matches_analytic():
 
 @pytest.mark.slow
 def test_designed_gains_settle_all_psm_joints(tmp_path, monkeypatch):
-    # One process beside this one: each more compiles the arm again.
+    # Use one worker process, since each process compiles the arm again.
     monkeypatch.setattr("dvrk_drake.experiments.tuning.tuning.local_executor", partial(local_executor, 1))
     tuning = tune_arm("psm", ["model"], conditions=CONDITIONS[:1], poses=1)
     settling = tuning.comparison.table("model", "settling")

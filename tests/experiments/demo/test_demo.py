@@ -1,4 +1,4 @@
-"""The demo as a user runs it, on fewer poses: it must find the arm that it hid, and hold it."""
+"""The demo with fewer poses: it must identify the ground-truth arm and hold it."""
 
 import io
 
@@ -32,7 +32,7 @@ def result(tmp_path_factory):
     shorter.undo()
 
 
-#: Of the plots of positions, by the name of the file.
+#: Properties of the position plots by file name.
 TITLES: dict[str, str] = {}
 
 

@@ -1,4 +1,4 @@
-"""The scene of a master and a PSM: the played hand, the live controls, the command."""
+"""Teleoperation demo of a master and a PSM: simulated hand, live controls, command."""
 
 from functools import partial
 
@@ -32,7 +32,7 @@ def test_tip_follows_hand_within_half_a_millimetre():
 
 
 def pressed(name):
-    """What the browser sends when a button is pressed: msgpack of {type: button, name: name}."""
+    """Returns the message of the browser for a pressed button: msgpack of {type: button, name: name}."""
     text = [bytes([0xA0 + len(word)]) + word.encode() for word in ("type", "button", "name", name)]
     return b"\x82" + b"".join(text)
 

@@ -1,4 +1,4 @@
-"""Measures of runs whose motion is written down: what each must say is known without simulating."""
+"""Measures of runs with a prescribed motion, whose values are known without simulation."""
 
 import math
 
@@ -17,12 +17,12 @@ T = np.arange(0, 20.001, 0.01)
 
 
 def state(q):
-    """What is true: the recordings here are 10 mrad beside it, which must not count."""
+    """Returns the true state; the recordings deviate from it by 10 mrad, which must not affect the measures."""
     return np.hstack([q, 0 * q])
 
 
 def released(**motions):
-    """Scenario and run of an MTM in mode "gravity": joints named move as said, the others rest."""
+    """Returns scenario and run of an MTM in mode "gravity" with a given motion of the named joints."""
     scenario = Scenario(arm="mtml", duration=20.0)
     scenario.controller.mode = "gravity"
     q = np.zeros((len(T), 7))
@@ -33,7 +33,7 @@ def released(**motions):
 
 
 def stepped(motion):
-    """Scenario and run of an elbow that is to be at 0.4 rad at 2 s."""
+    """Returns scenario and run of an elbow with a target of 0.4 rad at 2 s."""
     scenario = Scenario(arm="mtml", duration=20.0, targets=[Target(2.0, [0, 0, 0.4, 0, 0, 0, 0])])
     q = np.zeros((len(T), 7))
     q[:, 2] = motion
@@ -47,7 +47,7 @@ def test_uniform_drift_has_known_rate_and_distance():
     assert Measure("drift_rate")(*run) == pytest.approx(0.002)
     assert Measure("drift", time=3.0)(*run) == pytest.approx(0.006)
     assert Measure("steady_error", time=2.0)(*run) == pytest.approx(0.002 * 19.0)
-    # 15 mrad are passed after 7.5 s, 30 mrad after 15 s.
+    # The drift exceeds 15 mrad after 7.5 s, and 30 mrad after 15 s.
     assert Measure("held")(*run) is False
     assert Measure("held", time=7.4)(*run) is True
     assert Measure("held", band=0.0201)(*run) is True

@@ -1,4 +1,4 @@
-"""Studies: the same table whatever runs them and whatever interrupts them. The simulation is replaced by a formula."""
+"""Studies: the table does not depend on the executor or on interruptions. A formula replaces the simulation."""
 
 import csv
 import math
@@ -41,7 +41,7 @@ def make_study(**changes):
 
 @pytest.fixture(autouse=True)
 def formula(monkeypatch):
-    """Drifts by what seed and parameter error say; every seventh seed diverges, every eleventh is lost as NaN."""
+    """Computes a drift from seed and parameter error; every seventh seed diverges, every eleventh gives NaN."""
 
     def simulate(scenario):
         if scenario.seed % 7 == 0:
@@ -57,7 +57,7 @@ def formula(monkeypatch):
 
 
 class Backwards(ThreadPoolExecutor):
-    """Runs nothing until all is submitted, then the last case first."""
+    """Executor that runs all cases in reverse order after the last one is submitted."""
 
     def __init__(self):
         super().__init__(1)
@@ -73,7 +73,7 @@ class Backwards(ThreadPoolExecutor):
 
 
 class Dying(ThreadPoolExecutor):
-    """Whose workers are killed after a number of cases."""
+    """Executor whose workers are killed after a given number of cases."""
 
     def __init__(self, cases):
         super().__init__(1)
@@ -102,7 +102,7 @@ def test_table_has_one_reproducible_row_per_case(reference):
     assert {(row["pose"], row["variation"], row["seed"]) for row in rows} == {
         (row["pose"], v, row["seed"]) for row in rows for v in ("exact", "wrong, a lot")
     }
-    assert len({row["seed"] for row in rows}) == 12  # its own for each pose and seed, shared by the variations
+    assert len({row["seed"] for row in rows}) == 12  # one for each pose and seed, shared by the variations
     starts = np.array([[float(row[f"q{j}"]) for j in range(1, 8)] for row in rows])
     np.testing.assert_array_equal(starts[::4], MTM.sample_poses(6, np.random.default_rng(3)))
     for row in rows:
@@ -133,7 +133,7 @@ def test_lost_workers_do_not_lose_rows(cases, reference, tmp_path):
         run_study(make_study(), executor, path)
     assert isinstance(loss.value.__cause__, BrokenProcessPool)
     counts = []
-    with Dying(24 - cases) as executor:  # as many as are missing, and no more
+    with Dying(24 - cases) as executor:  # exactly the number of missing cases
         rows = run_study(make_study(), executor, path, lambda done, all_cases: counts.append((done, all_cases)))
     assert counts == [(done, 24) for done in range(cases, 25)]
     assert sorted(rows) == list(range(24))
@@ -230,7 +230,7 @@ def test_parquet_matches_csv(reference, tmp_path):
         run_study(make_study(), executor, path)
     assert not path.exists()
     assert len((tmp_path / "results.parquet.rows.csv").read_bytes().splitlines()) == 10
-    for most in (15, 0):  # the rest, and then nothing more
+    for most in (15, 0):  # first the remaining cases, then none
         with Dying(most) as executor:
             run_study(make_study(), executor, path)
         assert {p.name for p in tmp_path.iterdir()} == {"reference.csv", "results.parquet"}
@@ -253,7 +253,7 @@ def test_wilson_interval_counts_failed_runs_as_worst(tmp_path):
     held = exact.measures["held"]
     assert isinstance(held, Share)
     assert held.yes > wrong.measures["held"].yes > 0
-    # Wilson: the shares p at which the observed one is just 1.96 standard errors away.
+    # Wilson: the bounds are the shares p that are 1.96 standard errors away from the observed share.
     for p in (held.lower, held.upper):
         assert abs(held.yes / 120 - p) == pytest.approx(norm.ppf(0.975) * math.sqrt(p * (1 - p) / 120))
     drift = exact.measures["drift"]

@@ -1,4 +1,4 @@
-"""`dvrk-drake study` as a user meets it: what is refused, in one line, before anything runs."""
+"""`dvrk-drake study`: invalid input gives a one-line error before any simulation."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Studies on processes and on a Dask cluster, killed in the middle: nothing lost, and the same as undisturbed."""
+"""Studies on processes and on a Dask cluster: interruptions lose no rows and do not change the results."""
 
 import json
 import os
@@ -27,7 +27,7 @@ random_poses: {count: 5, seed: 1, margin: 0.1}
 variations: [{name: nominal}, {name: wrong, set: [controller.parameter_error=0.2]}]
 measures: [{kind: held, time: 1}, {kind: drift, time: 0.5}, {kind: effort_share}]
 """
-#: The command line with a formula in place of the simulation, which workers would compile for seconds.
+#: Command line with a formula instead of the simulation, whose compilation takes seconds per worker.
 FORMULA = Path(formula_study.__file__)
 
 
@@ -39,7 +39,7 @@ def study(tmp_path_factory):
 
 
 def undisturbed(study):
-    """The table as one thread of this process makes it."""
+    """Table computed by one thread of this process."""
     path = study.parent / "undisturbed.csv"
     path.unlink(missing_ok=True)
     with ThreadPoolExecutor(1) as executor:
@@ -51,7 +51,7 @@ def undisturbed(study):
 
 @pytest.fixture
 def started():
-    """Starts processes, and leaves none behind."""
+    """Starts processes and ends them after the test."""
     processes = []
 
     def start(*arguments):
@@ -68,7 +68,7 @@ def started():
 
 @pytest.fixture
 def sell(tmp_path, monkeypatch):
-    """Lets so many more simulations of the formula finish; without this fixture none waits."""
+    """Releases the given number of simulations; without this fixture the simulations do not wait."""
     folder = tmp_path / "tickets"
     folder.mkdir()
     monkeypatch.setenv(formula_study.TICKETS, str(folder))
@@ -85,7 +85,7 @@ def rows_in(path):
 
 
 def children_of(process):
-    """Process ids of the workers, without multiprocessing's resource tracker."""
+    """Returns the process ids of the workers, without multiprocessing's resource tracker."""
     ids = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     return [int(i) for i in ids if "spawn_main" in Path(f"/proc/{i}/cmdline").read_text()]
 
