@@ -1,4 +1,4 @@
-"""The watchdog's states: what it lets pass, from when on, and when it takes over."""
+"""States of the command guard: accepted commands, start check, expiry and transitions."""
 
 import copy
 
@@ -87,7 +87,7 @@ def test_command_expires_after_50_ms_and_arm_holds():
 
 
 def test_command_after_expiry_restarts():
-    """Also where no step came in between."""
+    """The guard restarts even without a step in between."""
     bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
     bench.utime += 60 * MS
     assert bench.send() == Status.REFUSAL_NONE
@@ -117,7 +117,7 @@ def test_expiry_counts_from_the_answered_measurement():
     bench = Bench().started()
     answered = bench.utime
     bench.tick(39)
-    # Late, and then again and again: no time is gained by that.
+    # Late, then repeated: this does not extend the expiry.
     for _ in range(11):
         assert bench.send(status_utime=answered) == Status.REFUSAL_NONE
         assert bench.tick().control_mode == Command.EFFORT
@@ -145,11 +145,11 @@ def test_single_message_cannot_switch_off(mode):
     bench = Bench(modes=WITH_OFF).started(mode)
     allowed = bench.guard.accepted_modes
     assert not allowed >> Command.OFF & 1
-    for _ in range(200):  # also not after the expiry, when the arm holds
+    for _ in range(200):  # also after the expiry, when the arm holds
         assert bench.send(Command.OFF) == Status.REFUSAL_SUDDEN_OFF
         bench.tick()
     assert bench.guard.state == Status.STATE_HOLD
-    # Nor the first one of whoever comes, also when somebody else asked for a hold before.
+    # Nor the first command of a new sender, even if another one commanded a hold before.
     bench.run(Command.HOLD, 1)
     bench.tick(60)
     assert bench.send(Command.OFF, sender=6) == Status.REFUSAL_SUDDEN_OFF
@@ -160,7 +160,7 @@ def test_single_message_cannot_switch_off(mode):
 def test_off_requires_configuration(sender):
     bench = Bench()
     bench.run(Command.HOLD, 1)
-    bench.tick(60)  # idle: a stranger may come
+    bench.tick(60)  # idle: a new sender may start
     for _ in range(20):
         bench.run(Command.HOLD, 1, sender=sender)
         assert bench.send(Command.OFF, sender=sender) == Status.REFUSAL_BAD_MODE
@@ -248,7 +248,7 @@ def test_foreign_messages_do_not_end_start():
         bench.run(Command.EFFORT, 1)
     assert bench.guard.state == Status.STATE_EFFORT
     assert (bench.guard.ignored_code, bench.guard.counts.ignored) == (Status.REFUSAL_WRONG_ARM, 320)
-    # What the sender itself sends does.
+    # Messages of the sender itself end it.
     bench = Bench()
     bench.run(Command.EFFORT, 100)
     assert bench.send(effort=[np.nan] * N) == Status.REFUSAL_NOT_FINITE
@@ -266,7 +266,7 @@ def test_refused_command_keeps_command_in_force():
 def test_ended_start_keeps_held_pose(ending):
     bench = Bench()
     bench.run(Command.EFFORT, 100)
-    bench.q = Q - 0.01  # it sags meanwhile
+    bench.q = Q - 0.01  # it has moved meanwhile
     bench.tick()
     if ending == "refused":
         assert bench.send(effort=list(LIMIT)) == Status.REFUSAL_START_FAR
@@ -298,10 +298,10 @@ def test_wall_effort_increases_over_start_time():
     bench.run(Command.EFFORT, 250)
     for k in range(260):
         share = min(k / 250, 1.0)
-        # The wall has twice what the motor has there.
+        # The wall has twice the motor effort there.
         expected = -min(2 * share, 1.0) * LIMIT[0]
         assert bench.run(Command.EFFORT, 1).effort[0] == pytest.approx(expected, abs=0.01 * LIMIT[0])
-    # From then on efforts are as if they had begun elsewhere.
+    # From then on, efforts do not depend on the start.
     bench.run(Command.EFFORT, 250)
     bench.q = Q.copy()
     np.testing.assert_allclose(bench.run(Command.EFFORT, 1).effort, np.zeros(N), atol=1e-12)
@@ -324,7 +324,7 @@ def test_backward_arm_clock_discards_sender():
     bench.utime -= 10**6
     bench.step()
     assert bench.guard.fault_code == Status.FAULT_CLOCK
-    # By the old clock this would be a second sender, and a command out of order.
+    # On the old clock this would be a second sender and a command out of order.
     bench.sequence = 0
     assert bench.send(Command.HOLD, sender=6) == Status.REFUSAL_NONE
     bench.tick()
@@ -351,7 +351,7 @@ def test_guard_computes_gravity_effort():
 
 @pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])
 def test_copy_is_independent(mode):
-    """Drake copies a guard with its context before every step."""
+    """Drake copies the guard with its context before every step."""
     bench = Bench()
     bench.run(mode, 260)
     other = copy.copy(bench)
@@ -365,7 +365,7 @@ def test_copy_is_independent(mode):
     assert other.guard.fault_code == Status.FAULT_NONE
     other.run(mode, 300)
     assert (other.output.control_mode, other.guard.fault_code) == (mode, Status.FAULT_NONE)
-    # The same from here on gives the same.
+    # Equal inputs from here on give equal outputs.
     twin = copy.copy(other)
     twin.guard = copy.deepcopy(other.guard)
     for guarded in (other, twin):

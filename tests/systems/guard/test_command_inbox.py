@@ -1,4 +1,4 @@
-"""The inbox before a guard: which bytes it drops, what a flood leaves, and what only a key can tell apart."""
+"""Inbox of a guard: dropped bytes, behaviour in a flood, and authentication with a key."""
 
 import numpy as np
 import pytest
@@ -11,12 +11,12 @@ from dvrk_drake.models.lcm_messages import MessageKey
 from dvrk_drake.systems.guard.command_inbox import CommandInbox
 
 KEY = MessageKey(bytes(range(32)))
-#: More than an inbox keeps.
+#: Number of messages above the capacity of an inbox.
 FLOOD = 100
 
 
 class Networked(Bench):
-    """A bench whose commands go through an inbox, as bytes."""
+    """Test bench whose commands pass through an inbox as bytes."""
 
     def __init__(self, key=None, **arguments):
         super().__init__(**arguments)
@@ -32,7 +32,7 @@ class Networked(Bench):
         return data if self.key is None else self.key.sign(data)
 
     def round(self, before=(), after=()):
-        """A millisecond with a good command between other messages."""
+        """Runs one millisecond with a good command between other messages."""
         self.sent.append(self.good())
         self.put(*before, self.sent[-1], *after)
         self.inbox.deliver(self.guard, self.utime)
@@ -46,7 +46,7 @@ class Networked(Bench):
 
 
 def stranger(bench, **fields):
-    """A command that the bench's sender did not send; its own sequence does not notice."""
+    """Returns a command of another origin without a change of the sender's own sequence."""
     command = bench.command(**{"effort": list(LIMIT), **fields})
     bench.sequence -= 1
     return command.encode()
@@ -81,7 +81,7 @@ def test_foreign_messages_are_counted_by_reason(fields, code):
 def test_good_commands_of_any_arm_are_delivered(name, key):
     bench = Networked(key, arm=load_arm(name)).acting()
     assert (bench.guard.counts.accepted, bench.guard.counts.ignored) == (260, 0)
-    # A signed command is one for an arm without a key as well.
+    # An arm without a key accepts a signed command as well.
     bench.inbox = CommandInbox(bench.guard)
     bench.round()
     assert bench.guard.counts.accepted == 261
@@ -122,11 +122,11 @@ def test_flood_decodes_bounded_number():
 
 @pytest.mark.parametrize("key", [None, KEY])
 def test_200_spoofed_commands_that_continue_the_stream(key):
-    """Only a key tells them from the true ones: without one they act, within the guard's limits."""
+    """Only a key distinguishes them from genuine ones. Without it they act within the guard's limits."""
     bench = Networked(key).acting()
     moved = []
     for k in range(200):
-        # As soon as the sender's command was read on the network: its sequence and times plus a little.
+        # Derived from the sender's observed command: sequence and times plus a small increment.
         spoofed = stranger(bench, sequence=bench.sequence + 1 + k, utime=bench.utime - 10**15 + 1 + k)
         output = bench.round([spoofed])
         moved.append(np.abs(output.effort - 0.05 * LIMIT).max())
@@ -152,7 +152,7 @@ def test_huge_sequence_or_time_blocks_no_sender(field, key):
 
 
 def test_replayed_authentic_commands_do_not_act():
-    """At once, while the sender is in command; and later, when it is silent: they are out of order, then stale."""
+    """Immediately they are out of order. Later, when the sender is silent, they are stale."""
     bench = Networked(KEY).acting()
     for _ in range(100):
         assert bench.round(bench.sent[-8:]).control_mode == Command.EFFORT
@@ -164,7 +164,7 @@ def test_replayed_authentic_commands_do_not_act():
         bench.tick()
     assert (bench.guard.state, bench.guard.counts.accepted) == (Status.STATE_HOLD, accepted)
     assert bench.guard.refusal_code == Status.REFUSAL_STALE
-    # Nor in another session of the arm.
+    # Also not in another session of the arm.
     other = Networked(KEY)
     other.guard.session_id = SESSION + 1
     other.inbox = CommandInbox(other.guard, KEY)
@@ -202,7 +202,7 @@ def test_sender_in_control_has_separate_capacity():
     bench.put(*[bench.good() for _ in range(5)])
     bench.inbox.deliver(bench.guard, bench.utime)
     counts = bench.guard.counts
-    # At one time only one command of a sender is accepted: its clock must go on.
+    # Only one command of a sender is accepted at one time, because its clock must advance.
     assert (counts.accepted, counts.refused, counts.ignored) == (1, 2, 2)
     assert bench.guard.ignored_code == Status.REFUSAL_FLOOD
     bench.tick()

@@ -1,4 +1,4 @@
-"""What an arm does from period to period, by itself: how each mode begins, follows and ends."""
+"""Follower of a command guard: start, following and end of each mode."""
 
 import numpy as np
 import pytest
@@ -69,7 +69,7 @@ def test_target_follows_command_at_limited_rate():
     output = follower.follow_position(goal, 0.01 * LIMITS.speed, 1.0)
     np.testing.assert_allclose(output.position, goal, atol=1e-12)
     np.testing.assert_allclose(output.velocity, 0.01 * LIMITS.speed, atol=1e-12)
-    # Whoever changes the output does not change the target.
+    # A change of the output does not change the target.
     output.position[:] = 9.0
     np.testing.assert_allclose(follower.hold(1e-3).position, goal, atol=1e-12)
 
@@ -84,14 +84,14 @@ def test_large_following_error_is_detected(joint, side):
     text = follower.astray(Q + 1.001 * away)
     assert text.startswith(f"{ARM.joint_names[joint]} = ")
     assert text.endswith(f"{0.15 * RANGE[joint]:.3g} away is allowed")
-    # The worst one is named.
+    # The worst one is reported.
     other = (joint + 1) % N
     assert follower.astray(Q + 1.1 * away + 0.5 * RANGE[other] * E[other]).startswith(ARM.joint_names[other])
 
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_lag_up_to_following_time_is_allowed(side):
-    """Between the target and a first order that follows it late, and the following error beyond either."""
+    """The arm may be between the target and its first-order lag, plus the following error."""
     follower, joint = at(), 4
     follower.begin_position()
     late, dt, error = Q[joint], 1e-3, 0.15 * RANGE[joint]
@@ -148,7 +148,7 @@ def test_braking_distance_is_allowed_after_latch(joint, side, share):
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_fault_holds_valid_joints_with_bounded_effort(side):
-    """At most `fault_effort`, or a third of it more than gravity needs, and never more than the motor has."""
+    """The bound is `fault_effort`, or the gravity effort plus a third of it, and the motor's limit."""
     bound, valid = LIMITS.fault_effort, np.ones(N, bool)
     for gravity, most in ((STILL, bound), (0.5 * LIMIT, 0.5 * LIMIT + bound / 3), (0.95 * LIMIT, LIMIT)):
         for away, expected in ((9.0, side * most), (-9.0, -side * bound)):
@@ -202,21 +202,21 @@ def test_start_inside_wall_increases_wall_gradually(side):
     q[0] = (ARM.position_upper if side > 0 else ARM.position_lower)[0]
     push = side * 0.25 * LIMIT * E[0]
     wall = LIMITS.wall_effort(q, STILL)[0]
-    assert wall[0] == pytest.approx(-side * 2 * LIMIT[0])  # twice what the motor has, inward
+    assert wall[0] == pytest.approx(-side * 2 * LIMIT[0])  # twice the motor effort, inward
     follower = at(q)
     follower.begin_effort(push, q)
     for share in (0.0, 0.25, 0.5, 1.0):
         output = follower.follow_effort(push, q, STILL, 1e-3, share)
         np.testing.assert_allclose(output.effort, np.clip(push + share * wall, -LIMIT, LIMIT), atol=1e-12)
         assert output.joint_flags[0] == Status.FLAG_POSITION_LIMIT
-    # What is taken back does not push an arm outward beyond its motors when it has left the wall.
+    # The subtracted effort does not push an arm outward after it has left the wall.
     inside = follower.follow_effort(side * LIMIT * E[0], Q, STILL, 1.0, 0.0)
     np.testing.assert_allclose(inside.effort, side * LIMIT * E[0], atol=1e-12)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_start_inside_wall_never_pulls_outward(side):
-    """Nothing is left out that the wall does not add now: the arm has left it, or the speed limit brakes."""
+    """Nothing is subtracted beyond the present effort of the wall, also outside it or while braking."""
     q = Q.copy()
     q[0] = (ARM.position_upper if side > 0 else ARM.position_lower)[0]
     follower = at(q)

@@ -1,4 +1,4 @@
-"""What was tried to get past the watchdog: limits at their edges, clocks, messages, settings, lost power."""
+"""Attempts to bypass the guard: edges of limits, clocks, messages, settings, power loss."""
 
 import dataclasses
 
@@ -97,7 +97,7 @@ def test_session_zero_is_refused():
         CommandGuard(ARM, 0, Weightless())
 
 
-# What is configured
+# Configuration
 
 
 def test_empty_modes_accept_no_mode():
@@ -145,7 +145,7 @@ def test_effort_fraction_clamps_and_refuses_a_dropping_start():
     output = bench.run(Command.EFFORT, 50, effort=list(LIMIT))
     np.testing.assert_allclose(output.effort, 0.1 * LIMIT, atol=1e-12)
     assert np.all(output.joint_flags & Status.FLAG_EFFORT_CLAMPED)
-    # The wall has all of the effort all the same.
+    # The wall still has the full effort.
     bench.q = Q.copy()
     bench.q[0] = ARM.position_upper[0]
     assert bench.run(Command.EFFORT, 1, effort=list(LIMIT)).effort[0] == -LIMIT[0]
@@ -167,7 +167,7 @@ def test_feedforward_velocity_stays_inside_limits(name):
     bench.follows = True
     generator = np.random.default_rng(2)
     for q in arm.sample_poses(30, generator):
-        # The way there takes up to the traverse time.
+        # The motion there takes up to the traverse time.
         bench.run(Command.POSITION, 520, position=list(q))
         bench.run(Command.POSITION, 1, position=list(q), velocity=list(1e5 * generator.normal(size=arm.num_joints)))
         ahead = bench.output.position + look_ahead * bench.output.velocity
@@ -200,7 +200,7 @@ def test_efforts_inside_wall_start_without_step():
 
 
 def test_wall_next_to_start_acts_immediately():
-    """Efforts outward as soon as they act, from where the wall begins: as strong as it is later."""
+    """For outward efforts from the start of the wall, the wall has its full effort immediately."""
     q = Q.copy()
     q[0] = UPPER[0] - 0.05
     efforts = []
@@ -213,7 +213,7 @@ def test_wall_next_to_start_acts_immediately():
 
 
 def test_targets_stay_inside_coupled_limit():
-    """Targets, from every corner of the two joints that the coupled limit leaves, with jumps to any other."""
+    """Targets jump between all corners of the range of shoulder and elbow."""
     bench = Bench()
     limits = bench.guard.limits
     generator = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""The watchdog's latched faults, and what clears them."""
+"""Latched faults of the command guard and their reset."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def test_pose_beyond_limit_faults_in_effort_mode():
 def test_pose_beyond_coupled_limit_faults():
     bench = Bench().started()
     bench.q = Q.copy()
-    bench.q[1:3] = 0.2, -0.2 - 0.36  # each inside its own limits
+    bench.q[1:3] = 0.2, -0.2 - 0.36  # each joint inside its own range
     bench.tick()
     assert bench.guard.fault_text == "parallelogram = -0.36 is beyond -0.33..0.68"
 
@@ -116,7 +116,7 @@ def test_few_bad_measurements_in_hold_are_tolerated():
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
 def test_wrong_velocity_at_start_has_no_lasting_effect(joint, side):
-    """The brake of the speed limit acts on that one sample, and nothing takes it back in the next 250 ms."""
+    """The speed limit brakes on that one sample, and the start does not subtract this effort later."""
     bench = Bench().at_rest()
     commanded = bench.effort.copy()
     while bench.guard.state != Status.STATE_EFFORT:
@@ -132,7 +132,7 @@ def test_wrong_velocity_at_start_has_no_lasting_effect(joint, side):
 def test_reset_does_not_hold_an_unmeasured_pose():
     bench = Bench(modes=WITH_OFF, checks=True, model=Heavy()).at_rest()
     good = bench.q
-    # Off: neither a hold nor a reset of a fault gives power.
+    # In OFF, neither a hold nor a reset of a fault switches the power on.
     bench.run(Command.HOLD, 5)
     bench.run(Command.OFF, 5)
     bench.q = good * np.nan
@@ -167,7 +167,7 @@ def test_reset_does_not_hold_an_unmeasured_pose():
 
 
 def test_reset_after_invalid_position_holds_measured_pose():
-    """Also where it is so near that a hold would go on; until then the others are braked as well as held."""
+    """This also holds for a pose near the target. Until the reset, the others are held and damped."""
     bench = Bench(checks=True, model=Heavy()).at_rest()
     bench.tick(100)
     bench.q = Q + 0.015 * np.eye(N)[0]
@@ -220,7 +220,7 @@ def test_implausible_first_pose_is_a_fault():
     guard = bench.guard
     assert (guard.state, guard.fault_code) == (Status.STATE_FAULT, Status.FAULT_MEASUREMENT)
     assert guard.fault_text == "outer_yaw = 40 is far beyond -0.6981..1.134; degrees or wrong zero?"
-    assert bench.output.control_mode == Command.OFF  # it was never held anywhere
+    assert bench.output.control_mode == Command.OFF  # it never held a pose
     bench.q = Q
     assert bench.tick().control_mode == Command.OFF
     assert guard.state == Status.STATE_FAULT
@@ -395,7 +395,7 @@ def test_stuck_arm_during_motion_is_a_fault():
 
 
 def test_following_lag_is_no_fault():
-    """A PD controller without feed-forward, at the highest speed from end to end: late by Kd/Kp, and no fault."""
+    """A PD controller without feedforward at the highest speed lags by Kd/Kp. This is no fault."""
     late = np.array(ARM.gains.kd) / np.array(ARM.gains.kp)
     bench = Bench().started(Command.POSITION)
     worst = 0.0
@@ -408,4 +408,4 @@ def test_following_lag_is_no_fault():
         bench.tick()
         worst = max(worst, np.abs((bench.output.position - bench.q) / RANGE).max())
     assert bench.guard.state == Status.STATE_POSITION
-    assert worst > 0.2  # more than is allowed to who is not late
+    assert worst > 0.2  # more than is allowed without a lag

@@ -1,4 +1,4 @@
-"""Garbage of all kinds: the watchdog never lets it move anything."""
+"""Invalid messages of all kinds never move the arm."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 
 
 def random_command(bench, generator):
-    """A command that is right in most fields, so that it gets far; any field may be wrong in a nasty way."""
+    """Returns a command that is correct in most fields. Any field may have an extreme value."""
     nasty = [0.0, -0.0, np.nan, np.inf, -np.inf, 1e300, -1e6, 1e-320, 3.0]
     whole = [0, 1, -1, 2**63 - 1, -(2**63), 2**31]
     command = bench.command(int(generator.choice([0, 1, 2, 4, 3, 3, 3, 3])))
@@ -43,7 +43,7 @@ def test_fuzzed_commands_keep_output_limited(seed):
     last_effort, last_flags, last_mode = None, None, Command.HOLD
     for k in range(10_000):
         if k % 700 == 0 and bench.guard.state != Status.STATE_EFFORT:
-            # Now and then a good start, so that the fuzz also meets a guard that acts.
+            # An occasional good start, so that fuzzed commands also arrive while commands act.
             bench.tick(60)
             bench.q, bench.v, bench.effort = Q.copy(), np.zeros(N), 0.05 * LIMIT
             bench.tick()

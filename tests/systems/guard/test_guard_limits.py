@@ -1,4 +1,4 @@
-"""Limits of effort, rate and position that the watchdog keeps commands inside."""
+"""Limits of effort, rate and position that the guard enforces."""
 
 import numpy as np
 import pytest
@@ -49,14 +49,14 @@ def test_soft_wall_reverses_outward_effort(row, side):
     assert np.all(effort[joints] * command[joints] < LIMIT[joints] ** 2)
     assert np.all(flags[joints] == (Status.FLAG_COUPLED_LIMIT if row >= N else Status.FLAG_POSITION_LIMIT))
     effort, _ = settled(0.5)
-    assert np.all(effort[joints] * np.sign(command[joints]) <= 1e-12)  # nothing outward is left
+    assert np.all(effort[joints] * np.sign(command[joints]) <= 1e-12)  # no outward effort remains
     effort, _ = settled(1.0)
     np.testing.assert_allclose(effort, -command, atol=1e-12)
-    # One width before the wall, but there within Kd/Kp at this speed.
+    # One width before the wall, but it reaches the wall within Kd/Kp at this speed.
     seconds = max(np.divide(ARM.gains.kd, ARM.gains.kp)[joints])
     effort, _ = settled(-1.0, 2 * limits.wall_width[row] / (seconds * (a @ a)))
     np.testing.assert_allclose(effort, -command, atol=1e-12)
-    # It never pulls: on the way out it lets go.
+    # It never pulls: it exerts no effort on the way out.
     effort, _ = settled(0.5, -0.6 * limits.wall_width[row] / (seconds * (a @ a)))
     np.testing.assert_allclose(effort, command, atol=1e-12)
 
@@ -85,7 +85,7 @@ def test_feedforward_velocity_passes_with_unlimited_position():
     output = bench.run(Command.POSITION, 1, velocity=[0.01] * N)
     np.testing.assert_array_equal(output.velocity, np.full(N, 0.01))
     output = bench.run(Command.POSITION, 1, velocity=[100.0] * N)
-    # Shoulder and elbow together would lead to the coupled limit: test_guard_attacks.py.
+    # Shoulder and elbow together would reach the coupled limit, see test_guard_attacks.py.
     free = [0, 3, 4, 5, 6]
     np.testing.assert_array_equal(output.velocity[free], bench.guard.limits.speed[free])
 

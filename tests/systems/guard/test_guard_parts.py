@@ -1,4 +1,4 @@
-"""Measurements, streams of commands and settings by themselves: the edges of what is accepted."""
+"""Unit tests of measurements, command streams and settings at the edges of the accepted ranges."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ MS, NOW = 1000, 10**9
 
 
 def measurement():
-    """A good one of three joints, 25 ms ago."""
+    """Returns a good measurement of three joints, 25 ms old."""
     measured = Measurement(3, 20_000)
     measured.advance(NOW - 25 * MS)
     assert measured.take(NOW - 25 * MS, GOOD, GOOD, GOOD) == ""
@@ -115,14 +115,14 @@ def test_is_finite_bounds_the_sum_to_a_million(number, finite):
 
 
 class Stream:
-    """Commands of a sender whose clock reads what the arm's does, less a million seconds."""
+    """Stream of a sender whose clock is a million seconds behind the arm's."""
 
     def __init__(self, **fields):
         self.stream = CommandStream(expiry=50 * MS, clock_tolerance=30 * MS, sequence_jump=1000, **fields)
         self.sequence = 0
 
     def send(self, utime, mode=Command.HOLD, *, sender=5, ahead=0, step=1, reset=False):
-        """Refusal, or what accepting it said, of a command that arrives at `utime`."""
+        """Returns the refusal of a command that arrives at `utime`, or the result of accepting it."""
         self.sequence += step
         command = Command()
         command.sender_id, command.sequence, command.utime = sender, self.sequence, utime - 10**12 + ahead
@@ -137,7 +137,7 @@ def test_second_sender_requires_silence(silence, code):
     assert stream.send(0) is False
     assert stream.send(silence, sender=6) == code
     assert stream.stream.sender_id == (5 if code else 6)
-    # A refused command keeps no place: whoever repeats one must not keep others away.
+    # A refused command does not block other senders, even if it is repeated.
     stream = Stream()
     stream.send(0)
     assert stream.send(40 * MS, step=0) == Status.REFUSAL_OUT_OF_ORDER
@@ -193,7 +193,7 @@ def test_stopped_sender_clock_is_a_jump():
     stream = Stream()
     stream.send(0)
     assert stream.send(1, ahead=-1) == Status.REFUSAL_CLOCK_JUMP
-    assert stream.send(2, ahead=-1) is False  # it went on since the last accepted one
+    assert stream.send(2, ahead=-1) is False  # it advanced since the last accepted command
 
 
 def test_missing_commands_are_counted():
@@ -223,7 +223,7 @@ def test_reset_is_a_change_from_false_to_true():
     stream = Stream()
     asked = [stream.send(k * MS, reset=reset) for k, reset in enumerate([True, True, False, True, True, False, True])]
     assert asked == [False, False, False, True, False, False, True]
-    # Another sender's false does not count.
+    # The flag of another sender does not count.
     stream.send(8 * MS)
     assert stream.send(60 * MS, sender=6, reset=True) is False
 
@@ -233,7 +233,7 @@ def test_forget_discards_the_sender():
     stream.send(50 * MS)
     stream.stream.forget()
     assert stream.stream.sender_id == 0
-    # The clock went back: an older time, a lower sequence and another sender are all right now.
+    # After a backward clock, an older time, a lower sequence and another sender are accepted.
     assert stream.send(0, Command.OFF, sender=6, step=-5) == Status.REFUSAL_SUDDEN_OFF
     assert stream.send(MS, reset=True, sender=6) is False
     assert stream.stream.lost == 0
@@ -259,7 +259,7 @@ def test_reset_requires_hold(mode, reset):
 
 # Settings
 
-#: What a person may set. A change of a default or of a bound is a decision about safety, which this makes visible.
+#: Defaults and bounds of all settings. A change of one of them is a decision about safety, which this test shows.
 SETTINGS = {
     "expiry": (0.002, 0.05, 1.0),
     "measurement_age": (0.001, 0.02, 0.1),

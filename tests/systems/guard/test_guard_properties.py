@@ -1,4 +1,4 @@
-"""Whatever a guard is given, what it tells the arm to do is finite and inside the limits."""
+"""Property test: the output of a guard is finite and inside the limits for any input."""
 
 import dataclasses
 from collections import Counter
@@ -26,12 +26,12 @@ ARMS = [
     for stiffness in (0.5, 1.0, 2.0)
     for strength in (0.7, 1.0)
 ]
-#: What sensors, networks and models give when something is wrong.
+#: Typical wrong values of sensors, networks and models.
 STRANGE = (np.nan, np.inf, -np.inf, 0.0, -0.0, 1e300, -1e300, 1e-300, 999999.0, -999999.0, 1e6)
 
 
 class Broken(Weightless):
-    """A model that gives numbers that are not finite, or absurd."""
+    """Model that returns numbers that are not finite or implausible."""
 
     def __init__(self, number):
         self.number = number
@@ -44,7 +44,7 @@ class Broken(Weightless):
 
 
 def settings_of(schema):
-    """Settings with each number anywhere in its range."""
+    """Generates settings with each number anywhere in its range."""
     ranges = {field.name: field.metadata[RANGE] for field in dataclasses.fields(schema) if RANGE in field.metadata}
     whole = {field.name for field in dataclasses.fields(schema) if field.type is int}
     numbers = {
@@ -68,7 +68,7 @@ def configurations(draw):
 
 
 class Script:
-    """Measurements and commands near each other and near the arm's range, with strange ones among them."""
+    """Generates measurements and commands near each other and the arm's range, with extreme ones among them."""
 
     def __init__(self, draw, arm, guard):
         self.arm, self.guard, self.n = arm, guard, arm.num_joints
@@ -80,7 +80,7 @@ class Script:
         self.mode = draw(st.sampled_from([Command.HOLD, Command.POSITION, Command.EFFORT]))
 
     def numbers(self, values):
-        """The values, some replaced by strange ones."""
+        """Returns the values, some of them replaced by extreme ones."""
         values = np.array(values, float)
         replaced = self.random.random(len(values)) < self.strange
         values[replaced] = self.random.choice(STRANGE, np.count_nonzero(replaced))
@@ -122,12 +122,12 @@ _PERIODS = [0.5, 0.3, 0.15, 0.01, 0.02, 0.01, 0.01]
 
 
 def check(data, modes):
-    """Runs a script through a guard, and counts the modes of its output."""
+    """Runs a script through a guard and counts the modes of its output."""
     arm, guard = data.draw(configurations())
     script = Script(data.draw, arm, guard)
     guard.step(script.utime, script.utime, script.q, np.zeros(script.n), np.zeros(script.n))
     if script.mode != Command.HOLD:
-        # Commands act at once, without the many periods in which they are watched.
+        # Commands act immediately, without the periods of the start check.
         guard._force.take(script.command())
         guard._stream.accept(guard.last_command, script.utime)
         guard._act(script.mode)

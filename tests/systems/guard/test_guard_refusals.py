@@ -1,4 +1,4 @@
-"""What the watchdog refuses, and that what is refused ends in a hold."""
+"""Refused commands of the guard, which lead to a hold."""
 
 import numpy as np
 import pytest
@@ -76,7 +76,7 @@ def test_foreign_messages_do_not_extend_expiry():
         bench.send(sender=6)
         bench.guard.receive(decode(Command, b"garbage"), bench.utime)
         bench.tick()
-    # A second sender may follow the first when that one was silent for the expiry, and is watched.
+    # A second sender may follow a first one that was silent for the expiry, and passes STARTING.
     assert (bench.guard.state, bench.guard.sender_id) == (Status.STATE_STARTING, 6)
     assert bench.guard.counts.expired == 1
 
@@ -163,7 +163,7 @@ def test_arm_clock_jumps_expire_commands_or_fault():
     bench.utime -= 3600 * 10**6
     assert bench.tick().control_mode == Command.HOLD
     assert bench.guard.fault_code == Status.FAULT_CLOCK
-    # The reset works on the clock as it is now.
+    # The reset works on the present clock.
     bench.run(Command.HOLD, 2)
     bench.run(Command.HOLD, 1, reset_fault=True)
     assert bench.guard.state == Status.STATE_HOLD

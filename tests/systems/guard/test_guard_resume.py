@@ -1,4 +1,4 @@
-"""After the watchdog took over an operator must resume. Expiry by the wall clock, in stalls of either side."""
+"""Resume by an operator after the watchdog took over, and expiry by the wall clock in stalls of either side."""
 
 import copy
 
@@ -22,7 +22,7 @@ def expire(bench):
 
 
 def jump(bench, mode=None):
-    """The sender's clock jumps: its commands are refused until the last good one expires."""
+    """Lets the sender's clock jump: its commands are refused until the last good one expires."""
     for _ in range(50):
         code = bench.send(mode or bench.output.control_mode, utime=bench.utime)
         assert code == Status.REFUSAL_CLOCK_JUMP
@@ -37,7 +37,7 @@ TAKEOVERS = [(expire, EXPIRED), (jump, EXPIRED), (call, "the period is 20 ms")]
 
 
 def waits(bench, reason):
-    """Whether the guard holds and takes no command that acts, whoever sends it and however long."""
+    """Returns whether the guard holds and refuses POSITION and EFFORT of any sender for any time."""
     guard, pose = bench.guard, bench.tick().position
     assert (guard.state, guard.fault_code, guard.hold_reason) == (Status.STATE_HOLD, Status.FAULT_NONE, reason)
     for sender in (5, 6):
@@ -213,7 +213,7 @@ def test_reset_clears_fault_and_pending_resume():
 
 
 class WallBench(Bench):
-    """A bench with a wall clock, which goes on with the arm's clock unless it is stalled."""
+    """Test bench with a wall clock that advances with the arm's clock except in a stall."""
 
     def __init__(self, **arguments):
         self.stalled = 0
@@ -221,7 +221,7 @@ class WallBench(Bench):
         super().__init__(wall_clock=lambda: self.utime + self.stalled - 10**14, **arguments)
 
     def stall(self, milliseconds):
-        """The process of the guard is stopped, and the arm's clock with it: nothing is received, no step is made."""
+        """Stops the guard's process and the arm's clock: nothing is received, no step is made."""
         self.stalled += round(milliseconds * MS)
 
 
@@ -231,7 +231,7 @@ class WallBench(Bench):
     ("milliseconds", "goes_on"), [(20, True), (48, True), (48.001, False), (50, False), (200, False), (1000, False)]
 )
 def test_bridge_stall_expires_command_by_wall_clock(mode, first, milliseconds, goes_on):
-    """Whether a command or a step comes first after it; with a command that was 1 ms old when it came."""
+    """The first event after it is a command or a step. The command was 1 ms old on arrival."""
     bench = WallBench().started(mode)
     assert bench.send(mode, status_utime=bench.utime - MS) == Status.REFUSAL_NONE
     bench.stall(milliseconds)
@@ -279,7 +279,7 @@ def test_answer_to_old_measurement_has_its_wall_clock_age():
 
 
 def test_delayed_command_has_age_of_its_measurement():
-    """As in the socket of a process that was stopped: by the arm's clock it is new."""
+    """Such a command waits in the socket of a stopped process. By the arm's clock it is new."""
     bench = WallBench().started()
     answered = bench.utime
     bench.stall(30)
@@ -301,7 +301,7 @@ def test_measurements_have_wall_clock_times():
     clock.note(8000, 0)
     assert clock.time_of(5000, 1) == 10**6 - 200
     assert clock.time_of(8000, 1) == clock.now() == 10**6 + 3000
-    assert clock.time_of(7000, 1500) == clock.now() - 1500  # never noted
+    assert clock.time_of(7000, 1500) == clock.now() - 1500  # never recorded
     for utime in range(10_000, 12_000):
         clock.note(utime, 0)
     now[0] += 50

@@ -1,4 +1,4 @@
-"""Limits by themselves: what they clamp, where walls and brakes begin, and that neither gives energy."""
+"""Unit tests of limits: clamping, start of walls and brakes, and passivity."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ FREE, HALF = np.zeros(N), 0.5 * LIMIT
 
 
 def flagged(flags):
-    """The joints that have a flag, and the flags."""
+    """Returns the joints that have a flag, and the flags."""
     return list(np.flatnonzero(flags)), set(int(flag) for flag in flags if flag)
 
 
@@ -100,7 +100,7 @@ def test_implausible_pose_starts_at_half_of_the_range(row, side):
     def at(share):
         pose = Q.copy()
         pose[joint] += middle[row] + side * (0.5 + share) * width[row] - A[row] @ Q
-        if row in (1, 2):  # the other one keeps the sum of shoulder and elbow inside
+        if row in (1, 2):  # the other joint keeps the sum of shoulder and elbow inside
             pose[3 - row] = np.clip(middle[N] - pose[row], LOWER[3 - row], UPPER[3 - row])
         return LIMITS.implausible_pose(pose)
 
@@ -181,19 +181,19 @@ def test_efforts_follow_clamped_command_at_limited_rate(sign):
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
 def test_fast_joint_is_braked(joint, side):
-    limits = GuardLimits(ARM, GuardSettings(traverse_time=50.0))  # so slow that no wall is met early
+    limits = GuardLimits(ARM, GuardSettings(traverse_time=50.0))  # so slow that the speed does not affect the wall
     push, speed = side * LIMIT * E[joint], side * limits.speed * E[joint]
     for share, left in ((0.0, 1.0), (1.0, 1.0), (1.125, 0.5), (1.25, 0.0), (1.375, -0.5), (1.5, -1.0), (3.0, -1.0)):
         effort, flags = limits.restrain_effort(push, Q, share * speed)
         np.testing.assert_allclose(effort, left * push, atol=1e-12)
         assert flagged(flags) == (([joint], {Status.FLAG_SPEED_LIMIT}) if share > 1 else ([], set()))
-    # It brakes what is too fast by itself, with up to all that the motor has.
+    # It brakes a fast joint with up to the full motor effort.
     np.testing.assert_allclose(limits.restrain_effort(FREE, Q, 1.1 * speed)[0], -0.4 * push, atol=1e-12)
     np.testing.assert_allclose(limits.restrain_effort(FREE, Q, 9.0 * speed)[0], -push, atol=1e-12)
 
 
 def test_wall_stiffness_is_limited():
-    """One period late, a stiffer wall would chatter; a softer one would be wider than it need be."""
+    """With a delay of one period, a stiffer wall would chatter. A softer one would be wider than necessary."""
     motors = [max(LIMIT[row != 0] / np.abs(row[row != 0])) for row in A]
     stiffness = 2 * np.array(motors)[:, None] * A**2 / LIMITS.wall_width[:, None] / KP
     assert np.all(stiffness <= 4.0 * (1 + 1e-9))
@@ -204,7 +204,7 @@ def test_wall_stiffness_is_limited():
 
 @pytest.mark.parametrize("row", range(N + 1))
 def test_wall_is_passive(row):
-    """Work over closed paths through the wall, of the limit's own coordinate, at several speeds."""
+    """Checks the work over closed paths of the limit's coordinate through the wall at several speeds."""
     a = A[row] / (A[row] @ A[row])
     middle = Q + (0.5 * (LOWER + UPPER)[row] - A[row] @ Q) * a
     amplitude = 0.5 * WIDTH[row]
@@ -272,7 +272,7 @@ def test_target_outside_moves_only_inward():
 
 
 def coupled(*limits):
-    """The arm with other coupled limits; joints differ in effort and in Kd/Kp."""
+    """Returns the arm with other coupled limits. Joints differ in effort and in Kd/Kp."""
     gains = dataclasses.replace(ARM.gains, kd=list(KP * np.linspace(0.05, 0.2, N)))
     return dataclasses.replace(ARM, coupled_limits=limits, effort_limits=LIMIT * np.linspace(1, 2, N), gains=gains)
 
@@ -298,7 +298,7 @@ def test_wall_effort_exceeds_all_pushing_motors(side):
     assert flagged(flags) == (list(joints), {Status.FLAG_COUPLED_LIMIT})
     assert np.all((pushed(0.5)[0] * push)[joints] <= 1e-12)
     np.testing.assert_allclose(pushed(1.0)[0], -push, atol=1e-12)
-    # What comes fast is met earlier, by the largest Kd/Kp of these joints.
+    # The wall acts earlier at high speed, by the largest Kd/Kp of these joints.
     seconds = max((np.array(arm.gains.kd) / np.array(arm.gains.kp))[joints])
     rate = 1e-3
     np.testing.assert_allclose(
@@ -311,7 +311,7 @@ def test_conflicting_coupled_limits_stop_target():
     first = CoupledLimit("first", {shoulder: 1.0, elbow: 1.0}, -1.0, Q[1] + Q[2])
     second = CoupledLimit("second", {shoulder: 1.0, yaw: 1.0}, Q[0] + Q[1], 2.0)
     limits = GuardLimits(coupled(first, second), GuardSettings())
-    # The shoulder makes room for the elbow, but the second limit does not let it.
+    # The shoulder would have to move for the elbow, which the second limit prevents.
     wanted = Q + np.array([-0.001, -0.001, 0.001, 0.001, 0.0, 0.0, 0.0])
     last = Q.copy()
     target, flags = limits.limit_position(wanted, last, 0.01)
@@ -353,7 +353,7 @@ def test_no_feedforward_velocity_with_limited_position():
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
 def test_effort_start_requires_gravity_effort(joint, side):
-    """But for 0.1 of the limit, dry friction, and what a hand or a wrong model does to a wrist."""
+    """The tolerance is 0.1 of the limit, dry friction, and `hand_effort` on a wrist."""
     allowed = 0.1 * LIMIT[joint] + ARM.dry_friction()[joint] + 0.06
     command = Command()
     command.control_mode = Command.EFFORT

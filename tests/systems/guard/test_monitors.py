@@ -33,7 +33,7 @@ def test_long_period_is_found_immediately(period, long):
 
 
 def test_slow_guard_holds_until_operator_resumes():
-    """Every 20 ms, efforts at 0.9 of their limits would act on an arm that moves on meanwhile."""
+    """With a period of 20 ms, efforts at 0.9 of their limits would act too long on a moving arm."""
     bench = Bench(checks=True)
     bench.run(Command.EFFORT, 260)
     assert bench.guard.state == Status.STATE_EFFORT
@@ -43,7 +43,7 @@ def test_slow_guard_holds_until_operator_resumes():
         bench.step()
         assert (bench.guard.state == Status.STATE_EFFORT) == (k < 50)
     assert bench.guard.hold_reason == "the guard's period has a median above the allowed 5 ms"
-    # Also with an operator's reset no command acts while it is so slow.
+    # No command acts while it is slow, even with an operator's reset.
     for reset in (False, True):
         bench.utime += 20 * MS
         assert bench.send(Command.HOLD, reset_fault=reset) == Status.REFUSAL_NONE
@@ -68,7 +68,7 @@ def test_guard_holds_after_49_ms_without_step():
 
 
 def test_period_is_measured_by_wall_clock():
-    """A simulated arm's own clock counts its ticks, however late they are."""
+    """The clock of a simulated arm counts its ticks and does not show their delay."""
     wall = [10**9]
     bench = Bench(checks=True, wall_clock=lambda: wall[0])
     for _ in range(260):
@@ -85,7 +85,7 @@ def test_period_is_measured_by_wall_clock():
 
 
 def reversals(monitor, wave, seconds=6.0):
-    """Time at which the monitor finds an oscillation of the effort wave(t) (n,), and the joint; or (None, None)."""
+    """Returns the time and joint of the detected oscillation of the effort wave(t) (n,), or (None, None)."""
     for k in range(round(1e3 * seconds)):
         joint = monitor.add(wave(1e-3 * k), 1e-3)
         if joint is not None:

@@ -1,4 +1,4 @@
-"""Each plausibility check: what it finds after which time, and what it must not find."""
+"""Plausibility checks: detected faults, detection times, and plausible data without a fault."""
 
 import dataclasses
 
@@ -25,14 +25,14 @@ JOINTS = range(N)
 
 
 class Unity(Weightless):
-    """A model with unit inertia in all joints."""
+    """Model with unit inertia in all joints."""
 
     def mass_matrix(self, q):
         return np.eye(len(q))
 
 
 class Sensors:
-    """An arm that moves as the test says, and the checks of what is measured."""
+    """Arm with a prescribed motion, and the checks of its measurements."""
 
     def __init__(self, arm=ARM, model=None):
         self.checks = Plausibility(arm, model or Weightless(), SETTINGS, GuardLimits(arm, GuardSettings()).speed)
@@ -46,7 +46,7 @@ class Sensors:
         return self.checks.check(dt, np.array(q), np.array(v), np.array(self.effort), self.commanded)
 
     def move(self, v, *, ticks=1, measured_q=None, measured_v=None):
-        """Moves at v (n,) and returns the first fault with the ticks until it, or ("", ticks)."""
+        """Moves at v (n,). Returns the first fault and the number of ticks until it, or ("", ticks)."""
         self.v = np.array(v, float)
         for k in range(ticks):
             self.q = self.q + MS * self.v
@@ -78,7 +78,7 @@ def test_position_jump_beyond_tolerance_is_found(joint, side):
 
 @pytest.mark.parametrize("ticks", [5, 100, 107, 125, 133])
 def test_last_valid_pose_precedes_the_fault(ticks):
-    """From one to two detection times before the fault is found, or the first pose."""
+    """Its age is one to two detection times before the fault is found, or it is the first pose."""
     sensors, v = Sensors(), unit(0, 0.5)
     first = sensors.q.copy()
     sensors.v = v
@@ -94,7 +94,7 @@ def test_last_valid_pose_precedes_the_fault(ticks):
 
 
 def test_jump_is_found_at_any_measured_velocity():
-    """A velocity that is the difference of positions makes no jump plausible."""
+    """A velocity computed from the positions does not make a jump plausible."""
     sensors = Sensors()
     v = unit(0, 0.3 / MS)
     assert "jumps" in sensors.move(v)[0]
@@ -142,7 +142,7 @@ def test_inconsistent_velocity_is_found(joint, speed, measured, relative):
     ],
 )
 def test_smallest_detected_drift(arm, smallest):
-    """At rest, of a position whose velocity is measured as zero: the table of docs/safety.md [rad/s, m/s]."""
+    """Checks the table of docs/safety.md: drift of a position with zero measured velocity [rad/s, m/s]."""
     for joint, drift in enumerate(smallest):
         for share, found in ((0.95, False), (1.05, True)):
             rate = share * drift * np.eye(arm.num_joints)[joint]
@@ -167,7 +167,7 @@ def test_constant_position_under_changing_effort_is_frozen(joint, side):
     time = SETTINGS.frozen_time + COUNTS[joint] / SETTINGS.frozen_speed
     for factor, found in ((0.99, False), (1.01, True)):
         sensors = Sensors()
-        sensors.move(np.zeros(N), ticks=1000)  # it may have stood before
+        sensors.move(np.zeros(N), ticks=1000)  # it may have been at rest before
         sensors.effort = unit(joint, side * factor * SETTINGS.frozen_effort * LIMIT[joint])
         fault, ticks = sensors.move(np.zeros(N), ticks=500)
         assert ("does not change although" in fault) == found
@@ -194,7 +194,7 @@ def test_joint_moving_by_a_count_is_not_frozen():
 
 
 def test_gravity_of_moving_joints_freezes_no_other_joint():
-    """The effort follows the gravity effort, which changes with the other joints' positions."""
+    """The effort follows the gravity effort, which changes with the positions of the other joints."""
     sensors = Sensors(model=Heavy())
     v = np.where(np.arange(N) < 3, 0.0, 0.5)
     for _ in range(1000):
@@ -205,8 +205,8 @@ def test_gravity_of_moving_joints_freezes_no_other_joint():
 
 @pytest.mark.parametrize("joint", JOINTS)
 def test_motion_inconsistent_with_effort_is_found(joint):
-    """Unit inertia: an effort of its limit that accelerates the joint the other way, as with an inverted encoder."""
-    strong = SETTINGS.hand_effort < 0.1 * LIMIT[joint]  # what a hand can do hides it on the others
+    """With unit inertia, the full effort accelerates the joint in the wrong direction (inverted encoder)."""
+    strong = SETTINGS.hand_effort < 0.1 * LIMIT[joint]  # on the others, the allowed hand effort hides it
     for sign, found in ((1, False), (-1, strong)):
         sensors = Sensors(model=Unity())
         sensors.effort = unit(joint, LIMIT[joint])
@@ -251,7 +251,7 @@ def test_missing_measured_effort_is_found(joint, measured):
 
 
 def test_effort_in_hold_is_not_compared():
-    """In HOLD nothing is commanded by the guard; the time begins anew after it."""
+    """In HOLD the guard commands no efforts, and the time restarts afterwards."""
     sensors = Sensors()
     for _ in range(10):
         sensors.commanded = unit(0, 0.9 * LIMIT[0])
@@ -332,7 +332,7 @@ def test_invalid_joint_gets_gravity_effort_others_are_held(mode, joint):
     ("name", "file"), [("mtml", "mtm_one.csv"), ("psm", "psm_one.csv"), ("psm", "psm_one_205g_insertion.csv")]
 )
 def test_no_false_alarms_on_recordings_of_real_arms(shared_data, name, file):
-    """With the nominal model, at 200 Hz: also where it is wrong and rows are late, no check finds anything."""
+    """No check finds a fault with the nominal model at 200 Hz, despite model errors and late rows."""
     arm = load_arm(name)
     recording = read_recording(shared_data / "trajectories" / file, arm).in_joint_coordinates(arm)
     model = ControlModel(IdentifiedModel.from_arm(arm, arm.effects.cables + arm.effects.springs))
@@ -385,7 +385,7 @@ def test_arm_without_power_is_not_checked():
     bench.run(Command.HOLD, 1)
     bench.run(Command.OFF, 1)
     for _ in range(10):
-        bench.q = bench.q - unit(4, 0.1)  # it falls, and is caught
+        bench.q = bench.q - unit(4, 0.1)  # it falls and is held
         assert bench.tick().control_mode == Command.OFF
     assert bench.guard.fault_code == Status.FAULT_NONE
     bench.run(Command.HOLD, 100)
@@ -393,13 +393,13 @@ def test_arm_without_power_is_not_checked():
 
 
 def test_saturated_coupled_actuators_are_plausible():
-    """All of the elbow's effort turns the shoulder's actuator as well, which saturates: tau_2 = 1.464 - 1.753."""
+    """The full elbow effort also loads the shoulder's actuator, which saturates: tau_2 = 1.464 - 1.753."""
     sensors = Sensors()
     sensors.commanded = np.array([0.0, 0.35, -1.0, 0.0, 0.0, 0.0, 0.0]) * LIMIT
     assert sensors.commanded[1] > SETTINGS.silent_effort * LIMIT[1]
     sensors.effort = np.array([0.0, 1.464 - 1.753, -1.753, 0.0, 0.0, 0.0, 0.0])
     assert sensors.move(COUNTS / MS, ticks=200)[0] == ""
-    # An effort that reads zero although the actuators have it is found all the same.
+    # An effort that reads zero although the actuators apply it is still found.
     sensors.commanded = 0.4 * LIMIT * unit(1)
     sensors.effort = np.zeros(N)
     assert "does not show" in sensors.move(COUNTS / MS, ticks=200)[0]
