@@ -74,7 +74,7 @@ def efforts(name: str, period: float = PERIOD) -> tuple[np.ndarray, ...]:
 
 
 def clean_motion(name: str = "psm", *, at: np.ndarray | None = None, effort_lag: float = 0.0, **options) -> Recording:
-    """Returns joint coordinates at 200 Hz, or at true times `at`; efforts with delay `effort_lag` [s] and white noise."""
+    """Returns joint data at 200 Hz, or at true times `at`; efforts with delay `effort_lag` [s] and white noise."""
     t, q, v, tau = efforts(name, **options)
     times = t[::5] if at is None else at
 
