@@ -39,7 +39,7 @@ class DriveEffect:
 
     @property
     def distinguishable(self) -> bool:
-        """Whether the absolute value of the coefficient exceeds two standard errors."""
+        """Returns whether the absolute value of the coefficient exceeds two standard errors."""
         return abs(self.coefficient) > 2 * self.standard_error
 
 

@@ -104,7 +104,7 @@ class Recording:
 
     @property
     def is_motion(self) -> bool:
-        """Whether the rows are samples of a motion: at least `MIN_ROWS`, at intervals shorter than `MAX_PERIOD`.
+        """Returns whether the rows are samples of a motion: at least `MIN_ROWS`, at intervals below `MAX_PERIOD`.
 
         Times may decrease, see `has_increasing_times`. `motion` determines whether the arm moves.
         """
@@ -113,7 +113,7 @@ class Recording:
 
     @property
     def has_increasing_times(self) -> bool:
-        """Whether there are times and each is later than the previous one."""
+        """Returns whether there are times and each is later than the previous one."""
         return self.t is not None and bool(np.all(np.diff(self.t) > 0))
 
     def motion(self, arm: Arm) -> str:

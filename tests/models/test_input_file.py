@@ -29,7 +29,7 @@ from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
 from dvrk_drake.recordings.recording import read_recording, write_recording
 
 ARM = load_arm("mtml")
-#: What each reader's file is called -> the reader.
+#: Mapping from a file name to its reader.
 READERS = {
     "a.yaml": load_arm,
     "model.yaml": IdentifiedModel.load,
@@ -46,7 +46,7 @@ READERS = {
     "status.log": lambda path: convert(path, f"{path}.out", format="lcm-log"),
     "arm.sdf": lambda path: compose_sdf([path]),
 }
-#: Makes what is not a file at a path.
+#: Functions that create something other than a regular file at a path.
 NO_FILES = {
     "FIFO": os.mkfifo,
     "folder": os.mkdir,
@@ -63,7 +63,7 @@ def test_non_files_are_refused_in_one_line(name, kind, tmp_path):
     NO_FILES[kind](path)
     with pytest.raises(DvrkDrakeError) as refusal:
         READERS[name](path)
-    assert name in str(refusal.value) or kind == "device"  # which an arm's file is named by
+    assert name in str(refusal.value) or kind == "device"  # the name by which an arm is loaded
     assert "\n" not in str(refusal.value)
     assert not os.path.exists(f"{path}.out")
 

@@ -56,7 +56,7 @@ def test_custom_instrument_is_attached_to_the_arm(folder):
     set_arm_positions(plant, context, arm, q)
     torque = IdentifiedModel.from_arm(arm).holding_torque(q)
     np.testing.assert_allclose(torque, holding_torque(plant, context, arm), atol=1e-12)
-    assert abs(torque[3]) > 1e-3  # its centre of mass is beside the shaft
+    assert abs(torque[3]) > 1e-3  # its centre of mass is off the shaft axis
 
 
 @pytest.mark.parametrize("name", ["arm.yaml", "bare.yaml"])

@@ -25,9 +25,9 @@ from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_posi
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, mirror_links
 from dvrk_drake.recordings.recording import read_recording
 
-#: Mirrored in the plane x = 0, an arm has these joint angles in place of its own, and these torques.
+#: Signs of the joint angles and torques of an arm that is mirrored in the plane x = 0.
 MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
-#: Column of the controller's file that the wrist's brackets beside the arm make: my5 - mz4.
+#: Column of the controller's file for the lateral wrist brackets: my5 - mz4.
 P6 = 5
 
 
@@ -81,7 +81,7 @@ def test_mirrored_file_of_a_right_arm_predicts_left_arms(shared_data):
     for serial in ("MTML-22723", "MTML-34863"):
         left = GravityCompensationFile.load(folder / f"gc-{serial}.json")
         q = np.random.default_rng(0).uniform(*left.sweep, (2000, 7))
-        q = q[np.abs(q[:, 1] + q[:, 2]) < 0.2]  # where the parallelogram lets both files' sweeps be
+        q = q[np.abs(q[:, 1] + q[:, 2]) < 0.2]  # reachable range of both files' sweeps with the parallelogram
         tau = controller_torque(left, q)
         as_it_is = np.sqrt(np.mean((controller_torque(right, q) - tau) ** 2, axis=0))
         mirrored = np.sqrt(np.mean((MIRROR * controller_torque(right, MIRROR * q) - tau) ** 2, axis=0))
@@ -99,7 +99,7 @@ def test_compare_gc_refuses_a_file_of_another_arm(tmp_path, capsys):
     assert main(["compare-gc", str(path), "--arm", "mtmr"]) == 2
     error = refusal(capsys.readouterr().err)
     assert error.startswith(f"dvrk-drake: error: {path}: the file is of MTML") and "model is of MTMR" in error
-    # With a wrong name it is compared, and the numbers tell that it is wrong.
+    # A file with a wrong name is compared; its parameters show that the name is wrong.
     file.save(path, "MTMR", "test")
     assert main(["compare-gc", str(path), "--arm", "mtmr"]) == 0
     (warning,) = messages(capsys.readouterr().err)
@@ -118,7 +118,7 @@ def test_arm_is_taken_from_the_file_name_if_missing(tmp_path):
         compare_compensation(GravityCompensationFile.load(tmp_path / "gc-mtmr.json"), stock("mtml"))
 
 
-#: The last one calls itself MTMR: docs/identification.md, Left and right.
+#: The last file is labelled MTMR: docs/identification.md, Left and right.
 REAL_FILES = [("MTML-22723", "mtml"), ("MTML-34863", "mtml"), ("MTMR-32336", "mtmr"), ("MTMR-22403", "mtml")]
 
 

@@ -98,7 +98,7 @@ def test_inertias_are_consistent_and_centres_of_mass_off_joints(plant):
         body = plant.get_body(index)
         if body.name() == "base_link":
             continue
-        # A rotor is centred on its axis, and has to be.
+        # The centre of mass of a rotor must be on its axis.
         assert (np.linalg.norm(body.default_com()) > 1e-3) == (body.name() != "motor_4_link")
         M = body.default_spatial_inertia()
         assert M.IsPhysicallyValid()
@@ -149,7 +149,7 @@ def test_holding_torque_is_the_gradient_of_potential_energy(arm, plant):
 def test_pinned_loop_has_the_same_holding_torque(arm, plant):
     """Compares the variant without loop mimics: statics by the null space of its numerical constraint Jacobian."""
     loop_plant = make_arm_plant(arm, closure="ball")
-    assert loop_plant.num_constraints() == plant.num_constraints()  # two mimics less; a pin and a length more
+    assert loop_plant.num_constraints() == plant.num_constraints()  # two mimics fewer; one pin and one length more
     (loop,) = arm.loop_closures
     A, B = (loop_plant.GetFrameByName(name) for name in (loop.frame_a, loop.frame_b))
     context, loop_context = plant.CreateDefaultContext(), loop_plant.CreateDefaultContext()

@@ -45,7 +45,7 @@ from dvrk_drake.systems.station_config import load_station_config
 
 #: Schemas of files.
 FILES = (ArmDescription, Mechanism, Instrument, Gains, DvrkDriver, Scenario, Study, PoseFile, ModelFile)
-#: Dataclasses that Python code makes, with arrays.
+#: Dataclasses with arrays, created by Python code.
 OBJECTS = (Arm, GravityCompensationFile, CollectionSettings, Grip)
 
 
@@ -65,7 +65,7 @@ def numbers_in(kind, path, field):
         yield from numbers_in(arguments[0], (*path, 0), field)
     elif origin is dict:
         yield from numbers_in(arguments[1], (*path, "x"), field)
-    elif "ndarray" in str(origin).lower():  # numpy's class, or from numpy 2.5 on its alias NDArray
+    elif "ndarray" in str(origin).lower():  # numpy's class, or its alias NDArray since numpy 2.5
         if "float64" in str(kind):
             yield path, field, np.ndarray
     elif dataclasses.is_dataclass(kind):

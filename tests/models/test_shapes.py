@@ -93,7 +93,7 @@ def test_both_links_of_a_pin_are_drawn_around_it(plant, psm_vertices):
             assert (drawn.max(axis=0) > 0).all()
             assert (
                 np.linalg.norm(np.cross(drawn, axis), axis=1).min() < 0.03
-            )  # the largest bearing's bolt circle: 26 mm
+            )  # bolt circle of the largest bearing: 26 mm
 
 
 @pytest.mark.parametrize(
@@ -135,8 +135,8 @@ def test_shaft_and_cannula_pass_through_the_remote_centre(plant, psm_vertices):
     assert np.linalg.norm(shaft[:, :2], axis=1).max() == pytest.approx(0.0042, abs=2e-4)
 
 
-#: What touches although no joint of the tree joins it: the top bar's pin in the end link, the instrument in the cannula
-#: and the fingers' hubs, which share a pin with both wrist links.
+#: Links that touch although no joint of the tree connects them: the top bar's pin in the end link, the instrument in
+#: the cannula and the fingers' hubs, which share a pin with both wrist links.
 NEIGHBOURS = (
     {"top_bar_link", "end_link"},
     {"end_link", "roll_link"},

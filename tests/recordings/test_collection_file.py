@@ -87,15 +87,15 @@ def test_written_rows_survive_kill(tmp_path):
     )
     path = tmp_path / "f.csv"
     process = subprocess.Popen([sys.executable, "-c", code, path], stdout=subprocess.PIPE, text=True)
-    told = [int(process.stdout.readline()) for _ in range(50)][-1]
+    last_row = [int(process.stdout.readline()) for _ in range(50)][-1]
     process.send_signal(signal.SIGKILL)
-    told = max([told, *map(int, process.stdout.read().split())])
+    last_row = max([last_row, *map(int, process.stdout.read().split())])
     process.wait()
     rows = path.read_text().split("\n")
     assert rows.pop() == ""
     assert [int(row.split(",")[0]) for row in rows] == list(range(len(rows)))
     assert {len(row.split(",")[1]) for row in rows} == {4000}
-    assert len(rows) >= told
+    assert len(rows) >= last_row
 
 
 def test_a_full_disk_leaves_whole_rows(tmp_path):

@@ -67,7 +67,7 @@ def test_an_explicit_format_wins_over_the_name(tmp_path):
     assert len(convert(path, tmp_path / "out.csv", format="wpi-csv")) == 4
 
 
-def test_convert_refuses_options_that_do_not_apply_and_unknown_formats(tmp_path):
+def test_convert_refuses_unsuitable_options_and_unknown_formats(tmp_path):
     mat, text, output = (
         write_mat(tmp_path, a=team_array()),
         write_wpi(tmp_path, wpi_rows()),

@@ -31,7 +31,7 @@ def assert_same_numbers(recording, expected):
     np.testing.assert_allclose(recording.t, [1e-6 * (s.utime - expected[0].utime) for s in expected], atol=1e-12)
 
 
-# Our reader and LCM's own are of the same mind.
+# The project's reader and LCM's reader agree.
 
 
 def test_reads_what_lcm_writes(tmp_path):
@@ -84,7 +84,7 @@ def test_a_damaged_event_is_left_out_and_the_rest_is_read(tmp_path, begin, repla
     whole = log_bytes(statuses(10))
     at = 5 * len(whole) // 10 + begin
     recording = read_recording(write_log(tmp_path / "a.log", whole[:at], inserted, whole[at + replaced :]), ARM)
-    # An event is only trusted if another one follows: where the magic is gone, the one before goes with it.
+    # An event is accepted only if another one follows. Without its magic number the previous event is lost too.
     kept = [k for k in range(10) if k != 5 and not (begin == 0 and k == 4)]
     assert_same_numbers(recording, [statuses(10)[k] for k in kept])
     assert "are damaged and are left out" in recording.notes[0]
@@ -114,7 +114,7 @@ def test_damaged_logs_are_read_or_refused(tmp_path):
     assert read > 100
 
 
-# What is left out is said.
+# Notes on omitted messages.
 
 
 def changed(k, **changes):
@@ -150,7 +150,7 @@ def test_a_restart_is_noted_and_two_arms_of_one_name_are_refused(tmp_path):
     recording = read_recording(write_log(tmp_path / "restart.log", [*first[:9], *second[12:]]), ARM)
     assert_same_numbers(recording, [*first[:9], *second[12:]])
     assert recording.notes == ("restarts of MTML in between: 1",)
-    mixed = [(first, second)[k % 2][k - k % 2] for k in range(20)]  # the second is always a little late
+    mixed = [(first, second)[k % 2][k - k % 2] for k in range(20)]  # the second arm is slightly later
     with pytest.raises(RecordingError, match=r"a\.log: event 2: two arms called MTML send at the same time"):
         read_recording(write_log(tmp_path / "a.log", mixed), ARM)
 
@@ -184,7 +184,7 @@ def test_a_log_is_in_joint_coordinates(tmp_path):
         read_recording(write_log(tmp_path / "a.log", statuses()), ARM, "actuator")
 
 
-# Every command that reads a recording.
+# Commands that read a recording.
 
 
 def test_commands_read_a_log_as_they_read_a_csv(tmp_path, capsys):
@@ -242,7 +242,7 @@ def test_convert_refuses_options_of_other_formats(tmp_path):
         convert(tmp_path / "b.csv", tmp_path / "a.csv", format="lcm-log")
 
 
-# Files that grow.
+# Growing files.
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".log"])
@@ -257,7 +257,7 @@ def test_a_growing_file_is_whole_after_every_message(tmp_path, suffix):
         assert_same_numbers(read_recording(path, ARM), [m for m in messages[: k + 1] if m.guard_state])
     file.close()
     with pytest.raises(RecordingError, match=r"nowhere\.csv: cannot be written: "):
-        check_stream_output("/proc/self/nowhere.csv")  # a folder in which nobody can write
+        check_stream_output("/proc/self/nowhere.csv")  # a folder that is not writable
     with pytest.raises(RecordingError, match="exists already, and a recording is not overwritten"):
         open_recording_file(path, ARM, stream)
 

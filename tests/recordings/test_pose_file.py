@@ -50,7 +50,7 @@ def test_bad_files_of_poses_are_refused_in_one_line(text, message, tmp_path, cap
     path.write_text(text)
     with pytest.raises(CollectionError, match=message):
         load_poses(path, load_arm("mtml"))
-    # The command refuses it before it looks for an arm, and for every task.
+    # The command refuses the file before it connects to an arm, for every task.
     for task in (["--output", str(output)], ["--teach"], ["--random", "2"]):
         assert main(["collect", "--arm", "mtml", "--poses", str(path), *task]) == 2
         error = capsys.readouterr().err
@@ -74,7 +74,7 @@ def test_random_poses_are_appended_and_depend_on_the_seed(tmp_path):
     assert main([*command, "4", "--seed", "4"]) == 0
     both = load_poses(path, arm)
     np.testing.assert_array_equal(both[:5], first)
-    np.testing.assert_array_equal(both[5:], random_poses(arm, 4, seed=[4, 5]))  # others than in an empty file
+    np.testing.assert_array_equal(both[5:], random_poses(arm, 4, seed=[4, 5]))  # different from those of an empty file
     assert main([*command, "0"]) == 2
     np.testing.assert_array_equal(load_poses(path, arm), both)
     assert main([*command, "4", "--seed", "4"]) == 0

@@ -1,4 +1,4 @@
-"""What an arm says over UDP, for tests that wait for something to come true."""
+"""Observes the statuses of an arm over UDP, for tests that wait for a condition."""
 
 import threading
 import time
@@ -15,7 +15,7 @@ NETWORK_URL = "udpm://239.255.76.67:7667?ttl=0"
 
 
 class Observer:
-    """What an arm says, gathered by a thread that is scheduled as real-time where that is permitted."""
+    """Collects the statuses of an arm in a thread, with real-time scheduling if that is permitted."""
 
     running: ClassVar[set] = set()
 
@@ -28,13 +28,13 @@ class Observer:
         self.running.add(self)
 
     def end(self):
-        """Ends its threads: those of LCM read every message of the network, in real time."""
+        """Ends its threads. Those of LCM read every message of the network, in real time."""
         self.running.remove(self)
         self.ended.set()
         self.thread.join(TIMEOUT)
 
     def listen(self, name, url):
-        # Scheduling is a thread's own. LCM's reading thread, which is started here, inherits it; processes do not,
+        # Scheduling is set per thread. LCM's reading thread, which is started here, inherits it. Processes do not,
         # because the main thread starts them.
         make_realtime()
         network = lcm.LCM(url)
@@ -53,9 +53,9 @@ class Observer:
         return self.heard[-1]
 
     def until(self, condition, what, since=None, process=None):
-        """The index of the first status that meets the condition, of those from now on or since an index.
+        """Returns the index of the first status that meets the condition, from now on or since an index.
 
-        `process` is what has to bring it about.
+        `process` is the process that is expected to fulfil the condition.
         """
         seen = len(self.heard) if since is None else since
 
@@ -75,13 +75,13 @@ class Observer:
         return seen
 
     def during(self, seconds):
-        """The statuses of the next `seconds` of the arm's clock."""
+        """Returns the statuses of the next `seconds` of the arm's clock."""
         first, end = len(self.heard), self.last.utime + 1e6 * seconds
         return self.heard[first : 1 + self.until(lambda status: status.utime >= end, f"{seconds} s of the arm's clock")]
 
 
 def check_clock(statuses):
-    """An arm counts its statuses, a millisecond of its clock each; UDP may lose some where a computer is busy."""
+    """Checks that an arm sends one status per millisecond of its clock. UDP may lose some if the computer is busy."""
     steps = np.diff([status.sequence for status in statuses])
     assert np.all(steps >= 1)
     np.testing.assert_array_equal(np.diff([status.utime for status in statuses]), 1000 * steps)

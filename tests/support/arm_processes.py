@@ -1,4 +1,4 @@
-"""Processes of our programs in a network of their own, forked from one that has compiled everything."""
+"""Processes of the package in a network namespace, forked from a process that has compiled everything."""
 
 import multiprocessing
 import os
@@ -15,7 +15,7 @@ from dvrk_drake import cli
 
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
 
-#: The configuration of a driver that is seldom too strict for a busy computer.
+#: Driver configuration with long timeouts, suitable for a busy computer.
 PATIENT_DRIVER = Path(__file__).with_name("long_timeout_driver.yaml")
 
 FORKSERVER = multiprocessing.get_context("forkserver")
@@ -23,7 +23,7 @@ FORKSERVER.set_forkserver_preload(["lcm_precompiled"])
 
 
 class Forked:
-    """A process of one of our programs, with what it says in a file."""
+    """Forked process of one of the package's programs, with its output in a file."""
 
     def __init__(self, main, *arguments):
         descriptor, self.path = tempfile.mkstemp()
@@ -35,20 +35,20 @@ class Forked:
         os.kill(self.process.pid, number)
 
     def wait(self):
-        """The exit code."""
+        """Returns the exit code."""
         self.process.join(TIMEOUT)
         assert self.poll() is not None, f"does not end: {self.said()}"
         return self.poll()
 
     def poll(self):
-        """The exit code, or None while it runs."""
+        """Returns the exit code, or None while the process is running."""
         return self.process.exitcode
 
     def said(self):
         return Path(self.path).read_text()
 
     def end(self, number=signal.SIGKILL):
-        """Ends it, and returns what it said."""
+        """Ends the process and returns its output."""
         if self.poll() is None:
             self.send_signal(number)
         self.wait()
@@ -56,7 +56,7 @@ class Forked:
 
 
 class CommandLine(Forked):
-    """`dvrk-drake run` as a user starts it."""
+    """`dvrk-drake run`, started as by a user."""
 
     def __init__(self, name, *options):
         descriptor, self.path = tempfile.mkstemp()
@@ -82,7 +82,7 @@ def run_forked(main, arguments, path):
 
 
 def dvrk_drake(*arguments):
-    """A command of the command line, with its options."""
+    """Starts a command of the command line with its options."""
     return Forked(cli.main, *map(str, arguments))
 
 

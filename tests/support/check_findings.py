@@ -1,4 +1,4 @@
-"""Findings of `check`, by kind, and recordings with one thing wrong."""
+"""Findings of `check` by kind, and recordings with one fault."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ ARMS = "psm", "mtmr"
 
 
 def found(recording, name="psm"):
-    """Findings by kind."""
+    """Returns findings by kind."""
     report = check_recording(recording, load_arm(name))
     kinds = {}
     for finding in report.findings:

@@ -1,4 +1,4 @@
-"""A simulated arm with real sensors whose measurements can fail, behind its driver, and a controller that moves it."""
+"""Simulated arm with realistic sensors whose measurements can fail, with its driver and a controller."""
 
 from dataclasses import dataclass
 
@@ -18,11 +18,11 @@ from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import SimDvrkDriver
 
 PERIOD = 1e-3
-#: Time for which the desired pose rests at first, while the guard watches the controller [s].
+#: Initial time for which the desired pose is constant, while the guard observes the controller [s].
 _AT_REST = 0.8
 
-#: Sensor faults of one joint: (q, v, effort, q when it began, time since then, scale) -> what is measured. The scale is
-#: 1 on a joint that turns [rad] and 0.1 on one that slides [m].
+#: Sensor faults of one joint: (q, v, effort, q when it began, time since then, scale) -> measurement. The scale is 1
+#: for a revolute joint [rad] and 0.1 for a prismatic joint [m].
 FAULTS = {
     "encoder stuck": lambda q, v, effort, q0, t, scale: (q0, 0.0, effort),
     "position stuck": lambda q, v, effort, q0, t, scale: (q0, v, effort),
@@ -38,7 +38,7 @@ FAULTS = {
 
 
 class FaultySensors(LeafSystem):
-    """Passes a state (2n) and an effort (n) on; the measurement of one joint fails from a time on."""
+    """Forwards a state (2n) and an effort (n); the measurement of one joint fails from a given time on."""
 
     def __init__(self, arm):
         super().__init__()
@@ -62,10 +62,10 @@ class FaultySensors(LeafSystem):
 
 
 def wave(arm, seconds, speed, seed=0, reach=0.35):
-    """A smooth motion (2n: q, then v) of all joints about the middle of their ranges, that begins at rest.
+    """Returns a smooth motion (2n: q, then v) of all joints about the middle of their ranges that starts at rest.
 
-    Joints swing as far to each side as `reach` of half of their range and as fast as `speed` (a tenth of it if they
-    slide) allow, each at a frequency of its own.
+    The amplitude is `reach` times half of the range, or less if the speed would exceed `speed` (a tenth of it for
+    prismatic joints). Each joint has its own frequency.
     """
     times = np.arange(0.0, seconds + 0.1, 0.02)
     middle, half = 0.5 * (arm.position_upper + arm.position_lower), 0.5 * (arm.position_upper - arm.position_lower)
@@ -82,14 +82,14 @@ def wave(arm, seconds, speed, seed=0, reach=0.35):
 
 @dataclass
 class Outcome:
-    """What a fault of one joint did to the simulated arm; revolute joints in rad, prismatic ones in m.
+    """Effect of a fault of one joint on the simulated arm; revolute joints in rad, prismatic ones in m.
 
     Attributes:
-        detected: time from the fault to its detection [s]; inf if it was not detected.
-        text: the guard's.
-        before, after: largest movement of the joint from the fault to its detection, and from then on.
-        speed: largest speed of any joint after detection, 50 ms and more, divided by 1 rad/s or 0.1 m/s.
-        effort: largest effort of any joint after detection, as a fraction of its limit.
+        detected: Time from the fault to its detection [s]; inf if it was not detected.
+        text: Fault text of the guard.
+        before, after: Largest movement of the joint from the fault to its detection, and after detection.
+        speed: Largest speed of any joint at least 50 ms after detection, divided by 1 rad/s or 0.1 m/s.
+        effort: Largest effort of any joint after detection, as a fraction of its limit.
     """
 
     detected: float
@@ -101,24 +101,24 @@ class Outcome:
 
 
 class FaultyArm:
-    """The arm, its driver and one of four controllers, in one Diagram stepped every millisecond.
+    """Arm, its driver and one of four controllers, in one Diagram stepped every millisecond.
 
     Attributes:
-        sensors: whose measurements can be made to fail.
-        model: the true one.
-        desired: time -> desired state (2n) of the arm under "effort" and "position".
-        lead: status, time -> the same for `ArmController.answer`.
-        controller: the ArmController, or None.
+        sensors: Sensors whose measurements can be made to fail.
+        model: Ground-truth model.
+        desired: Function from time to the desired state (2n) of the arm under "effort" and "position".
+        lead: Function from status and time to the desired state for `ArmController.answer`.
+        controller: ArmController, or None.
     """
 
     def __init__(self, name, use, *, path=None, hand=False, effects=True, driver=None, seed=0):
-        """An arm at rest at the start of its path.
+        """Creates an arm at rest at the start of its path.
 
         Args:
             use: "effort" (PID and gravity along the path), "gravity" or "damped" (gravity compensation), "position",
                 "hold" (no commands).
             path: PiecewisePolynomial of the joints; a wave of 8 s at 0.5 rad/s by default.
-            hand: whether a hand moves the arm along the path.
+            hand: Whether an operator moves the arm along the path.
         """
         self.arm = arm = load_arm(name)
         known = arm.effects.cables + arm.effects.springs if effects else []

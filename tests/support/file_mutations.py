@@ -1,4 +1,4 @@
-"""Damaged files for fuzzing: changes of the structure of a valid file, and changes of its bytes."""
+"""Damaged files for fuzzing: changes of the structure or of the bytes of a valid file."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ TEXTS = (
     "_",
     "-.inf",
 )
-#: What stands where something else should.
+#: Values that replace valid ones.
 JUNK = st.one_of(
     st.sampled_from((*NUMBERS, *TEXTS, None, True, [], {}, [[]], {"a": 1}, [1, 2, 3], "[" * 3000)),
     st.integers(-100, 100),
     st.floats(width=32),
     st.text(max_size=8),
 )
-#: Words where a cell of a CSV or a text of an XML file should be.
+#: Texts that replace a cell of a CSV or a text of an XML file.
 WORDS = st.sampled_from(
     ("", " ", "nan", "-inf", "1e999", "1_0", "0x10", "abc", '"', "'", "#", ";", "1e308", "-1e308", "1e-320", "9" * 5000)
 )
 
 
 def slots(content: object) -> list[tuple[object, object]]:
-    """(container, key) of every value in nested lists and tables."""
+    """Returns (container, key) of every value in nested lists and tables."""
     found, waiting = [], [content]
     while waiting:
         container = waiting.pop()
@@ -55,7 +55,7 @@ def slots(content: object) -> list[tuple[object, object]]:
 
 @st.composite
 def changed_content(draw: st.DrawFn, content: object) -> object:
-    """The nested lists and tables of a file, with one to three changes."""
+    """Returns the nested lists and tables of a file with one to three changes."""
     content = copy.deepcopy(content)
     for _ in range(draw(st.integers(1, 3))):
         places = slots(content)
@@ -82,7 +82,7 @@ def changed_content(draw: st.DrawFn, content: object) -> object:
 
 @st.composite
 def changed_bytes(draw: st.DrawFn, content: bytes) -> bytes:
-    """The bytes of a file, damaged in one place."""
+    """Returns the bytes of a file, damaged in one place."""
     position = draw(st.integers(0, len(content)))
     length = draw(st.integers(1, 200))
     noise = draw(st.binary(min_size=1, max_size=8))
@@ -102,7 +102,7 @@ def changed_bytes(draw: st.DrawFn, content: bytes) -> bytes:
 
 
 def fixed_damages(content: bytes) -> dict[str, bytes]:
-    """A file's bytes damaged as editors, other systems and attackers do, by name."""
+    """Returns a file damaged as by editors, other systems and attackers, by name."""
     middle = content.find(b"\n", len(content) // 2) + 1
     before, after = content[:middle], content[middle:]
     aliases = [b"a%d: &a%d [%s]\n" % (k, k, b", ".join([b"*a%d" % (k - 1)] * 9) if k else b"1") for k in range(12)]
@@ -143,7 +143,7 @@ def _rows(content: list) -> bytes:
 
 @st.composite
 def changed_xml(draw: st.DrawFn, content: bytes) -> bytes:
-    """An XML file with one to three changes of its elements."""
+    """Returns an XML file with one to three changes of its elements."""
     root = ElementTree.fromstring(content)
     for _ in range(draw(st.integers(1, 3))):
         parents = [element for element in root.iter() if len(element)]
@@ -171,7 +171,7 @@ def changed_xml(draw: st.DrawFn, content: bytes) -> bytes:
 
 
 def damaged(kind: str, content: bytes) -> st.SearchStrategy[bytes]:
-    """Damaged forms of a valid file of a kind: "yaml", "json", "csv", "xml", or "binary" for changes of bytes only."""
+    """Returns damaged forms of a valid file of a kind: "yaml", "json", "csv", "xml", or "binary" (bytes only)."""
     by_bytes = changed_bytes(content)
     if kind == "yaml":
         by_content = changed_content(yaml.safe_load(content)).map(_yaml)

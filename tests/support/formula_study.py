@@ -1,4 +1,4 @@
-"""The command line with a formula in place of the simulation, in all processes: workers that are spawned import this.
+"""Command line with a formula in place of the simulation in all processes: spawned workers import this module.
 
 python tests/support/formula_study.py study STUDY.yaml --output RESULTS.csv --workers 2
 """
@@ -14,7 +14,8 @@ import dvrk_drake.experiments.study.study as study_module
 from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.recordings.recording import Recording
 
-#: Names a folder of tickets. Where it is set, each simulation waits for a file there, and takes it.
+#: Environment variable with the path of a folder of tickets. If it is set, each simulation waits for a file in the
+#: folder and removes it.
 TICKETS = "DVRK_DRAKE_TEST_TICKETS"
 
 
@@ -30,7 +31,7 @@ def take_ticket(folder):
 
 
 def simulate(scenario):
-    """A drift that seed, start and parameter error decide."""
+    """Returns a drift that depends on seed, start and parameter error."""
     if folder := os.environ.get(TICKETS):
         take_ticket(folder)
     t = np.arange(0.0, scenario.duration + 1e-9, scenario.sample_period)

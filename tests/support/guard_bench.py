@@ -1,4 +1,4 @@
-"""A command guard on a bench: a clock, a measured state that the test sets, and commands."""
+"""Test bench for a command guard: a clock, a measured state set by the test, and commands."""
 
 import numpy as np
 
@@ -20,12 +20,12 @@ WITH_OFF = (Command.POSITION, Command.EFFORT, Command.OFF)
 
 
 def modes(*allowed):
-    """`accepted_modes` with these."""
+    """Returns `accepted_modes` with the given modes."""
     return sum(1 << mode for mode in allowed)
 
 
 class Weightless:
-    """A model without weight and inertia, for tests of a guard whose arm does not move by its efforts."""
+    """Model without weight and inertia, for tests of a guard whose arm is not moved by its efforts."""
 
     def gravity_effort(self, q):
         return np.zeros(len(q))
@@ -35,14 +35,14 @@ class Weightless:
 
 
 class Heavy(Weightless):
-    """A model whose gravity effort is a known function of the pose, up to 0.2 of each effort limit."""
+    """Model whose gravity effort is a known function of the pose, up to 0.2 of each effort limit."""
 
     def gravity_effort(self, q):
         return 0.2 * LIMIT * np.cos(q)
 
 
 class Unchecked(Plausibility):
-    """Finds everything plausible: an arm on the bench is where the test puts it."""
+    """Measurement check that accepts everything: on the bench the test sets the state of the arm."""
 
     def check(self, dt, q, v, effort, commanded):
         self.gravity, self._poses = self.model.gravity_effort(q), (q, q)
@@ -50,16 +50,16 @@ class Unchecked(Plausibility):
 
 
 class Untimed(PeriodMonitor):
-    """Finds every period short enough."""
+    """Period check that accepts every period."""
 
     def add(self, period):
         return ""
 
 
 class Bench:
-    """A guard at rest with a clock; the measured state is set by the test.
+    """Guard of an arm at rest, with a clock; the measured state is set by the test.
 
-    Its checks of measurements and of its own period are off unless the test is about them.
+    Checks of measurements and of the guard's own period are off, except in tests of these checks.
     """
 
     def __init__(self, arm=ARM, *, q=Q, model=None, checks=False, **arguments):
@@ -79,7 +79,7 @@ class Bench:
         self.output = self.step()
 
     def at_rest(self):
-        """The measured effort becomes the model's gravity effort."""
+        """Sets the measured effort to the model's gravity effort."""
         self.effort = self.guard._plausibility.model.gravity_effort(self.q)
         self.tick()
         return self
@@ -114,7 +114,7 @@ class Bench:
         return self.output
 
     def run(self, mode, milliseconds, **fields):
-        """A good stream of commands, one a millisecond."""
+        """Sends a stream of valid commands, one per millisecond."""
         for _ in range(milliseconds):
             assert self.send(mode, **fields) == Status.REFUSAL_NONE
             self.tick()

@@ -1,4 +1,4 @@
-"""A simulated arm behind LCM in one process, and what can command it."""
+"""Simulated arm with LCM in one process, and controllers for it."""
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -19,12 +19,12 @@ from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 ARM = load_arm("mtml")
 POSES = {"mtml": [0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5], "psm": [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]}
 START = 10**15
-#: For tests of what comes after the start: it is watched for 50 ms, not for a quarter of a second.
+#: Driver for tests of the operation after the start: the controller is observed for 50 ms instead of 250 ms.
 SOON = DvrkDriver(guard=GuardSettings(start_time=0.05))
 
 
 class SimulatedArm:
-    """A simulated arm behind LCM, and what it said."""
+    """Simulated arm with LCM, and its statuses."""
 
     def __init__(self, lcm, name="mtml", driver=None, modify_plant=None):
         self.arm = load_arm(name)
@@ -52,7 +52,7 @@ class SimulatedArm:
 
 
 class Controller:
-    """Holds the first pose that it hears of, through the hardware station."""
+    """Holds the first received pose through the hardware station."""
 
     def __init__(self, lcm, name="mtml", driver=None):
         arm = load_arm(name)
@@ -85,13 +85,13 @@ def without_stops(plant):
 
 
 class Sending:
-    """A DvrkCommandSender that answers each status, with fixed inputs."""
+    """DvrkCommandSender that answers each status, with fixed inputs."""
 
     def __init__(self, lcm, arm=ARM, **inputs):
         self.arm, self.sender = arm, DvrkCommandSender(arm)
         self.context = self.sender.CreateDefaultContext()
         self.lcm, self.status, self.ticks = lcm, Status(), 0
-        # Fixing it at each tick anew would copy it each time.
+        # Fixing the value at each tick would copy it each time.
         self.received = self.port("lcmt_dvrk_status").FixValue(self.context, AbstractValue.Make(self.status))
         lcm.Subscribe(f"DVRK_STATUS_{arm.name}", self.hear)
         for name, value in inputs.items():

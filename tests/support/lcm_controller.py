@@ -1,9 +1,9 @@
-"""A small controller process for tests: holds the pose at which it first hears of the arm, by efforts.
+"""Small controller process for tests: holds the first received pose of the arm by efforts.
 
     python lcm_controller.py ARM [--echo] [--clock-jump SECONDS] [--lcm-url URL]
 
-With --echo it only answers with HOLD commands. Its clock jumps by those seconds at its 1000th command.
-It is scheduled as real-time where that is permitted.
+With --echo it only answers with HOLD commands. Its clock jumps by the given time at its 1000th command.
+It has real-time scheduling if that is permitted.
 """
 
 import sys
@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> None:
     def option(name: str, default: str) -> str:
         return arguments[arguments.index(name) + 1] if name in arguments else default
 
-    make_realtime()  # before LCM's reading thread is there
+    make_realtime()  # before LCM's reading thread is started
     controller = Controller(
         arguments[0], "--echo" in arguments, float(option("--clock-jump", "0")), option("--lcm-url", "")
     )
@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> None:
 
 
 def tick(arguments: list) -> None:
-    """Counts milliseconds in a loop that is paced and scheduled like an arm's; argument: a shared number."""
+    """Counts milliseconds in a loop with the period and scheduling of an arm's loop; argument: a shared number."""
     (ticks,) = arguments
     make_realtime()
     pace = Pace(1e-3)
@@ -70,7 +70,7 @@ def tick(arguments: list) -> None:
 
 
 def flood(arguments: list) -> None:
-    """Publishes one good command of a stranger as fast as it can; arguments: URL, a status to answer as bytes."""
+    """Publishes one valid command of another sender at maximum rate; arguments: URL, a status to answer (bytes)."""
     url, data = arguments
     network, status, command = lcm.LCM(url), lcmt_dvrk_status.decode(data), lcmt_dvrk_command()
     n = status.num_joints

@@ -1,4 +1,4 @@
-"""Importing this compiles the controllers of the arms: once for all processes that are forked afterwards."""
+"""Compiles the arms' controllers when imported, once for all processes that are forked afterwards."""
 
 import lcm_controller  # noqa: F401
 

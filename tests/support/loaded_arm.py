@@ -1,4 +1,4 @@
-"""A simulated arm on two days, the second with a known payload: recordings whose difference is known."""
+"""Simulated arm on two days, the second with a known payload: recordings with a known difference."""
 
 from __future__ import annotations
 
@@ -15,16 +15,18 @@ from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import Recording
 
 RATE = 1000.0
-#: White noise of the efforts, as a share of their RMS.
+#: White noise of the efforts, as a fraction of their RMS.
 NOISE = 0.02
-#: Dry and viscous friction, each as a share of the RMS effort without it; both differ by 20 % (RMS) on the second day.
+#: Dry and viscous friction, each as a fraction of the RMS effort without it; both differ by 20 % (RMS) on the second
+#: day.
 FRICTION, FRICTION_CHANGE = 0.15, 0.2
-#: Offset, spring and cable torque that the second day brings, each as a share of the RMS effort (RMS over the arms).
+#: Additional offset, spring and cable torque of the second day, each as a fraction of the RMS effort (RMS over the
+#: arms).
 DRIVE_CHANGE = 0.03
 
 
 def friction(model: DynamicModel, q, v, vd) -> list[DriveEffect]:
-    """Viscous, Coulomb and presliding friction at every actuator."""
+    """Returns viscous, Coulomb and presliding friction at every actuator."""
     arm = model.arm
     effort = np.sqrt(np.mean(model.effort(q, v, vd) ** 2, axis=0))
     speed, travel = arm.transmission.velocity(v).std(axis=0), arm.transmission.position(q).std(axis=0)
@@ -40,7 +42,7 @@ def friction(model: DynamicModel, q, v, vd) -> list[DriveEffect]:
 
 
 def other_day(model: DynamicModel, q, v, vd, generator: np.random.Generator) -> DynamicSection:
-    """The section with friction scaled and with offsets, springs and cable torques that were not there."""
+    """Returns the section with scaled friction and additional offsets, springs and cable torques."""
     effort = np.sqrt(np.mean(model.effort(q, v, vd) ** 2, axis=0))
     effects = []
     for joint in model.arm.joint_names:
@@ -62,7 +64,7 @@ def other_day(model: DynamicModel, q, v, vd, generator: np.random.Generator) -> 
 
 
 def with_payload(section: DynamicSection, link: str, mass: float, place) -> DynamicSection:
-    """The section with a point mass on a link."""
+    """Returns the section with a point mass on a link."""
     added = point_mass_parameters(mass, np.asarray(place, dtype=float))
     links = [
         dataclasses.replace(own, parameters=[float(x) for x in np.array(own.parameters) + added])
@@ -76,9 +78,9 @@ def with_payload(section: DynamicSection, link: str, mass: float, place) -> Dyna
 def two_days(
     name: str, link: str, mass: float, place, seed: int, *, noise: float = NOISE
 ) -> tuple[DynamicModel, Recording, Recording]:
-    """The arm of the first day, its recording, and that of the second day, with a payload, of the same motion.
+    """Returns the arm of the first day, its recording, and the recording of the second day with a payload.
 
-    The motion of the second day is not quite the same: the controller gives way under the payload.
+    The motions differ slightly, because the controller deviates under the payload.
     """
     arm, generator = load_arm(name), np.random.default_rng(seed)
     t, q, v, vd = fourier_motion(arm, np.random.default_rng(1000), 6.5, 26.0, RATE)

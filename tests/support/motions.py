@@ -1,4 +1,4 @@
-"""Motions of simulated arms whose dynamics are known, for tests."""
+"""Motions of simulated arms with known dynamics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dvrk_drake.recordings.recording import Recording
 
 
 def fourier_motion(arm: Arm, generator: np.random.Generator, period: float, seconds: float, rate: float):
-    """q, v, vd (m, n) and t (m,) of a motion inside the arm's limits that repeats after `period` [s]."""
+    """Returns q, v, vd (m, n) and t (m,) of a motion within the arm's limits that repeats after `period` [s]."""
     t = np.arange(round(seconds * rate)) / rate
     center = arm.sample_poses(400, generator, margin=0.2).mean(axis=0)
     amplitude = 0.5 * (arm.position_upper - arm.position_lower)
@@ -40,7 +40,7 @@ def fourier_motion(arm: Arm, generator: np.random.Generator, period: float, seco
 def true_dynamics(
     arm: Arm, generator: np.random.Generator, effects: list[DriveEffect], spread: float = 0.05
 ) -> DynamicModel:
-    """An arm like the SDF's with other links: each is sheared and shifted by this share of its own size, or as fits."""
+    """Returns an arm whose links are sheared and shifted by about `spread` of their size relative to the SDF."""
     regressor, boxes = DynamicRegressor(arm), bounding_boxes(arm)
     links = []
     for link in regressor.links:
@@ -65,9 +65,9 @@ def true_dynamics(
 def recorded(
     model: DynamicModel, motion, noise: float, generator: np.random.Generator, rate: float = 200.0
 ) -> Recording:
-    """The motion, sampled at 1 kHz, as it would be recorded at `rate`, with noise of a share of each effort's RMS.
+    """Returns the motion, sampled at 1 kHz, as recorded at `rate`, with noise relative to each effort's RMS.
 
-    Efforts are late as the arm's file says that they are.
+    Efforts have the delay that the arm's file states.
     """
     t, q, v, vd = motion
     J = model.arm.transmission
@@ -79,7 +79,7 @@ def recorded(
 
 
 def friction_everywhere(arm: Arm, motion, share: float = 0.2) -> list[DriveEffect]:
-    """Viscous, Coulomb and presliding friction at every actuator, each a share of the RMS effort of the SDF's arm."""
+    """Returns viscous, Coulomb and presliding friction at every actuator, each `share` of the SDF arm's RMS effort."""
     _, q, v, vd = motion
     without = true_dynamics(arm, np.random.default_rng(0), [])
     effort = np.sqrt(np.mean(without.effort(q, v, vd) ** 2, axis=0))

@@ -1,6 +1,6 @@
-"""A network of their own for tests over real UDP multicast.
+"""Network namespace for tests over real UDP multicast.
 
-A test file starts itself again inside a network namespace; the tests of that run are the real ones:
+A test file runs itself again inside a network namespace. The tests of that run are the actual ones:
 
     @outside
     def test_in_a_network_of_its_own(request):
@@ -11,9 +11,9 @@ A test file starts itself again inside a network namespace; the tests of that ru
 
 Tests wait for conditions, and pass on a busy computer. There are two exceptions, which run again in a new process:
 
-- A test of a watchdog by the wall clock, marked `@watchdog`: where the computer does something else for 10 ms, the
-  watchdog acts late, and the test fails without a defect.
-- Any test that failed while the computer stood still: a thread that sleeps 10 ms at a time was `STANDSTILL` late. The
+- A test of a watchdog by the wall clock, marked `@watchdog`. If the computer is busy for 10 ms, the watchdog acts late,
+  and the test fails without a defect.
+- Any test that failed while the computer was stalled: a thread that sleeps 10 ms at a time was `STANDSTILL` late. The
   time limits of the processes under test (no status for 1 s, for example) expire then.
 
 The last line of a run states the number of retries. A run with more than `MAX_RETRIES` fails.
@@ -33,11 +33,11 @@ import pytest
 
 INSIDE = "DVRK_DRAKE_OWN_NETWORK"
 NETWORK = "ip link set lo up && ip link set lo multicast on && ip route add 239.255.0.0/16 dev lo"
-#: Retries in one run of pytest, of all files and tests together.
+#: Maximum number of retries in one run of pytest, over all files and tests.
 MAX_RETRIES = 4
-#: A delay of a sleeping thread that only a computer that stands still explains [s].
+#: Delay of a sleeping thread that occurs only if the computer is stalled [s].
 STANDSTILL = 0.4
-#: Ends a run inside that hangs [s].
+#: Time limit of a run inside the namespace [s].
 MAX_RUN = 1800
 
 inside = pytest.mark.skipif(INSIDE not in os.environ, reason="runs in a network of its own, started by the test below")
@@ -48,7 +48,7 @@ _RETRIES = pytest.StashKey[list]()
 
 
 def unshare():
-    """How to get a network of one's own; real root keeps its right to real-time scheduling that way."""
+    """Returns the command that creates a network namespace and keeps root's right to real-time scheduling."""
     for command in (["unshare", "-n"], ["unshare", "-rn"]):
         try:
             done = subprocess.run([*command, "sh", "-c", NETWORK], capture_output=True, timeout=60, check=False)
@@ -60,7 +60,7 @@ def unshare():
 
 
 def run_inside(request):
-    """Runs the test file of `request` in a network of its own; of what failed, some run again (see above)."""
+    """Runs the test file of `request` in a network namespace; some failed tests run again (see above)."""
     marks = {name: getattr(test, "pytestmark", []) for name, test in vars(request.module).items()}
     watchdogs = {name for name, its in marks.items() if watchdog.mark in its}
     retries = request.config.stash.setdefault(_RETRIES, [])
@@ -79,7 +79,7 @@ def run_inside(request):
 
 
 class _LongestDelay:
-    """The longest time that a sleeping thread woke up too late during the block: `seconds`."""
+    """Measures the longest delay of a sleeping thread during the block: `seconds`."""
 
     def __enter__(self):
         self.seconds, self._ended = 0.0, threading.Event()
@@ -99,7 +99,7 @@ class _LongestDelay:
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    """States how many retries there were, where tests over UDP ran."""
+    """Prints the number of retries if tests over UDP ran."""
     retries = config.stash.get(_RETRIES, None)
     if retries is not None:
         names = f": {', '.join(retries)}" if retries else ""
@@ -108,11 +108,11 @@ def pytest_terminal_summary(terminalreporter, config):
 
 
 def _run(test_file, memory):
-    """Runs what failed last (at first: everything) and gives the names of the tests that failed now."""
+    """Runs the tests that failed last (at first: all) and returns the names of the tests that failed now."""
     command = [*unshare(), "sh", "-c", f'{NETWORK} && exec "$@"', "sh"]
     pytest_run = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-rsfE", "-s", "-o", f"cache_dir={memory}", "--lf"]
     environment = {**os.environ, INSIDE: "1", "OMP_NUM_THREADS": "1"}
-    # Where a process that others are forked from finds what it compiles.
+    # Path on which the process that others are forked from finds the modules to compile.
     paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment["PYTHONPATH"] = os.pathsep.join(paths)
     environment.pop("LCM_DEFAULT_URL", None)
@@ -132,12 +132,12 @@ def _run(test_file, memory):
 
 
 def start(*arguments):
-    """A process whose output can be read when it has ended."""
+    """Starts a process whose output can be read after it has ended."""
     return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 def end(process, number=signal.SIGKILL):
-    """Ends it and gives what it said."""
+    """Ends a process and returns its output."""
     process.send_signal(number)
     process.wait(60)
     return process.stdout.read()

@@ -1,10 +1,10 @@
-"""The regressor that the paper prints (section III.H), typed in from there: a truth that no code of ours makes."""
+"""Regressor printed in the paper (section III.H), as an independent reference."""
 
 import numpy as np
 
 
 def paper_regressor(q):
-    """Its 7 x 12 gravity regressor at a pose q (7,) over g, columns in the paper's order [1]."""
+    """Returns the 7 x 12 gravity regressor at a pose q (7,) divided by g, columns in the paper's order [1]."""
     s2, s4, s5, s6, s7 = np.sin(q[[1, 3, 4, 5, 6]])
     c2, c4, c5, c6, c7 = np.cos(q[[1, 3, 4, 5, 6]])
     S, C = np.sin(q[1] + q[2]), np.cos(q[1] + q[2])

@@ -1,4 +1,4 @@
-"""Where the repository is, for tests of its documents and examples."""
+"""Path of the repository, for tests of its documents and examples."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""An arm's station with effects of a real arm, advanced step by step."""
+"""Station of an arm with friction, cable and sensor effects, advanced step by step."""
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -19,7 +19,7 @@ def middle(arm):
 
 
 class Run:
-    """A station at rest at q that is advanced step by step."""
+    """Station that starts at rest at q and is advanced step by step."""
 
     def __init__(self, arm, effects, q=None, seed=0):
         self.arm, self.name = arm, arm.name.lower()
@@ -50,7 +50,7 @@ class Run:
 
 
 def breakaway(arm):
-    """(n,) effort on the actuators up to which friction along the actuators alone holds."""
+    """Returns the effort (n,) on the actuators up to which the friction along the actuators alone sticks."""
     total = dict.fromkeys(arm.joint_names, 0.0)
     for effect in arm.effects.friction:
         owner, _, actuator = effect.coordinate.partition(".")

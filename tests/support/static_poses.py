@@ -1,4 +1,4 @@
-"""A motion from rest to rest whose torques are known."""
+"""Motion between static poses with known torques."""
 
 import itertools
 
@@ -11,7 +11,7 @@ RATE = 200.0
 
 
 def motion_with_pauses(arm, poses, generator, travel=2.0, rest=0.4, rate=RATE):
-    """From pose to pose with a rest at each; torques are gravity's plus a viscous friction that spoils the travel."""
+    """Returns a motion with a pause at each pose; torques are gravity plus a viscous friction during motion."""
     t_travel, t_rest = np.arange(0, travel, 1 / rate), np.arange(0, rest, 1 / rate)
     s = t_travel / travel
     blend = 10 * s**3 - 15 * s**4 + 6 * s**5

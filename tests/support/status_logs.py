@@ -12,7 +12,7 @@ START = 1_795_257_600_000_000
 
 
 def statuses(count=20, seed=1, **changes):
-    """Statuses 1 ms apart with random measurements inside the limits."""
+    """Returns statuses 1 ms apart with random measurements inside the limits."""
     generator = np.random.default_rng(seed)
     result = []
     for k, q in enumerate(ARM.sample_poses(count, generator)):

@@ -1,4 +1,4 @@
-"""An arm whose dry friction sticks, and a collector that leads it, without a network."""
+"""Arm with dry friction that sticks, and a collector that moves it, without a network."""
 
 from concurrent.futures import Executor, Future
 
@@ -18,9 +18,9 @@ PERIOD = 1e-3
 
 
 class Disk(Executor):
-    """Replaces the thread that writes, so that no test depends on a real disk.
+    """Replacement for the thread that writes, so that no test depends on a real disk.
 
-    It writes at once, or if it is `slow`, when `finish` is called.
+    It writes immediately, or if it is `slow`, when `finish` is called.
     """
 
     def __init__(self, slow=False):
@@ -47,7 +47,7 @@ def random_poses(arm, count, seed=0, margin=0.1):
 
 
 class StickyArm:
-    """An arm whose joints do not affect one another: weight, dry friction that truly sticks, efforts as commanded."""
+    """Arm with decoupled joints: weight, dry friction that sticks exactly, efforts as commanded."""
 
     def __init__(self, arm, model, friction, q):
         self.arm, self.model, self.friction = arm, model, friction
@@ -72,20 +72,20 @@ class StickyArm:
             self.move(command.effort)
 
     def move(self, effort):
-        """Moves as the effort makes it, for a period."""
+        """Moves for one period under the effort."""
         self.effort = np.array(effort)
         drive = self.effort - self.model.holding_torque(self.q)
         dv = PERIOD / self.inertia
         moved = self.v + dv * drive
-        # Friction takes as much of the motion as it can, and no more.
+        # Friction reduces the velocity at most to zero.
         self.v = np.sign(moved) * np.maximum(np.abs(moved) - dv * self.friction, 0)
         self.q = self.q + PERIOD * self.v
 
 
 class GuardedArm(StickyArm):
-    """A StickyArm behind a guard that resumes automatically; its clock goes on by a period with every step.
+    """StickyArm with a guard that resumes automatically; its clock advances by one period per step.
 
-    Where an operator must resume, `control` ends before a collector is asked: tests/processes/test_control.py.
+    If an operator must resume, `control` ends before a collector is called: tests/processes/test_control.py.
     """
 
     def __init__(self, *arguments):
@@ -100,7 +100,7 @@ class GuardedArm(StickyArm):
         return status
 
     def step(self, command=None):
-        """Goes on by a period, in which a command may arrive."""
+        """Advances by one period, in which a command may arrive."""
         if command is not None:
             self.guard.receive(command, 1000 * self.ticks)
         self.acts = self.guard.state == Status.STATE_EFFORT
@@ -131,7 +131,7 @@ def lead(collector, controller, sticky, seconds, until=lambda: False):
 
 
 def near_poses(count=3):
-    """Poses at which a one-sided collection takes about 1.3 s each."""
+    """Returns poses at which a one-sided collection takes about 1.3 s each."""
     return np.array([0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5]) + 0.05 * np.arange(count)[:, None]
 
 

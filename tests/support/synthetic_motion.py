@@ -1,4 +1,4 @@
-"""A motion whose efforts are known: the arm's own inverse dynamics with friction, and clean channels."""
+"""Motion with known efforts: the arm's inverse dynamics with friction, and channels without faults."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.recordings.recording import Recording
 
 RATE, PERIOD, PASSES = 200.0, 6.0, 4
-#: White noise of the efforts, as a share of their RMS.
+#: White noise of the efforts, as a fraction of their RMS.
 EFFORT_NOISE = 0.01
-#: Coulomb and viscous friction of each actuator take about this share of the RMS of the rigid-body effort each.
+#: Approximate Coulomb and viscous friction of each actuator, each as a fraction of the RMS of the rigid-body effort.
 FRICTION = 0.2
 
 
 def trajectory(arm: Arm, t: np.ndarray, period: float = PERIOD, seed: int = 1) -> tuple[np.ndarray, ...]:
-    """q, v, vd (m, n): a Fourier series of five harmonics a joint, over 60 % of each range."""
+    """Returns q, v, vd (m, n): a Fourier series of five harmonics per joint, over 60 % of each range."""
     generator = np.random.default_rng(seed)
     n = arm.num_joints
     amplitude = generator.uniform(0.3, 1.0, (5, n)) / np.arange(1, 6)[:, None]
@@ -35,7 +35,7 @@ def trajectory(arm: Arm, t: np.ndarray, period: float = PERIOD, seed: int = 1) -
 
 
 def inverse_dynamics(arm: Arm, plant: MultibodyPlant, q: np.ndarray, v: np.ndarray, vd: np.ndarray) -> np.ndarray:
-    """(m, n) efforts of the joints: those of the tree, projected with the linkage's map."""
+    """Returns the efforts (m, n) of the joints: those of the tree, projected with the linkage's map."""
     context = plant.CreateDefaultContext()
     order = [plant.GetJointByName(name).velocity_start() for name in arm.tree_joint_names]
     tree = np.empty((3, len(q), plant.num_velocities()))
@@ -57,7 +57,7 @@ def inverse_dynamics(arm: Arm, plant: MultibodyPlant, q: np.ndarray, v: np.ndarr
 
 @cache
 def efforts(name: str, period: float = PERIOD) -> tuple[np.ndarray, ...]:
-    """t, q, v, tau (joint coordinates) on a grid five times as fine as the recording's, of PASSES * PERIOD seconds."""
+    """Returns t, q, v, tau (joint coordinates) of PASSES * PERIOD seconds, at five times the recording's rate."""
     arm = load_arm(name)
     t = np.arange(0, PASSES * PERIOD, 0.2 / RATE)
     coarse = t[::5]
@@ -74,7 +74,7 @@ def efforts(name: str, period: float = PERIOD) -> tuple[np.ndarray, ...]:
 
 
 def clean_motion(name: str = "psm", *, at: np.ndarray | None = None, effort_lag: float = 0.0, **options) -> Recording:
-    """Joint coordinates at 200 Hz, or at true times `at`; efforts late by `effort_lag` [s], with white noise."""
+    """Returns joint data at 200 Hz, or at true times `at`; efforts with delay `effort_lag` [s] and white noise."""
     t, q, v, tau = efforts(name, **options)
     times = t[::5] if at is None else at
 

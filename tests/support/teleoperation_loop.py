@@ -1,4 +1,4 @@
-"""Teleoperation's law with a follower that obeys, and poses of handle and tip."""
+"""Teleoperation law with an ideal follower, and poses of handle and tip."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.systems.teleoperation import Teleoperation
 
 MTM, PSM = load_arm("mtml"), load_arm("psm")
-#: yaw, pitch, insertion, roll, wrist pitch, wrist yaw, jaw: Wang et al. 2019.
+#: Speeds of yaw, pitch, insertion, roll, wrist pitch, wrist yaw, jaw: Wang et al. 2019.
 SPEED = np.array([1.7, 1.7, 0.35, 2.0, 2.0, 3.0, 3.0])
 PERIOD = 1e-3
 Q_M = np.array([0.1, 0.3, -0.1, 0.2, 1.0, 0.1, 0.3])
@@ -34,7 +34,7 @@ def angle(R):
 
 
 class Loop:
-    """`Teleoperation` with a follower that is where it is commanded, unless told otherwise."""
+    """`Teleoperation` with a follower that reaches each command immediately, unless specified otherwise."""
 
     def __init__(self, q_follower=Q_F, **arguments):
         self.system = Teleoperation(MTM, PSM, **arguments)
@@ -43,7 +43,7 @@ class Loop:
         self.step()
 
     def step(self, follower=None, **inputs):
-        """One update; the desired positions (7,) and velocities (7,)."""
+        """Runs one update; returns the desired positions (7,) and velocities (7,)."""
         self.inputs.update(inputs)
         if follower is not None:
             self.inputs["follower_position"] = follower
@@ -57,7 +57,7 @@ class Loop:
         return desired[:7].copy(), desired[7:].copy()
 
     def move(self, q_master, steps=400):
-        """Moves the master to q_master, step by step, then lets the follower arrive; all desired positions."""
+        """Moves the master to q_master step by step, then lets the follower arrive; returns all desired positions."""
         start = np.array(self.inputs["master_position"])
         way = [self.step(master_position=start + s * (q_master - start))[0] for s in np.linspace(0, 1, steps)]
         return np.array(way + [self.step()[0] for _ in range(steps)])

@@ -20,7 +20,7 @@ def public_folder() -> Iterator[Path]:
 
 
 def run_unprivileged(check: Callable[[], None]) -> None:
-    """Calls `check` in a forked process, where root becomes nobody. Fails if `check` fails."""
+    """Calls `check` in a forked process, as user nobody if started by root. Fails if `check` fails."""
     pid = os.fork()
     if pid == 0:
         try:

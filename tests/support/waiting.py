@@ -1,8 +1,8 @@
-"""Waiting for a condition instead of for a time."""
+"""Waits for a condition instead of a fixed time."""
 
 import time
 
-#: Ends a test that would wait forever [s]; no test depends on its value, however busy the computer is.
+#: Time limit of a test that would wait forever [s]; no test depends on its value, however busy the computer is.
 TIMEOUT = 300.0
 
 
@@ -10,9 +10,10 @@ def wait_until(condition, what, process=None):
     """Waits until the condition holds.
 
     Args:
-        condition: called every millisecond.
-        what: shall come true, for the message when it does not.
-        process: has to bring it about; when it ends before, so does the test. A subprocess.Popen, or one with its poll.
+        condition: Function that is called every millisecond.
+        what: Expected condition, for the message.
+        process: Process that is expected to fulfil the condition; the test fails if it ends earlier. A
+            subprocess.Popen, or an object with its poll.
     """
     end = time.monotonic() + TIMEOUT
     while not condition():
