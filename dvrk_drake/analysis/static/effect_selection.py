@@ -22,7 +22,8 @@ from dvrk_drake.models.arm import Arm
 if TYPE_CHECKING:
     from dvrk_drake.dynamics.static_model import StaticModel
 
-#: Prior standard deviation of a base parameter. The unit is the value at which it alone reaches a joint's effort limit.
+#: Prior standard deviation of a base parameter, as a share of the value at which it alone reaches some joint's effort
+#: limit.
 BASE_PRIOR = 0.25
 #: Prior standard deviation of an effect, as a share of the effort that the joint limits allow along its coordinate.
 #: Offsets have a small deviation. Over a narrow range a large offset would replace gravity and be wrong outside of it.
