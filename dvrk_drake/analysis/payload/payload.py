@@ -297,7 +297,6 @@ def shown_elsewhere(payload: Payload, estimates: Sequence[Payload]) -> list[Payl
     These links explain the change clearly better, or their estimated mass predicts phases that were not used for its
     fit.
     """
-    """
     better = better_links(payload, estimates)
     return [
         other for other in estimates if other in better or (other is not payload and other.found and other.left_out < 1)
