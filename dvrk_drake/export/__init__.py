@@ -1,1 +1,1 @@
-"""Identified models as files of other programs: SDF, URDF, the dVRK's gravity compensation, C, Python, LaTeX."""
+"""Export of identified models to SDF, URDF, the dVRK's gravity compensation, C, Python and LaTeX."""

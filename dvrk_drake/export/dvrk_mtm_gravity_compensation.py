@@ -1,4 +1,4 @@
-"""The formula by which the dVRK's controller compensates the gravity of a master arm, and a file of it from a model."""
+"""Gravity compensation formula of the dVRK's controller for a master arm, and its file from an identified model."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import NUM_JOINTS, NUM_PARAMETERS, GravityCompensationFile
 from dvrk_drake.models.arm import Arm
 
-#: Effects of a drive that stay when it slides slowly.
+#: Effects of a drive that remain at low sliding speed.
 DRY_KINDS = ("coulomb", "presliding")
-#: What the controller multiplies its ten columns of gravity with [m/s^2].
+#: Gravity by which the controller multiplies its ten gravity columns [m/s^2].
 CONTROLLER_GRAVITY = 9.81
 NUM_GRAVITY = 10
 ORDER = 4
-#: What the first two columns are at the shoulder.
+#: Meaning of the first two columns at the shoulder.
 _FIRST = ("cable sine", "cable cosine")
 MTM_JOINTS = (
     "outer_yaw",
@@ -52,7 +52,7 @@ class CompensationOptions:
 
 
 def controller_regressor(q: ArrayLike) -> NDArray[np.float64]:
-    """R (m, 7, 40) of the controller at poses q (m, 7) [rad] of the dVRK's joints: R parameters is a torque [N m].
+    """Returns the regressor R (m, 7, 40) at poses q (m, 7) [rad]. R times the parameters is a torque [N m].
 
     Source: sawIntuitiveResearchKit, robGravityCompensationMTM.
     """
@@ -98,13 +98,13 @@ def controller_regressor(q: ArrayLike) -> NDArray[np.float64]:
 
 
 def polynomial_columns(joint: int) -> slice:
-    """Columns of 1, q, .. q^4 of a joint 0..5."""
+    """Returns the columns of 1, q, .. q^4 of a joint 0..5."""
     first = NUM_GRAVITY + (ORDER + 1) * joint
     return slice(first, first + ORDER + 1)
 
 
 def unclipped_torque(file: GravityCompensationFile, q: ArrayLike, v: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Torque (m, 7) [N m] that the file asks for at poses q (m, 7) [rad], velocities v (m, 7) [rad/s] or at rest."""
+    """Returns the torque (m, 7) [N m] of the file at poses q (m, 7) [rad], velocities v (m, 7) [rad/s] or at rest."""
     R = controller_regressor(q)
     v = np.zeros(R.shape[:2]) if v is None else np.atleast_2d(np.asarray(v, dtype=np.float64))
     share = np.clip((np.abs(v) - file.dead_band) / (file.saturation - file.dead_band), 0.0, 1.0)
@@ -113,7 +113,7 @@ def unclipped_torque(file: GravityCompensationFile, q: ArrayLike, v: ArrayLike |
 
 
 def controller_torque(file: GravityCompensationFile, q: ArrayLike, v: ArrayLike | None = None) -> NDArray[np.float64]:
-    """`unclipped_torque` within the file's limits: what the controller applies."""
+    """Returns `unclipped_torque` limited to the file's range, as the controller applies it."""
     return np.clip(unclipped_torque(file, q, v), file.torque_lower, file.torque_upper)
 
 
@@ -178,13 +178,13 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
 
 
 def largest_differences(file: GravityCompensationFile, model: IdentifiedModel) -> NDArray[np.float64]:
-    """(7,) by how much [N m] the torque that the file commands at rest differs from the model's over the joint box."""
+    """Returns the largest differences (7,) [N m] between the torques of file and model at rest over the joint box."""
     poses = model.arm.sample_poses(4000, np.random.default_rng(1))
     return np.asarray(np.abs(controller_torque(file, poses) - model.holding_torque(poses)).max(axis=0))
 
 
 def _gravity_torque(model: IdentifiedModel, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m, 7) what the base parameters alone say, feedforward scale included."""
+    """Returns the gravity torque (m, 7) of the base parameters, including the feedforward scale."""
     beta = np.array([p.value for p in model.base_parameters])
     return np.asarray(model.feedforward_scale * (model.static_model.regressor(q)[:, :, : len(beta)] @ beta))
 
@@ -227,7 +227,7 @@ def _effect_parameters(model: IdentifiedModel, arm: Arm) -> NDArray[np.float64]:
 
 
 def _best_polynomial(effect: ActuatorEffect, arm: Arm, joint: int) -> NDArray[np.float64]:
-    """(5,) coefficients of 1 .. q^4 near an effect over a joint's range (Chebyshev: nearly the least maximum error)."""
+    """Returns coefficients (5,) of 1 .. q^4 that approximate an effect over a joint's range, nearly minimax."""
     lower, upper = arm.position_lower[joint], arm.position_upper[joint]
 
     middle, half = (lower + upper) / 2, (upper - lower) / 2
@@ -245,7 +245,7 @@ def _refuse_errors(
     poses: NDArray[np.float64],
     tolerance: float,
 ) -> None:
-    """Raises ModelError with what parameters (40,) of gravity and of effects would leave over the joint box."""
+    """Raises ModelError with the errors of the gravity and effect parameters (40,) over the joint box."""
     R, tau = controller_regressor(poses), _gravity_torque(model, poses)
     gravity_off = np.abs(R @ gravity - tau).max(axis=0)
     effects_off = np.abs(R @ effects - (model.holding_torque(poses) - tau)).max(axis=0)
@@ -274,7 +274,7 @@ def _refuse_errors(
 
 
 def _estimates_note(model: IdentifiedModel) -> str:
-    """Returns a sentence for a model that nobody identified, which moves a real arm by estimated masses."""
+    """Returns a note for a model that was not identified and uses estimated masses."""
     if model.provenance.method != "nominal":
         return ""
     return (
@@ -284,13 +284,13 @@ def _estimates_note(model: IdentifiedModel) -> str:
 
 
 def check_tolerance(tolerance: float) -> None:
-    """Raises ModelError unless it is a number from 0: no error exceeds a NaN."""
+    """Raises ModelError unless the tolerance is a non-negative number."""
     if not 0 <= tolerance < np.inf:
         raise ModelError(f"--gc-tolerance is {tolerance:g}; allowed: a number of N m from 0")
 
 
 def round_up(x: float) -> float:
-    """x rounded up to two digits."""
+    """Returns x rounded up to two digits."""
     unit = 10.0 ** (np.floor(np.log10(x)) - 1)
     return float(np.ceil(x / unit) * unit)
 

@@ -1,4 +1,4 @@
-"""Where the dVRK's installed gravity compensation of a master arm is no model of its gravity."""
+"""Compares the dVRK's installed gravity compensation of a master arm with an identified model."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import NUM_JOINTS, GravityCompensationFile
 from dvrk_drake.models.arm import known_arms
 
-#: Signs of the joints, and of their torques, in the mirror image of an arm: a left MTM's wrist is a right one's.
+#: Signs of the joints and their torques in the mirror image of an arm. The wrist of a left MTM mirrors that of a right.
 _MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
-#: Joints whose torque tells the side: shoulder_pitch, elbow_pitch and wrist_platform carry the wrist's brackets.
+#: Joints whose torque distinguishes left from right: shoulder_pitch, elbow_pitch and wrist_platform.
 _TELLS_SIDE = slice(1, 4)
 #: The mirror image fits clearly better if its error is below this share; of the four public files the wrong
 #: side has 1.8 to 2.1 times the error of the right one.
 _CLEARLY_BETTER = 0.8
 _MIN_POSES = 200
-#: A torque below this share of the model's largest on that joint has no sign that matters.
+#: Smallest torque whose sign is compared, as a share of the model's largest torque on that joint.
 SIGN_SHARE = 0.1
 POSES = 20000
 
@@ -104,7 +104,7 @@ class CompensationComparison:
         )
 
     def as_dict(self) -> dict:
-        """For JSON; NaN becomes None."""
+        """Returns the comparison for JSON. NaN becomes None."""
         joints = [{k: None if v != v else v for k, v in asdict(j).items()} for j in self.joints]
         return {
             "poses": len(self.q),
@@ -192,13 +192,13 @@ def _is_of_other_side(
 
 
 def _side_error(tau_file: NDArray[np.float64], tau_model: NDArray[np.float64]) -> float:
-    """RMS error over the joints that tell the side, each as a share of the RMS of the file's torque."""
+    """Returns the RMS error over the joints that distinguish the sides, relative to the RMS of the file's torque."""
     size = np.sqrt(np.mean(tau_file[:, _TELLS_SIDE] ** 2, axis=0)) + 1e-12
     return _rms((tau_file - tau_model)[:, _TELLS_SIDE] / size)
 
 
 def _polynomial_torque(file: GravityCompensationFile, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m, 7) what the powers q .. q^4 add at rest [N m]."""
+    """Returns the torque (m, 7) of the powers q .. q^4 at rest [N m]."""
     parameters = (file.positive + file.negative) / 2
     parameters[:NUM_GRAVITY] = 0.0
     parameters[NUM_GRAVITY::5] = 0.0

@@ -1,4 +1,4 @@
-"""The file that the dVRK's own controller compensates the gravity of a master arm with: `gc-MTML-<serial>.json`."""
+"""File of the dVRK controller for gravity compensation of a master arm: `gc-MTML-<serial>.json`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from dvrk_drake.models.schema_fault import number_fault, within
 
 VERSION = "2.0"
 NUM_JOINTS = 7
-#: Ten terms of gravity, then 1, q, q^2, q^3, q^4 of each of the first six joints.
+#: Ten gravity terms, then 1, q, q^2, q^3, q^4 of each of the first six joints.
 NUM_PARAMETERS = 40
 _CONTROLLER = "GC_controller"
-#: For people: the controller does not read it.
+#: Information for users. The controller does not read it.
 _ARM_NAME = "ARM_NAME"
 #: Our names -> the file's, one of which is misspelled in the controller's source.
 _KEYS = {

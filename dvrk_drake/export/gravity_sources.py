@@ -1,4 +1,4 @@
-"""The gravity torque and its regressor as LaTeX to read, and as Python or C to use elsewhere."""
+"""Exports the gravity torque and its regressor as LaTeX, Python or C."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def to_latex(gravity: SymbolicGravity, frame_poses: Mapping[str, sympy.Matrix]) 
 
 
 def to_python(gravity: SymbolicGravity) -> str:
-    """A Python module without dependencies: `gravity_torque(q, g, beta, out)` and `gravity_regressor(q, g, out)`."""
+    """Returns a Python module with `gravity_torque(q, g, beta, out)` and `gravity_regressor(q, g, out)`."""
     torque, regressor, arguments, beta_argument = _functions(gravity)
     names = "".join(f"    ({value!r}, {name!r}),\n" for name, value in _named_values(gravity))
     return (
@@ -70,7 +70,7 @@ def to_python(gravity: SymbolicGravity) -> str:
 
 
 def to_c(gravity: SymbolicGravity) -> str:
-    """C99 source: `<arm>_gravity_torque(q, g, beta, out)` and `<arm>_gravity_regressor(q, g, out)`, row-major."""
+    """Returns C99 source of `<arm>_gravity_torque(q, g, beta, out)` and `<arm>_gravity_regressor(q, g, out)`."""
     torque, regressor, arguments, beta_argument = _functions(gravity)
     prefix = gravity.arm.name.lower()
     table = "\n".join(f" *   beta[{i}] = {v!r}: {name}" for i, (name, v) in enumerate(_named_values(gravity)))
@@ -101,7 +101,7 @@ def c_source(
 
 
 def _what(gravity: SymbolicGravity) -> str:
-    """The arm, its mounting, and what is left out: what a reader of an exported file must know."""
+    """Returns a description of the arm, its mounting and the omitted terms."""
     x, y, z = gravity.arm.gravity
     labels = {p.label for p in gravity.standard_parameters}
     serial = "" if any(not label.isdigit() for label in labels) else ", without the links of its linkage"
@@ -118,7 +118,7 @@ def _functions(
 
 
 def _named_values(gravity: SymbolicGravity) -> list[tuple[str, float]]:
-    """Each base parameter with its unit, and its value in the SDF."""
+    """Returns each base parameter with its unit and its value in the SDF."""
     base = gravity.base
     return [(f"{n} [{u}]", float(v)) for n, u, v in zip(base.names, base.units, gravity.base_values, strict=True)]
 

@@ -1,4 +1,4 @@
-"""Export of a model into the file format of another program."""
+"""Exports a model to a file format of another program."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Format = Literal["sdf", "urdf", "dvrk-gc", "dvrk-kinematic-gc"]
 
 @dataclass(frozen=True, eq=False)
 class ModelExport:
-    """A model in the terms of a file format.
+    """Model converted to a file format.
 
     Attributes:
-        model: which is exported.
-        format: of the file.
-        origin: where the model is from, for the file.
-        bodies: links and rotors of an SDF or URDF, and what these cannot state; else None.
-        compensation: content of a file of the dVRK's controller; else None.
+        model: Model that is exported.
+        format: Format of the file.
+        origin: Source of the model, written to the file.
+        bodies: Links and rotors of an SDF or URDF, and effects that these formats cannot represent. Otherwise None.
+        compensation: Content of a file of the dVRK's controller. Otherwise None.
     """
 
     model: IdentifiedModel

@@ -1,4 +1,4 @@
-"""An arm's SDF with other inertial parameters: what an identification found, for every program that reads SDF."""
+"""SDF of an arm with identified inertial parameters."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def write_sdf(
 
 
 def sdf_difference(arm: Arm, links: Sequence[LinkInertia], rotor_inertias: Mapping[str, float] | None = None) -> str:
-    """Unified diff from the arm's composed SDF to that of `with_inertias`; empty if nothing changes."""
+    """Returns the unified diff from the arm's composed SDF to that of `with_inertias`, empty if nothing changes."""
     before, after = (
         to_text(root).splitlines(keepends=True)
         for root in (compose_sdf(arm.sdf, arm.mirrored_links), with_inertias(arm, links, rotor_inertias))
@@ -117,7 +117,7 @@ def sdf_difference(arm: Arm, links: Sequence[LinkInertia], rotor_inertias: Mappi
 
 
 def to_text(root: ElementTree.Element, comment: str = "") -> str:
-    """The XML file of a model, indented."""
+    """Returns the XML file of a model, indented."""
     ElementTree.indent(root)
     head = '<?xml version="1.0"?>\n' + (f"<!-- {comment.replace('--', '- -')} -->\n" if comment else "")
     return head + ElementTree.tostring(root, encoding="unicode") + "\n"
@@ -178,7 +178,7 @@ _FILE_URL = "file://"
 
 
 def mesh_folder(model_path: Path) -> str:
-    """Name of the folder beside an exported model that holds its meshes."""
+    """Returns the name of the mesh folder beside an exported model."""
     return f"{model_path.stem}_meshes"
 
 
@@ -241,7 +241,7 @@ def _local_path(uri: str) -> Path | None:
 
 
 def _parts_of(mesh: Path) -> list[str]:
-    """Buffers and images that a glTF file keeps outside of itself."""
+    """Returns the external buffers and images of a glTF file."""
     if mesh.suffix != ".gltf":
         return []
     content = read_json_input(mesh, ArmError, MAX_BINARY)

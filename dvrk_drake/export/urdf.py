@@ -1,4 +1,4 @@
-"""An arm as URDF, for programs that read no SDF: the tree of links with the linkage's joints as mimic joints."""
+"""URDF of an arm: the tree of its links, with mimic joints for the linkage."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.sdf_model import DRAKE, SdfFacts, read_sdf_facts
 
-#: URDF wants a speed limit of every joint; this one stands where the SDF states none [rad/s, m/s].
+#: Speed limit for joints whose SDF states none, because URDF requires one [rad/s, m/s].
 NO_SPEED_LIMIT = "1000"
 
 
@@ -177,7 +177,7 @@ def _add_filter_group(robot: ElementTree.Element, group: ElementTree.Element) ->
 
 
 def _pose(element: ElementTree.Element) -> RigidTransform:
-    """An element's `<pose>`; the identity without one."""
+    """Returns the pose of an element, or the identity without `<pose>`."""
     pose = element.find("pose")
     if pose is None or not (pose.text or "").strip():
         return RigidTransform()

@@ -1,1 +1,1 @@
-"""What an arm carries, from two recordings of the same motion."""
+"""Estimation of a payload from two recordings of the same motion."""

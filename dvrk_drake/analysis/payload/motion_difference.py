@@ -1,4 +1,4 @@
-"""Two recordings of one motion: brought onto the same time, and by how much their efforts differ."""
+"""Difference between the efforts of two recordings of the same motion, after alignment in time."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from dvrk_drake.recordings.recording import Recording
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """x[t] - sum_k coefficients[k - 1] x[t - k step], channel by channel.
+    """Whitening filter x[t] - sum_k coefficients[k - 1] x[t - k step] for each channel.
 
-    The step is half a period of the low-pass that the rows are behind: at that spacing their whole band is there, and
-    nothing else is.
+    The step is half a period of the cut-off frequency of the low-pass filter of the rows. Sampling at this spacing
+    contains their full bandwidth and nothing above it.
 
     Attributes:
-        coefficients: (n, order) of each channel; zeros leave it as it is.
-        step: rows between the values that are combined.
+        coefficients: Coefficients (n, order) of each channel. Zeros leave the channel unchanged.
+        step: Number of rows between the values that are combined.
     """
 
     coefficients: NDArray[np.float64]
@@ -34,12 +34,12 @@ class Whitening:
 
     @classmethod
     def none(cls, channels: int) -> Whitening:
-        """That of white rows."""
+        """Returns the whitening filter that leaves white rows unchanged."""
         return cls(np.zeros((channels, 0)), 1)
 
     @classmethod
     def of(cls, residual: NDArray[np.float64], order: int, rate: float, cut_off: float) -> Whitening:
-        """The autoregression of residuals (r, n) that lie behind a low-pass at `cut_off` [Hz], rows at `rate` [Hz]."""
+        """Fits the autoregression of residuals (r, n), filtered at `cut_off` [Hz] and sampled at `rate` [Hz]."""
         step = max(1, round(rate / (2 * cut_off)))
         coefficients = []
         for x in residual.T:
@@ -49,51 +49,53 @@ class Whitening:
 
     @property
     def lost(self) -> int:
-        """Rows at the start that have no past."""
+        """Number of rows at the start that are removed because they have no preceding rows."""
         return self.coefficients.shape[1] * self.step
 
     def __call__(self, x: NDArray[np.float64], channel: int) -> NDArray[np.float64]:
-        """Rows (r - lost, ...) of one channel's rows x (r, ...)."""
+        """Returns the filtered rows (r - lost, ...) for the rows x (r, ...) of one channel."""
         y = x[self.lost :].copy()
         for k, a in enumerate(self.coefficients[channel], start=1):
             y -= a * x[self.lost - k * self.step : len(x) - k * self.step]
         return y
 
 
-#: A motion that does not repeat may have begun so much sooner or later than the other [s].
+#: Largest time shift between two motions that do not repeat [s].
 MAX_SHIFT = 5.0
-#: Both recordings must have so much of the motion [s].
+#: Smallest duration of the motion that both recordings must contain [s].
 MIN_OVERLAP = 5.0
-#: Of the low-pass that the difference is behind [Hz]: what a payload adds is as slow as the motion, the rest is noise.
+#: Cut-off frequency of the low-pass filter of the difference [Hz]. The effort of a payload is as slow as the motion,
+#: and the rest is noise.
 CUT_OFF = 5.0
-#: By how much of an actuator's RMS effort torques that depend on its position may change: 0.4 to 9 % (RMS 5.6 %),
-#: actuator by actuator, between two days of a PSM without payload (psm_one, psm_one_no_weight of
+#: Expected change of position-dependent torques as a share of an actuator's RMS effort. Between two days of a PSM
+#: without payload it is 0.4 to 9 % for the actuators, with an RMS of 5.6 % (psm_one, psm_one_no_weight of
 #: docs/public_recordings.md).
 DRIFT = 0.06
-#: Pieces of an actuator's travel, in each of which such a torque is linear: a stop or a cable's fold is local.
+#: Number of linear segments of a position-dependent torque over an actuator's range. Joint stops and folds of cables
+#: have local effects.
 PIECES = 8
-#: Share of the travel over which such a torque at one place goes with that at another.
+#: Correlation length of a position-dependent torque as a share of the range.
 CORRELATED = 0.25
-#: Columns of `changes` of which nothing is known beforehand: offset, dry and viscous friction.
+#: Number of columns of `changes` without prior: offset, Coulomb friction and viscous friction.
 _SIMPLE = 3
-#: Step of the search before it is refined [s].
+#: Step of the search before refinement [s].
 _STEP = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class MotionDifference:
-    """What changed from a reference to another recording of the same motion.
+    """Difference from a reference to another recording of the same motion.
 
     Attributes:
-        grid: the other motion.
-        rows: (r,) which of its inner rows have a counterpart in the reference.
-        period: after which the motion repeats [s], or None.
-        shift: the other motion at t is the reference at t + shift [s].
-        tau: (k, n) efforts of the actuators [N m, N], other less reference, behind the filter, less what the model
-            expects since the two motions differ a little.
-        changes: (k, n, c) by which the drives may have changed since, actuator by actuator: an offset, dry and viscous
-            friction, and torques that depend on the position (cables, springs, a stop), piecewise linear in it.
-        deviation: (n, c) RMS effort [N m, N] by which each may well have changed; inf where nothing is known.
+        grid: Grid of the other motion.
+        rows: Indices or mask (r,) of its inner rows that have a counterpart in the reference.
+        period: Period of a repeating motion [s], or None.
+        shift: Time shift [s]. The other motion at t corresponds to the reference at t + shift.
+        tau: Filtered difference of the efforts of the actuators (k, n) [N m, N], other minus reference. The difference
+            predicted by the model for the small differences of the two motions is subtracted.
+        changes: Columns (k, n, c) for possible changes of each drive: an offset, Coulomb and viscous friction, and
+            position-dependent torques (cables, springs, a joint stop), which are piecewise linear.
+        deviation: Prior standard deviations (n, c) of the changes as RMS efforts [N m, N], inf where there is no prior.
     """
 
     grid: MotionGrid
@@ -106,14 +108,16 @@ class MotionDifference:
 
 
 def motion_difference(reference: Recording, other: Recording, model: DynamicModel) -> MotionDifference:
-    """Subtracts the reference.
+    """Aligns two recordings of one motion and subtracts the reference.
 
     Args:
-        reference, other: recordings of the same motion, in either coordinates.
-        model: of the arm without what was added to it; only small differences of the motions go through it.
+        reference: Recording of the motion before the change, in joint or actuator coordinates.
+        other: Recording of the same motion after the change, in joint or actuator coordinates.
+        model: Model of the arm before the change. It is only used for the small differences of the motions.
 
     Raises:
-        RecordingError: one is no motion of this arm, an effort has the wrong sign, or they are not of the same motion.
+        RecordingError: A recording is not a motion of this arm, an effort has the wrong sign, or the recordings are not
+            of the same motion.
     """
     signals = model.section.signals
     settings = replace(signals, effort_cut_off=min(CUT_OFF, signals.effort_cut_off))
@@ -142,14 +146,14 @@ def motion_difference(reference: Recording, other: Recording, model: DynamicMode
 def _efforts(
     recording: Recording, grid: MotionGrid, expected: DriveEfforts, model: DynamicModel
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(r, n) measured efforts of the actuators behind the filter, and what the model leaves of them."""
+    """Returns the filtered efforts of the actuators (r, n), measured and minus those predicted by the model."""
     tau = grid.behind_filter(recording.in_actuator_coordinates(model.arm).measured_effort())
     refuse_opposite_efforts(recording, model.arm.joint_names, tau, expected.total())
     return tau, tau - expected.total()
 
 
 def _changes(model: DynamicModel, grid: MotionGrid, expected: DriveEfforts) -> NDArray[np.float64]:
-    """(r, n, 3 + PIECES + 1) at the inner rows."""
+    """Returns the columns (r, n, 3 + PIECES + 1) for changes of the drives at the inner rows."""
     transmission = model.arm.transmission
     speed = grid.behind_filter(grid.efforts_at_rows(transmission.velocity(grid.v)))
     a = transmission.position(grid.q)
@@ -160,8 +164,11 @@ def _changes(model: DynamicModel, grid: MotionGrid, expected: DriveEfforts) -> N
 
 
 def _shapes(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m, PIECES + 1) of positions (m,): with independent weights their sum is piecewise linear between knots, and
-    neighbouring knots are alike (a Gaussian process over the travel, with a squared-exponential kernel)."""
+    """Returns basis functions (m, PIECES + 1) at positions (m,).
+
+    With independent weights their sum is linear between knots, and adjacent knots are correlated. It is a Gaussian
+    process over the range with a squared-exponential kernel.
+    """
     place = (x - np.min(x)) / max(float(np.ptp(x)), np.finfo(float).tiny)
     knots = np.linspace(0.0, 1.0, PIECES + 1)
     hats = np.maximum(1 - PIECES * np.abs(place[:, None] - knots), 0.0)
@@ -176,7 +183,7 @@ def _at(t: NDArray[np.float64], x: NDArray[np.float64], times: NDArray[np.float6
 
 
 def _shift(reference: MotionGrid, other: MotionGrid, period: float | None, recording: Recording) -> float:
-    """The shift at which the positions agree best, in units of their standard deviations."""
+    """Returns the shift at which the positions, in units of their standard deviations, agree best."""
     deviation = np.std(other.q, axis=0)
     moving = deviation > 1e-3
     x, y = (grid.q[:, moving] / deviation[moving] for grid in (reference, other))
@@ -184,7 +191,7 @@ def _shift(reference: MotionGrid, other: MotionGrid, period: float | None, recor
     start = other.t[0] - reference.t[0]
 
     def apart(shift: int) -> float:
-        """Half the mean squared difference, x[i + shift] against y[i]."""
+        """Returns half the mean squared difference between x[i + shift] and y[i]."""
         first, last = max(0, -shift), min(len(y), len(x) - shift)
         if last - first < MIN_OVERLAP * GRID_RATE:
             return np.inf

@@ -1,4 +1,4 @@
-"""What was added to an arm between two recordings of one motion: a mass, its place, and how well both are known."""
+"""Estimates mass and position of a payload, with standard errors, from two recordings of the same motion."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ from dvrk_drake.models.plant import shared_plant
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
 
-#: Of the intervals that are reported.
+#: Confidence level of the reported intervals.
 CONFIDENCE = 0.95
-#: Links whose left-out error is within this of the best explain the recording as well.
+#: Links whose cross-validation error is within this factor of the smallest explain the recording equally well.
 SAME_ERROR = 1.05
-#: Two recordings whose efforts differ by less than this share of them are one.
+#: Recordings whose efforts differ by less than this share are identical.
 MIN_DIFFERENCE = 1e-6
-#: Order of the autoregression that whitens the errors, and how often it is fitted.
+#: Order of the autoregression that whitens the errors, and the number of times it is fitted.
 AUTOREGRESSION, WHITENED = 2, 2
-#: An actuator that the payload loads by less than this share of its difference tells nothing of it.
+#: Smallest load of an actuator by the payload, as a share of the difference of its efforts, for it to be used.
 MIN_LOAD = 1e-6
 
 
 @dataclass(frozen=True)
 class PayloadActuator:
-    """One actuator: RMS efforts behind the low-pass [N m, N].
+    """RMS efforts of one actuator after low-pass filtering [N m, N].
 
     Attributes:
-        name: of the joint whose actuator it is.
-        change: what the recordings differ by.
-        payload: what the payload takes of it.
-        left: what neither the payload nor changes of the drive explain.
-        explained: 1 - left^2 / change^2; None where the payload does not load the actuator.
+        name: Name of the joint of the actuator.
+        change: Difference between the recordings.
+        payload: Part that is explained by the payload.
+        left: Residual that neither the payload nor changes of the drive explain.
+        explained: 1 - left^2 / change^2, or None if the payload does not load the actuator.
     """
 
     name: str
@@ -59,20 +59,20 @@ class PayloadActuator:
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """A point mass on a link.
+    """Point mass on a link.
 
     Attributes:
-        link: which carries it.
-        body: mass [kg] and place in the link's frame [m].
-        mass_error: standard error [kg].
-        place_error: (3,) standard errors [m], nan where the motion does not determine the coordinate.
-        quantile: so many standard errors either way are the interval of `CONFIDENCE`.
-        largest_at_com: upper end of the interval of a mass that is at the link's own centre of mass [kg].
-        place_in_base: (3,) the place in the base frame with all joints at 0 [m].
-        left_out: RMS error of phases that are predicted from the others, as a share of the error without a payload;
-            geometric mean over the actuators.
-        actuators: in the arm's order.
-        shift: of the two recordings [s].
+        link: Name of the link that carries the payload.
+        body: Mass [kg] and position in the link frame [m].
+        mass_error: Standard error of the mass [kg].
+        place_error: Standard errors (3,) of the position [m], nan for coordinates that are not identifiable.
+        quantile: Half the width of the interval of `CONFIDENCE`, in standard errors.
+        largest_at_com: Upper end of the interval of a mass that is at the link's own centre of mass [kg].
+        place_in_base: Position (3,) in the base frame with all joints at 0 [m].
+        left_out: RMS error of cross-validation over the phase of the motion, divided by the error without a payload.
+            Geometric mean over the actuators.
+        actuators: Efforts of the actuators, in the arm's order.
+        shift: Time shift between the two recordings [s].
     """
 
     link: str
@@ -88,14 +88,15 @@ class Payload:
 
     @property
     def found(self) -> bool:
-        """Whether the interval of the mass excludes 0."""
+        """True if the interval of the mass excludes 0."""
         return self.body.mass > self.quantile * self.mass_error
 
     def as_dict(self, estimates: Sequence[Payload] = ()) -> dict:
-        """Returns the entry of `payload --json`; coordinates that are not determined are null.
+        """Returns the entry of `payload --json`, with None for coordinates that are not identifiable.
 
         Args:
-            estimates: of all links, for a comparison. No bound of the mass is stated where another link shows one.
+            estimates: Payloads on all links, for comparison. The bound of the mass is omitted if a payload on another
+                link explains the change.
         """
         known = self.body.determined
         elsewhere = shown_elsewhere(self, estimates)
@@ -127,27 +128,30 @@ def estimate_payload(
     links: Sequence[str] | None = None,
     progress: Callable[[float], object] = lambda _: None,
 ) -> list[Payload]:
-    """The point mass on each of some links that explains best what changed from the reference, best link first.
+    """Estimates the point mass on each link that best explains the change from the reference, best link first.
 
-    The efforts' difference is explained, actuator by actuator, by the regressor's ten columns of the link with the
-    parameters of a point mass, and by what may have changed in the drives (`MotionDifference.changes`). That a weight
-    is small beside its distance from the joints' axes is what tells mass from place on a link that turns about a fixed
-    point: there only m p and the inertia m p p' show.
+    For each actuator, the difference of the efforts is explained by two parts: the ten regressor columns of the link
+    with the parameters of a point mass, and possible changes of the drives (`MotionDifference.changes`). A payload is
+    assumed to be small compared with its distance from the joint axes. This assumption separates mass and position on
+    a link that rotates about a fixed point, where only m p and the inertia m p p' are identifiable.
 
-    What is left is whitened, actuator by actuator (`Whitening`): offsets, friction and cables err slowly, while inertia
-    shows in the fast parts of a motion. The standard errors are a delete-one jackknife over the folds of `phase_folds`:
-    errors that repeat with the motion do not average out with its repetitions, as those of independent rows would. They
-    are never less than independent rows would have.
+    The residual of each actuator is whitened (`Whitening`), because errors from offsets, friction and cables are slow,
+    while inertia affects the fast parts of a motion. The standard errors are a delete-one jackknife over the folds of
+    `phase_folds`. Unlike errors of independent rows, errors that repeat with the motion do not average out over its
+    repetitions. The standard errors are not smaller than those of independent rows.
 
     Args:
-        reference, loaded: recordings of the same motion, without and with the payload.
-        model: of the arm in the reference: it gives the shape of dry friction, and what differs since the motions do.
-        links: names; all moving links by default.
-        progress: called with the finished share, 0..1.
+        reference: Recording of the motion without the payload.
+        loaded: Recording of the same motion with the payload.
+        model: Model of the arm in the reference. It determines the shape of Coulomb friction and the effect of
+            differences between the motions.
+        links: Names of links. Defaults to all moving links.
+        progress: Function that is called with the completed share, 0..1.
 
     Raises:
-        RecordingError: a recording is no motion of this arm, they are not of the same motion, or they are the same.
-        ModelError: there is no such link.
+        RecordingError: A recording is not a motion of this arm, the recordings are not of the same motion, or they are
+            identical.
+        ModelError: A link does not exist.
     """
     regressor = model.regressor
     names = [link.link for link in regressor.links]
@@ -176,11 +180,11 @@ class PayloadIdentification:
     """Result of `payload`.
 
     Attributes:
-        payload: on the named link, or on the one that explains the change best.
-        estimates: on each moving link, best first.
-        model: of the arm without the payload.
-        warnings: another link explains the change better, and what was found in the recordings.
-        link: the named one, or None.
+        payload: Payload on the given link, or on the link that explains the change best.
+        estimates: Payloads on each moving link, best first.
+        model: Model of the arm without the payload.
+        warnings: Warnings about links that explain the change better, and about the recordings.
+        link: Name of the given link, or None.
     """
 
     payload: Payload
@@ -190,7 +194,7 @@ class PayloadIdentification:
     link: str | None = None
 
     def as_dicts(self) -> list[dict]:
-        """Returns what `payload --json` writes: the payload on the named link, or on every link."""
+        """Returns the data of `payload --json`: the payload on the given link, or on every link."""
         chosen = self.estimates if self.link is None else [self.payload]
         return [payload.as_dict(self.estimates) for payload in chosen]
 
@@ -203,23 +207,25 @@ def payload(
     *,
     progress: Progress | None = None,
 ) -> PayloadIdentification:
-    """Checks two recordings of one motion and estimates what was added to the arm: what `dvrk-drake payload` does.
+    """Checks two recordings of one motion and estimates the payload of the arm, like `dvrk-drake payload`.
 
     Args:
-        reference, loaded: motions with efforts (m, n), without and with the payload.
-        model: identified from a motion of the arm without the payload; or the arm: its model is then identified from
-            `reference`.
-        link: of the SDF that carries the payload; None for the one that explains the change best.
-        progress: called with the step, "checking the recording", "identifying" or "estimating", and its finished share
-            0..1.
+        reference: Motion with efforts (m, n), without the payload.
+        loaded: The same motion with the payload.
+        model: Model identified from a motion of the arm without the payload, or the arm. In the latter case the model
+            is identified from `reference`.
+        link: SDF link that carries the payload. None selects the link that explains the change best.
+        progress: Function that is called with the step, "checking the recording", "identifying" or "estimating", and
+            its completed share 0..1.
 
     Returns:
-        Mass [kg] and place [m] with standard errors as `payload`, the same on each link as `estimates`, and `warnings`.
+        Mass [kg] and position [m] with standard errors as `payload`, the same for each link as `estimates`, and
+        `warnings`.
 
     Raises:
-        RecordingError: `check` refuses a recording, or the two are not of one motion: see `findings` of the error.
-        ModelError: the model has no dynamics, or there is no such link.
-        IdentificationError: `reference` does not determine the arm's model.
+        RecordingError: `check` rejects a recording, or the two are not of one motion. See `findings` of the error.
+        ModelError: The model has no dynamics, or the link does not exist.
+        IdentificationError: The model of the arm is not identifiable from `reference`.
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -253,24 +259,24 @@ def payload(
 
 
 def check_links(regressor: DynamicRegressor, links: Sequence[str]) -> None:
-    """Raises ModelError unless links of these names move; before a model is identified for nothing."""
+    """Raises ModelError if a link does not move or does not exist. Called before a model is identified."""
     names = [link.link for link in regressor.links]
     if unknown := [link for link in links if link not in names]:
         raise ModelError(f'unknown link "{unknown[0]}"; links of {regressor.arm.name} that move: {", ".join(names)}')
 
 
 def as_good(estimates: Sequence[Payload]) -> list[Payload]:
-    """The links that the recording cannot tell from the best one."""
+    """Returns the links that explain the change as well as the best one."""
     return [payload for payload in estimates if payload.left_out <= SAME_ERROR * estimates[0].left_out]
 
 
 def better_links(payload: Payload, estimates: Sequence[Payload]) -> list[Payload]:
-    """Returns the links that explain the change clearly better than `payload` does, best first."""
+    """Returns the links that explain the change clearly better than `payload`, best first."""
     return [other for other in estimates if SAME_ERROR * other.left_out < payload.left_out]
 
 
 def better_link_warnings(payload: Payload, estimates: Sequence[Payload]) -> tuple[Finding, ...]:
-    """Returns a warning that names the links that explain the change better than that of `payload`, if any do."""
+    """Returns a warning with the links that explain the change better than that of `payload`, if there are any."""
     better = better_links(payload, estimates)
     if not better:
         return ()
@@ -286,9 +292,10 @@ def better_link_warnings(payload: Payload, estimates: Sequence[Payload]) -> tupl
 
 
 def shown_elsewhere(payload: Payload, estimates: Sequence[Payload]) -> list[Payload]:
-    """Returns the links that contradict "no payload" on the link of `payload`, best first.
+    """Returns the links that contradict the absence of a payload on the link of `payload`, best first.
 
-    These explain the change clearly better, or a mass was found on them that predicts phases not used for its fit.
+    These links explain the change clearly better, or their estimated mass predicts phases that were not used for its
+    fit.
     """
     better = better_links(payload, estimates)
     return [
@@ -331,13 +338,13 @@ def _estimate(link: LinkInertia, columns: NDArray[np.float64], difference: Motio
 
 
 def _jackknife(parts: list[list[float]], least: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard errors (k,) from estimates (folds, k) that leave one fold out each, not below `least`."""
+    """Returns standard errors (k,), at least `least`, from estimates (folds, k) that each exclude one fold."""
     return np.maximum(np.sqrt((len(parts) - 1) * np.var(np.array(parts), axis=0)), least)
 
 
 @dataclass(frozen=True, eq=False)
 class _Problems:
-    """The problem of one link: as the rows are, with its actuators' weights, and with what it leaves made white."""
+    """Least-squares problems of one link: original, weighted by actuator, and whitened by the residuals."""
 
     plain: PointMassProblem
     plain_weights: NDArray[np.float64]
@@ -345,7 +352,7 @@ class _Problems:
 
     @classmethod
     def of(cls, link: LinkInertia, columns: NDArray[np.float64], difference: MotionDifference) -> _Problems:
-        """The errors' autoregression is that of what the problem, not yet whitened, leaves; then once more."""
+        """Creates the problems. The autoregression is fitted to the unwhitened residuals, then once more."""
         grid, n = difference.grid, difference.grid.arm.num_joints
         at_rows = np.stack([grid.at_rows(columns[:, i], i) for i in range(n)], axis=1)
         filtered = grid.behind_filter(at_rows)[difference.rows]
@@ -372,8 +379,8 @@ def _problem(
     size = both[0].shape[1]
     columns = ((np.arange(size), whitening(x, i)) for i, x in enumerate(both))
     equations = NormalEquations.of(columns, size, tau, fold[rows], edge[rows])
-    # A low-passed effort has two independent values a period of the cut-off. What repeats with the motion has fewer:
-    # the jackknife over its phases sees to that.
+    # A low-pass filtered effort has two independent values per period of the cut-off frequency. Errors that repeat with
+    # the motion have fewer, which the jackknife over the phases takes into account.
     independent = 2 * grid.settings.effort_cut_off / grid.rate
     com = link.parameters[1:4] / link.parameters[0]
     precision = np.mean(difference.changes**2, axis=0) / difference.deviation**2
@@ -381,7 +388,7 @@ def _problem(
 
 
 def _in_base(arm: Arm, link: str, place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3,) a point of a link in the base frame with all joints at 0."""
+    """Returns a point (3,) of a link in the base frame with all joints at 0."""
     plant = shared_plant(arm)
     context = plant.CreateDefaultContext()
     for name, x in zip(arm.tree_joint_names, arm.linkage.position(np.zeros(arm.num_joints)), strict=True):

@@ -1,4 +1,4 @@
-"""A point mass on a link that explains a difference of efforts best, from sums of squares and products."""
+"""Fits a point mass on a link to a difference of efforts, using the normal equations."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from scipy.optimize import least_squares
 
 from dvrk_drake.analysis.dynamic.normal_equations import NormalEquations
 
-#: It lies within this of the link's own centre of mass, along each axis [m]; no arm is longer.
+#: Largest distance from the link's own centre of mass along each axis [m]. No arm is longer.
 REACH = 1.0
-#: Heaviest one [kg].
+#: Largest mass [kg].
 MAX_MASS = 10.0
-#: A coordinate whose standard error would exceed this is not determined [m].
+#: Smallest standard error at which a coordinate is not identifiable [m].
 MIN_KNOWN = 0.5
-#: Where the search begins beside the link's own centre of mass [m].
+#: Distances of initial values from the link's own centre of mass, in addition to the centre itself [m].
 _STARTS = (0.15, 0.4)
 _RIGID = 10
 _NEGLIGIBLE = 1e-11
@@ -25,7 +25,7 @@ _TINY = 1e-30
 
 @dataclass(frozen=True, eq=False)
 class PointMass:
-    """A mass [kg] at `place` (3,) in the link's frame [m]; `determined` (3,) tells which coordinates are estimates."""
+    """Mass [kg] at `place` (3,) in the link frame [m]. `determined` (3,) is true for coordinates that are estimated."""
 
     mass: float
     place: NDArray[np.float64]
@@ -33,25 +33,28 @@ class PointMass:
 
     @property
     def parameters(self) -> NDArray[np.float64]:
-        """(10,) inertial parameters about the link's origin."""
+        """Returns the inertial parameters (10,) about the link's origin."""
         return point_mass_parameters(self.mass, self.place)
 
 
 def point_mass_parameters(mass: float, place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(10,) m, m p, then m (|p|^2 1 - p p') as `PARAMETER_NAMES` orders it: the pseudo-inertia m (p, 1)(p, 1)'."""
+    """Returns m, m p and m (|p|^2 1 - p p') (10,) in the order of `PARAMETER_NAMES`.
+
+    The corresponding pseudo-inertia is m (p, 1)(p, 1)'.
+    """
     x, y, z = place
     moments = [y * y + z * z, x * x + z * z, x * x + y * y]
     return mass * np.array([1.0, x, y, z, *moments, -x * y, -x * z, -y * z])
 
 
 class PointMassProblem:
-    """tau_i ~ Y_i phi(m, p) + N_i x_i of every actuator i, x_i its own nuisances: normal, about 0.
+    """Regression tau_i ~ Y_i phi(m, p) + N_i x_i for every actuator i, with nuisances x_i that are normal about 0.
 
     Attributes:
-        equations: columns: ten of the link, then the nuisances.
-        independent: share of the `rows` that are independent measurements.
-        com: (3,) the link's centre of mass [m], where a coordinate stays that the motion does not determine.
-        precision: (n, k) one over the variance of each nuisance before the recording, 0 where nothing is known.
+        equations: Normal equations, with the ten columns of the link first, then the nuisances.
+        independent: Share of the `rows` that are independent measurements.
+        com: Centre of mass (3,) of the link [m]. It is used for coordinates that are not identifiable.
+        precision: Inverse prior variances (n, k) of the nuisances, 0 where there is no prior.
     """
 
     def __init__(
@@ -67,13 +70,13 @@ class PointMassProblem:
         self._count, self._precision = rows * independent, precision
 
     def fit(self, start: PointMass | None = None) -> tuple[PointMass, NDArray[np.float64], NDArray[np.float64]]:
-        """The point mass, the actuators' weights (n,), and (4,) the standard errors if all rows' noise were alike.
+        """Returns the point mass, the actuators' weights (n,), and standard errors (4,) for equal noise in all rows.
 
-        Every actuator weighs by the variance that is left. Coordinates that the motion does not determine are set to
-        the link's centre of mass, one by one.
+        Each actuator is weighted by its residual variance. Coordinates that are not identifiable are set to the link's
+        centre of mass, one by one.
 
         Args:
-            start: near it; by default it is searched, as the cost has several minima in the place.
+            start: Initial value. By default, several are tried because the cost has several minima in the position.
         """
         weights = self._count / np.maximum(self._total[:, -1, -1], _TINY)
         determined = np.ones(3, dtype=bool) if start is None else start.determined
@@ -84,7 +87,7 @@ class PointMassProblem:
                 body = self._refine(reduced, weights, body)
                 weights = self._count / np.maximum(_left_by(reduced, body), _TINY)
             errors = self._standard_errors(self._reduced(self._total, weights), weights, body)
-            # What ends at the edge of the search is as unknown as what has no edge.
+            # A coordinate at the boundary of the search is not identifiable.
             unknown = np.where(np.abs(body.place - self.com) > REACH - 1e-6, np.inf, errors[1:])
             worst = int(np.argmax(np.where(determined, unknown, 0.0)))
             if not determined[worst] or not unknown[worst] > MIN_KNOWN:
@@ -92,16 +95,16 @@ class PointMassProblem:
             start, determined = None, determined & (np.arange(3) != worst)
 
     def without_fold(self, fold: int, weights: NDArray[np.float64], start: PointMass) -> PointMass:
-        """The point mass as the other folds see it."""
+        """Fits the point mass to the other folds."""
         others = self._total - self.equations.of_fold(fold).dense()
         return self._refine(self._reduced(others, weights), weights, start)
 
     def mass_at_com(self, weights: NDArray[np.float64], fold: int | None = None) -> tuple[float, float]:
-        """The mass at the link's centre of mass, and its standard error if all rows' noise were alike [kg].
+        """Returns the mass at the link's centre of mass and its standard error for equal noise in all rows [kg].
 
         Args:
-            weights: of the actuators.
-            fold: which is left out; None: none.
+            weights: Weights of the actuators.
+            fold: Fold that is excluded. None excludes none.
         """
         products = self._total if fold is None else self._total - self.equations.of_fold(fold).dense()
         H, b = _weighted(self._reduced(products, weights), weights)
@@ -110,13 +113,13 @@ class PointMassProblem:
         return float(unit @ b) / information, information**-0.5
 
     def nuisances(self, body: PointMass, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, k) that go with a point mass."""
+        """Returns the nuisances (n, k) for a point mass."""
         return np.array([self._own_nuisances(i, self._total[i], body.parameters, weights) for i in range(len(weights))])
 
     def fold_errors(self, fold: int, weights: NDArray[np.float64], start: PointMass | None) -> NDArray[np.float64]:
-        """(n,) sum of squares left of a fold that is predicted, nuisances included, from the others.
+        """Returns the sum of squared errors (n,) of a fold that is predicted, with nuisances, from the other folds.
 
-        None as `start`: without a point mass.
+        If `start` is None, the prediction has no point mass.
         """
         others, own = self.equations.without_fold(fold).dense(), self.equations.of_fold(fold).dense()
         phi = np.zeros(_RIGID)
@@ -127,7 +130,7 @@ class PointMassProblem:
     def budget(
         self, body: PointMass, weights: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """(n,) each, sums of squares: of the efforts, of what the body adds to them, of what it and nuisances leave."""
+        """Returns sums of squares (n,) of the efforts, of the part of the body, and of the residual with nuisances."""
         phi, total = body.parameters, self._total
         adds = np.einsum("a,nab,b->n", phi, total[:, :_RIGID, :_RIGID], phi)
         return total[:, -1, -1], np.maximum(adds, 0.0), self._left(total, total, phi, weights)
@@ -139,7 +142,7 @@ class PointMassProblem:
         phi: NDArray[np.float64],
         weights: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """(n,) sum of squares left of some rows by phi (10,) and nuisances that are fitted to others."""
+        """Returns the sum of squared residuals (n,) of some rows for phi (10,) and nuisances fitted to other rows."""
         left = np.empty(len(learnt))
         for i, (H, own) in enumerate(zip(learnt, predicted, strict=True)):
             residual = np.concatenate([-phi, -self._own_nuisances(i, H, phi, weights), [1.0]])
@@ -149,12 +152,12 @@ class PointMassProblem:
     def _own_nuisances(
         self, i: int, H: NDArray[np.float64], phi: NDArray[np.float64], weights: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(k,) of actuator i that go with phi (10,), from products H of some rows."""
+        """Returns the nuisances (k,) of actuator i for phi (10,), from products H of some rows."""
         right = H[_RIGID:-1, -1] - H[_RIGID:-1, :_RIGID] @ phi
         return _pseudo_solve(H[_RIGID:-1, _RIGID:-1] + np.diag(self._precision[i] / weights[i]), right)
 
     def _reduced(self, products: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, 11, 11) of the link's columns and the effort when each actuator's nuisances are fitted away."""
+        """Returns the products (n, 11, 11) of the link's columns and the effort after eliminating the nuisances."""
         keep = np.append(np.arange(_RIGID), products.shape[-1] - 1)
         reduced = np.empty((len(products), _RIGID + 1, _RIGID + 1))
         for i, full in enumerate(products):
@@ -166,7 +169,7 @@ class PointMassProblem:
     def _search(
         self, reduced: NDArray[np.float64], weights: NDArray[np.float64], determined: NDArray[np.bool_]
     ) -> PointMass:
-        """From several starts."""
+        """Searches from several initial values."""
         offsets = [np.zeros(3)] + [s * d * axis for d in _STARTS for axis in np.eye(3)[determined] for s in (1, -1)]
         H, b = _weighted(reduced, weights)
         bodies = []
@@ -204,7 +207,10 @@ class PointMassProblem:
     def _standard_errors(
         self, reduced: NDArray[np.float64], weights: NDArray[np.float64], body: PointMass
     ) -> NDArray[np.float64]:
-        """(4,) of mass and place; infinite where the motion tells nothing, 0 where a coordinate is not estimated."""
+        """Returns the standard errors (4,) of mass and position.
+
+        They are infinite for quantities that are not identifiable, and 0 for coordinates that are not estimated.
+        """
         A, _ = _rows(reduced, weights)
         jacobian = A @ _derivatives(body.mass, body.place)
         errors = np.zeros(4)
@@ -218,13 +224,16 @@ class PointMassProblem:
 
 
 def _left_by(reduced: NDArray[np.float64], body: PointMass) -> NDArray[np.float64]:
-    """(n,) sum of squares that a point mass leaves, nuisances fitted."""
+    """Returns the sum of squared residuals (n,) of a point mass, with fitted nuisances."""
     residual = np.append(-body.parameters, 1.0)
     return np.maximum(np.einsum("a,nab,b->n", residual, reduced, residual), 0.0)
 
 
 def _derivatives(mass: float, place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(10, 4) of the parameters by mass and place: exact by central differences, since they are quadratic in it."""
+    """Returns the derivatives (10, 4) of the parameters with respect to mass and position.
+
+    Central differences are exact because the parameters are quadratic in the position.
+    """
     by_place = [
         (point_mass_parameters(mass, place + step) - point_mass_parameters(mass, place - step)) / 2
         for step in np.eye(3)
@@ -233,7 +242,7 @@ def _derivatives(mass: float, place: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def _pseudo_solve(H: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """H^+ b of a symmetric positive semidefinite H, after its columns are brought to one size."""
+    """Returns H^+ b for a symmetric positive semidefinite H whose columns are scaled to equal size."""
     scale = 1 / np.sqrt(np.maximum(np.diag(H), _TINY))
     inverse = np.linalg.pinv(H * np.outer(scale, scale), rcond=_NEGLIGIBLE, hermitian=True)
     return np.asarray((inverse * np.outer(scale, scale)) @ b)
@@ -249,7 +258,7 @@ def _weighted(
 def _rows(
     reduced: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A (k, 10), b (k,) with |A phi - b|^2 = the weighted cost, up to a constant."""
+    """Returns A (k, 10), b (k,) with |A phi - b|^2 equal to the weighted cost, up to a constant."""
     H, b = _weighted(reduced, weights)
     scale = 1 / np.sqrt(np.maximum(np.diag(H), _TINY))
     values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
