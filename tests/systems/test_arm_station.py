@@ -1,4 +1,4 @@
-"""The simulated arm behind its driver's ports."""
+"""Simulated arm with the ports of its driver."""
 
 import dataclasses
 
@@ -23,14 +23,14 @@ from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 ARM = load_arm("mtml")
 MODEL = IdentifiedModel.from_arm(ARM)
 N = ARM.num_joints
-# What SAP holds the linkage to [m] at 1 ms under this arm's loads: its constraints are stiff, not rigid.
+# Accuracy [m] of SAP for the linkage at 1 ms under this arm's loads: its constraints are stiff, not rigid.
 # Measured: 1.0e-8 at rest and 1.2e-8 falling with couplers, 4e-9 with the loop pinned.
 GAP = 2e-8
 POSES = ARM.sample_poses(5, np.random.default_rng(0), margin=0.1)
 
 
 def loop_gap(station, context):
-    """Largest distance [m] between frames that the linkage keeps together."""
+    """Returns the largest distance [m] between frames that the linkage connects."""
     plant = station.plant
     plant_context = station.GetSubsystemContext(plant, context)
     gaps = []
@@ -41,14 +41,14 @@ def loop_gap(station, context):
 
 
 def linkage_error(station, context):
-    """Largest difference [rad] between the tree's joints and what the linkage makes of the arm's."""
+    """Returns the largest difference [rad] of the tree's joints from the linkage at the arm's joint positions."""
     plant_context = station.GetSubsystemContext(station.plant, context)
     q_tree = station.plant.GetPositions(plant_context)[tree_selector(station.plant, ARM)]
     return np.abs(q_tree - ARM.linkage.position(station.GetPositions(context))).max()
 
 
 def released(q, closure="mimic", **arguments):
-    """A station under gravity compensation alone, at pose q; and its simulator."""
+    """Returns a station under gravity compensation alone, at pose q, and its simulator."""
     builder = DiagramBuilder()
     station = builder.AddSystem(ArmStation(ARM, closure=closure, **arguments))
     controller = builder.AddSystem(GravityPidController(MODEL, mode="gravity"))
@@ -107,7 +107,7 @@ def test_linkage_stays_closed_while_the_arm_falls(closure):
 
 
 def test_energy_loss_vanishes_with_time_step():
-    # No damping and no limit in reach: what is lost is the integrator's, which is of first order in the step.
+    # Without damping and limits, the loss is that of the integrator, which is of first order in the step.
     q = np.array([0.1, 0.4, -0.2, 0.3, 0.5, 0.1, 0.0])
     losses = []
     for time_step in (1e-3, 2.5e-4):
@@ -119,7 +119,7 @@ def test_energy_loss_vanishes_with_time_step():
         plant_context = station.GetSubsystemContext(plant, context)
 
         def energy(plant=plant, plant_context=plant_context):
-            # Drake's kinetic energy leaves the rotors out; its mass matrix holds them.
+            # Drake's kinetic energy excludes the rotors. Its mass matrix includes them.
             v = plant.GetVelocities(plant_context)
             kinetic = 0.5 * v @ plant.CalcMassMatrix(plant_context) @ v
             return kinetic, plant.EvalPotentialEnergy(plant_context)
@@ -151,7 +151,7 @@ def test_effort_measured_is_the_clamped_command():
 
 
 def acceleration_of(station, q, inputs):
-    """Mean acceleration of the independent joints over the first millisecond."""
+    """Returns the mean acceleration of the independent joints over the first millisecond."""
     simulator = Simulator(station)
     context = simulator.get_mutable_context()
     station.SetPositions(context, q)
@@ -179,7 +179,7 @@ def test_efforts_act_on_their_joint_through_the_linkage(j):
     for name in ("mtml.effort_commanded", "mtml.effort_disturbance"):
         inputs = {"mtml.effort_commanded": tau, "mtml.effort_disturbance": np.zeros(N)}
         inputs[name] = inputs[name] + extra
-        # Ten short steps: SAP's couplers give by 0.2 % in the first step, and are stiff after a few.
+        # Ten short steps: SAP's couplers deviate by 0.2 % in the first step only.
         measured = acceleration_of(ArmStation(ARM, plant_config=arm_plant_config(1e-4)), q, inputs)
         np.testing.assert_allclose(measured, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
 
@@ -326,6 +326,6 @@ def test_two_stations_in_one_diagram():
         simulator.AdvanceTo(0.01)
         context = simulator.get_context()
         q = [s.GetPositions(s.GetMyContextFromRoot(context)) for s in (left, right)]
-        # Mirror images, but for motor 4, which elbow and platform turn alike on both sides.
+        # Mirror images, except for motor 4, which has the same direction on both sides.
         np.testing.assert_allclose(q[0], np.array([-1, 1, 1, -1, 1, -1, -1]) * q[1], atol=2e-5)
         assert np.any(q[0])

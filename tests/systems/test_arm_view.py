@@ -1,4 +1,4 @@
-"""The Meshcat view: the linkage follows, sliders cannot leave the coupled limit, and the camera sees the whole arm."""
+"""Meshcat view: linkage, sliders at the coupled limit, and camera position."""
 
 import math
 import os
@@ -50,7 +50,7 @@ def test_sliders_stop_at_the_coupled_limit(view):
 
 
 def test_other_sliders_move_at_the_coupled_limit(view):
-    """As found: at the stop of the parallelogram every slider snapped back, with a division by zero."""
+    """Regression: at the stop of the parallelogram, a division by zero reset every slider."""
     q = np.zeros(7)
     q[1:3] = 0.4, 0.28033  # a step of a slider beyond the limit
     view.show(q)
@@ -113,7 +113,7 @@ def test_camera_frames_the_whole_arm(name):
 
 
 class Link:
-    """Statuses as an ArmLink gives them, one after the other; None is silence."""
+    """Returns statuses like an ArmLink, one after the other; None for no status."""
 
     def __init__(self, *positions):
         self.positions = list(positions)
@@ -133,12 +133,12 @@ def test_live_view_draws_the_last_status():
     link = Link(pose, None, [math.nan] * 7)
     for _ in range(3):
         show_status(view, link)
-        np.testing.assert_array_equal(view._q, pose)  # what was drawn last
+        np.testing.assert_array_equal(view._q, pose)  # last drawn pose
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
 def test_viewer_ends_when_arm_is_killed():
-    """What draws is a sleep here: `kill -9` leaves nobody to end it, and it would keep its port."""
+    """A sleep replaces the viewer. After `kill -9` of the arm it would continue and keep its port."""
     program = (
         "import signal\n"
         "from dvrk_drake.processes import live_view\n"

@@ -1,4 +1,4 @@
-"""Drive joints, stops, cables and springs of a real arm: mechanics that must hold whatever the values are."""
+"""Mechanical properties of drive joints, stops, cables and springs of a real arm for any values."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_joints_of_drive_coordinates_follow_the_arm(name):
     for _ in range(100):
         run.advance(10)
         for joint, row in added:
-            # What near-rigid ties of light bodies give by under the friction's load.
+            # Compliance of the nearly rigid constraints of light bodies under the friction load.
             assert plant.GetPositions(plant_context)[joint.position_start()] == pytest.approx(row @ run.q, abs=3e-4)
     assert np.abs(run.q - moved).max() > 0.1  # the arm fell
 
@@ -47,7 +47,7 @@ def test_coupled_stop_limits_motion(which):
     outside = {0: lambda s: limit.lower - s.min(), 1: lambda s: s.max() - limit.upper}[which]
     assert outside(free) > 0.05
     assert outside(stopped) < 2e-3
-    assert np.abs(np.diff(stopped[-50:])).max() < 1e-5  # it rests there
+    assert np.abs(np.diff(stopped[-50:])).max() < 1e-5  # it stays at rest there
 
 
 @pytest.mark.parametrize("direction", [-1.0, 1.0])
@@ -66,7 +66,7 @@ def test_coupled_stop_adds_no_energy(direction):
             run.advance()
             path.append(plant.CalcKineticEnergy(plant_context))
         energy[len(parts)] = np.array(path)
-    # Flying free, steps of 1 ms change it by 2e-4; the stop takes it, and never gives any.
+    # In free motion, steps of 1 ms change it by 2e-4. The stop dissipates energy and never adds any.
     assert np.all(energy[1] <= energy[1][0] * (1 + 1e-3))
     assert energy[1][-1] < 0.8 * energy[1][0] < energy[0][100]
 
@@ -83,7 +83,7 @@ def test_cable_effort_has_opposite_sign_of_identified_effect():
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_cables_and_springs_are_conservative(name):
-    """Round a closed path of the joints their work is nothing."""
+    """Their work on a closed path of the joints is zero."""
     arm = weightless(name)
     run = Run(arm, arm.effects.only(["cables", "springs"]))
     system = run.station.GetSubsystemByName("drive_force")
@@ -112,7 +112,7 @@ def stretched(friction=()):
 
 
 def test_cable_stretches_by_its_load():
-    """A motor that holds against an effort on the joints turns by what the cable gives; the encoder sits on it."""
+    """A motor that holds against a joint effort rotates by the cable's stretch. The encoder is on the motor."""
     brakes = [FrictionEffect(f"actuator.{joint}", "viscous", 0.0, 0.5) for joint in load_arm("mtml").joint_names]
     arm, run = stretched(brakes)
     load = dict.fromkeys(arm.joint_names, 0.0) | {"outer_yaw": 0.8, "shoulder_pitch": -0.6, "wrist_roll": 0.01}
@@ -123,7 +123,7 @@ def test_cable_stretches_by_its_load():
     stretch = arm.transmission.position(run.get("position_measured") - run.q)
     for i, joint in enumerate(arm.joint_names):
         expected = -load[joint] / CABLES[joint].stiffness if joint in CABLES else 0.0
-        # The tie is a rod whose length is as good as linear in the angle: 1 % at 10 mrad.
+        # The constraint is a rod whose length is nearly linear in the angle: 1 % at 10 mrad.
         assert stretch[i] == pytest.approx(expected, rel=0.02, abs=2e-4)
     assert np.abs(run.v).max() < 1e-3
 
@@ -135,7 +135,7 @@ def test_cable_without_rotor_inertia_is_refused(name, actuator):
 
 
 def test_elastic_cables_add_no_energy():
-    """Motion and stretch together never gain energy once nothing pushes any more."""
+    """The sum of kinetic and elastic energy never increases without external effort."""
     arm, run = stretched()
     plant = run.station.plant
     plant_context = plant.GetMyContextFromRoot(run.context)
@@ -153,7 +153,7 @@ def test_elastic_cables_add_no_energy():
         run.advance()
         path.append(energy())
     path = np.array(path)
-    # Drake steps what Coriolis and centrifugal forces do explicitly: 2e-4 of the energy, as without cables.
+    # Drake integrates Coriolis and centrifugal forces explicitly: 2e-4 of the energy, as without cables.
     assert np.all(np.maximum.accumulate(path[::-1])[::-1] <= path * (1 + 1e-3))
     assert path[-1] < 0.9 * path[0]
 
@@ -172,7 +172,7 @@ def test_rotor_behind_cable_has_inertia_of_sdf():
         was = rigid.station.plant.GetJointByName(joint).velocity_start()
         rotor = rigid.station.plant.GetJointActuatorByName(joint)
         reflected = rotor.default_rotor_inertia() * rotor.default_gear_ratio() ** 2
-        # The bodies that are added have 0.2 % of what the arm shows at their coordinates.
+        # The added bodies have 0.2 % of the arm's inertia at their coordinates.
         share = 4e-3 * M_rigid[was, was]
         assert reflected <= M[motor, motor] <= reflected + share
         assert abs(M[at_joint, at_joint] - (M_rigid[was, was] - reflected)) <= share

@@ -1,4 +1,4 @@
-"""The parts of a real arm's drive one by one: motors, sensors, hooks of friction, and where they are in the plant."""
+"""Unit tests of a real arm's drive: motors, sensors, anchors of friction springs, and their plant indices."""
 
 import numpy as np
 import pytest
@@ -29,9 +29,9 @@ def test_motors_clamp_step_and_saturate_in_this_order():
     inside = np.linspace(-0.2, 0.2, N)
     free = Motors(ARM, ArmEffects(), limits)
     np.testing.assert_allclose(free.effort(inside), INVERSE.pull_back_effort(inside), atol=1e-12)
-    # Beyond the joints' limits nothing more comes.
+    # The effort does not increase beyond the joints' limits.
     np.testing.assert_allclose(free.effort(np.full(N, 9.0)), INVERSE.pull_back_effort(limits), atol=1e-12)
-    # 0.33 is three steps, of which the motor has 0.25; the second has 0.3, all others what was commanded.
+    # 0.33 is three steps, limited to 0.25 by the motor. The second has 0.3, all others the command.
     command = ARM.transmission.pull_back_effort(np.array([0.33, -0.33, *[0.05] * (N - 2)]))
     assert np.all(np.abs(command) <= limits)
     np.testing.assert_allclose(motors.effort(command), [0.25, -0.3, *[0.05] * (N - 2)], atol=1e-12)
@@ -75,7 +75,7 @@ def test_measured_efforts_are_whole_steps():
 
 
 def measure(positions, resolution, decay, delay=0):
-    """Positions and velocities that an encoder of one actuator makes of `positions`, one a time step of 0.5 s."""
+    """Returns encoder positions and velocities of one actuator for `positions`, one per time step of 0.5 s."""
     one = np.eye(1)
     constants = np.array([resolution, decay, 0.5])
     memory, out, path = np.zeros(2 + 2 * max(delay - 1, 0)), np.zeros(2), []
@@ -108,11 +108,11 @@ def test_measurement_queue_keeps_order(delay):
     np.testing.assert_array_equal(path[: delay - 1], np.zeros((delay - 1, 2)))
 
 
-# Friction's hooks
+# Anchors of friction springs
 
 
 def hooks(positions, *, fall_speed=0.0, side=1.0, code=5, velocity=0.0):
-    """Where the hook of one slider that gives way at 0.1 is, after each position."""
+    """Returns the anchor of one slider that slips at 0.1, after each position."""
     places, laws = np.array([[code, 0, 0]]), np.array([[0.1, fall_speed, side]])
     hook, path = np.zeros(1), []
     for position in positions:
@@ -125,7 +125,7 @@ def test_anchor_follows_when_spring_slips():
     assert hooks([0.05, 0.09, -0.09]) == [0.0, 0.0, 0.0]
     np.testing.assert_allclose(hooks([0.3, 0.25, 0.15, 0.05, 0.2]), [0.2, 0.2, 0.2, 0.15, 0.15], atol=1e-12)
     np.testing.assert_allclose(hooks([-0.3, -0.15]), [-0.2, -0.2], atol=1e-12)
-    # "presliding forward" holds one way only: it follows the other way without a stretch.
+    # "presliding forward" holds in one direction only. It follows in the other one without deflection.
     np.testing.assert_allclose(hooks([0.3, 0.1], code=6), [0.2, 0.1], atol=1e-12)
     np.testing.assert_allclose(hooks([-0.3, -0.1], code=6, side=-1.0), [-0.2, -0.1], atol=1e-12)
 
@@ -133,16 +133,16 @@ def test_anchor_follows_when_spring_slips():
 def test_anchor_moves_closer_with_fall_speed():
     (still,), (moving,) = hooks([0.3], fall_speed=1.0), hooks([0.3], fall_speed=1.0, velocity=1.0)
     assert still == pytest.approx(0.2, abs=1e-12)
-    # It holds 1/e of its travel, less what the arm moves in two steps.
+    # It holds 1/e of its travel, minus the motion of the arm in two steps.
     assert moving == pytest.approx(0.3 - (0.1 * np.exp(-1.0) - 2e-3), abs=1e-12)
 
 
-# The whole
+# Complete drive
 
 
 @pytest.mark.parametrize("stretch", [{}, {"outer_yaw": Cable(80.0, 0.05)}])
 def test_power_of_motors_equals_power_of_actuators(stretch):
-    """The map of velocities to the actuators is the transpose of the map of efforts from the motors."""
+    """The matrix from velocities to actuators is the transpose of the matrix from motor efforts."""
     parts = Run(ARM, ArmEffects(stretch=stretch)).station._parts
     np.testing.assert_allclose(parts.to_actuators, parts.from_motors.T, atol=1e-12)
     assert np.linalg.matrix_rank(parts.to_actuators) == N
@@ -159,7 +159,7 @@ def test_drive_coordinates_are_plant_joints():
     drive.set_positions(q_plant, q)
     for added, row in drive._added:
         assert q_plant[added.position_start()] == pytest.approx(row @ q)
-        assert drive.joint(row) == (added, 1.0)  # it is found again, not made again
+        assert drive.joint(row) == (added, 1.0)  # it is found, not created again
 
 
 def test_drive_without_effects_is_ideal():

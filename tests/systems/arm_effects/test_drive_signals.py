@@ -1,4 +1,4 @@
-"""What a computer knows of a real arm, and what the motors make of its commands."""
+"""Measured signals of a real arm and motor efforts for its commands."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Dry friction as elements of Drake's solver: it sticks, it slides, and it only takes energy."""
+"""Dry friction as elements of Drake's solver: sticking, sliding and passivity."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_friction_sticks_below_its_limit_without_creep(name):
     assert np.all(np.abs(before - middle(arm)) > 1e-6)  # it is loaded
     run.advance(9000)
     after, ripple = mean_position()
-    # Over 10 s. The solver's tolerance lets a loaded spring tremble by some 1e-9 rad, without a direction.
+    # Over 10 s. The solver's tolerance causes noise of about 1e-9 rad on a loaded spring, without drift.
     assert np.abs(after - before).max() < 1e-9
     assert ripple < 5e-8
 
@@ -56,7 +56,7 @@ def test_friction_slides_above_its_limit(name):
 
 
 def friction_of(arm, law):
-    """As much along each actuator as what slides there, by another law."""
+    """Returns the sliding friction of each actuator by another law."""
     limits = zip(arm.joint_names, breakaway(arm), strict=True)
     return ArmEffects(friction=[FrictionEffect(f"actuator.{joint}", *law(limit)) for joint, limit in limits])
 
@@ -72,7 +72,7 @@ LAWS = {
 @pytest.mark.parametrize("law", ["the arm's", *LAWS])
 @pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def test_friction_is_dissipative(name, law):
-    """Work on the friction, by what Drake says that it applies: never less than nothing, whatever the motion."""
+    """The work on the friction, from the efforts that Drake applies, is never negative for any motion."""
     arm = weightless(name)
     run = Run(arm, friction_of(arm, LAWS[law]) if law in LAWS else arm.effects.only(["friction"]))
     plant = run.station.plant
@@ -94,7 +94,7 @@ def test_friction_is_dissipative(name, law):
         taken -= effort @ (plant.GetPositions(plant_context)[columns] - before)
         worst, most = min(worst, taken), max(most, taken)
     assert most > 1e-3
-    # The solver's tolerance; springs are slack at the start, so nothing is there to be given back.
+    # Solver tolerance. The springs are relaxed at the start, so they store no energy.
     assert worst > -1e-9
 
 
@@ -119,7 +119,7 @@ def test_friction_equals_the_identified_element(name):
     law = ActuatorEffect(effect.coordinate, "presliding", effect.scale)
     expected = -effect.coefficient * law.column(x, np.zeros_like(x))[1:]
     assert np.ptp(expected) == pytest.approx(2 * effect.coefficient)
-    # Its damper, which the law has not, is worth what it travels in that time; it rounds the corners.
+    # The damper, which is not in the law, adds the travel in its relaxation time and smooths the corners.
     rounding = effect.coefficient * np.minimum(RELAXATION * np.abs(np.diff(x)) / STEP / effect.scale, 2.0)
     assert np.all(np.abs(effort - expected) < rounding + 1e-6)
     assert np.mean(np.abs(effort - expected)) < 0.1 * effect.coefficient
@@ -142,7 +142,7 @@ def test_friction_does_not_change_inertia(name):
 
 
 def roll_friction(*effects):
-    """These along the wrist roll; all other actuators move as through honey."""
+    """Returns these effects along the wrist roll. All other actuators are strongly damped."""
     arm = weightless("mtml")
     honey = [FrictionEffect(f"actuator.{joint}", "viscous", 0.0, 1.0) for joint in arm.joint_names[:-1]]
     along = [FrictionEffect("actuator.wrist_roll", *effect) for effect in effects]
@@ -161,7 +161,7 @@ def test_one_sided_friction_holds_more_on_that_side(more):
 
 
 def test_stribeck_friction_decreases_while_sliding():
-    """Stribeck's friction: the same effort holds an arm that rests and keeps one going that slides."""
+    """Stribeck friction: the same effort does not move an arm at rest and keeps a sliding arm in motion."""
     at_rest, sliding, fall_speed, viscous = 0.002, 0.002, 2.0, 2e-4
     travel = 0.1
     effects = ("presliding", 0.01, sliding), ("presliding", travel, at_rest, fall_speed), ("viscous", 0.0, viscous)

@@ -1,4 +1,4 @@
-"""The whole real arm, and a hand on it: together they give back no more energy than was put in."""
+"""Passivity of a real arm with all effects and a hand."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ HANDLES = {"mtml": "dh_7", "psm": "dh_6"}
 GRIPS = {
     "as a person": Grip(),
     "undamped": Grip(damping=1e-6, rotational_damping=1e-6),
-    # Their limits bind until they have nearly arrived.
+    # Their limits are active until they have nearly arrived.
     "ten times as firm": Grip(6e3, 250.0, 20.0, 0.3),
     "a thousand times as firm": Grip(6e5, 2.5e4, 2e3, 30.0),
 }
@@ -26,7 +26,7 @@ ROUNDING = 1e-9
 
 
 class HeldArm:
-    """A limp, weightless arm with effects, whose handle a hand pulls towards `wanted`."""
+    """Unpowered, weightless arm with effects. A hand pulls its handle towards `wanted`."""
 
     def __init__(self, name, effects, grip):
         self.arm, self.grip, self.effects = weightless(name), grip, effects
@@ -58,7 +58,7 @@ class HeldArm:
         return self.frame.pose(self.q)
 
     def want(self, rpy, p):
-        """The handle so far from where it was at first."""
+        """Returns the pose of the handle relative to its initial pose."""
         R = RotationMatrix(RollPitchYaw(rpy)) @ self.start.rotation()
         self.wanted = RigidTransform(R, self.start.translation() + p)
         self.port.GetMutableData().set_value(self.wanted)
@@ -67,7 +67,7 @@ class HeldArm:
         self.port.GetMutableData().set_value(RigidTransform(np.full(3, np.nan)))
 
     def advance(self):
-        """One step; the work of the hand on the arm."""
+        """Advances one step and returns the work of the hand on the arm."""
         port, context = self.effort
         tau, q = port.Eval(context).copy(), self.q
         self.tick += 1
@@ -75,7 +75,7 @@ class HeldArm:
         return tau @ (self.q - q)
 
     def in_hand(self):
-        """What the hand's springs hold: quadratic until their limits, linear beyond."""
+        """Returns the energy of the hand's springs: quadratic up to their limits, linear beyond."""
         turn = (self.wanted.rotation() @ self.X_BG.rotation().inverse()).ToAngleAxis().angle()
         way = np.linalg.norm(self.wanted.translation() - self.X_BG.translation())
         springs = (
@@ -85,7 +85,7 @@ class HeldArm:
         return sum(0.5 * k * x**2 if k * x <= most else most * x - 0.5 * most**2 / k for k, x, most in springs)
 
     def in_arm(self):
-        """Motion, what cables and springs hold, and what friction does before it slips."""
+        """Returns the sum of the kinetic energy and the elastic energy of cables, springs and presliding friction."""
         plant = self.station.plant
         context = plant.GetMyContextFromRoot(self.simulator.get_context())
         energy = plant.CalcKineticEnergy(context)
@@ -128,14 +128,14 @@ def test_arm_with_fixed_hand_never_gains_energy(name, grip):
         held.advance()
     total, arm = np.array(path).T
     assert np.diff(total).max() < ROUNDING
-    # It was no small matter: the arm was thrown, and friction and damper took what it had.
+    # The energy was considerable: the arm moved fast, and friction and damper dissipated its energy.
     assert arm.max() > arm[0] + 0.2
     assert total[-1] < total[0] - 0.5
 
 
 @pytest.mark.parametrize("grip", ["as a person", "a thousand times as firm"])
 def test_hand_adds_no_energy_beyond_its_work(grip):
-    """Between steps the wanted pose jumps, which is work put into the springs; in the step they work on the arm."""
+    """The desired pose jumps between steps, which adds energy to the springs. In the step they work on the arm."""
     held = HeldArm("mtml", weightless("mtml").effects, GRIPS[grip])
     generator = np.random.default_rng(1)
     rates, phases = generator.uniform(2.0, 20.0, 6), generator.uniform(0.0, 6.0, 6)
@@ -160,6 +160,6 @@ def test_oscillation_on_cables_and_springs_gains_no_energy(name):
     for _ in range(2000):
         path.append(held.in_arm())
         held.advance()
-    # Taken at the start of a step, so their energy swings with them, by less than 1 %; it does not grow.
+    # Evaluated at the start of a step, so the energy oscillates by less than 1 %. It does not grow.
     assert max(path) < path[0] + 0.01 * abs(path[0])
     assert np.ptp(held.q - middle(held.arm)) > 0.05

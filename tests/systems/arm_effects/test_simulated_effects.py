@@ -1,4 +1,4 @@
-"""The real arm as a whole: parts that can be switched, scenarios, and what is refused."""
+"""Simulated arm with effects: selection of parts, scenarios, and invalid configurations."""
 
 import xml.etree.ElementTree as ElementTree
 
@@ -34,13 +34,13 @@ def test_seed_gives_identical_bits(name):
 def test_gravity_controller_holds_arm_with_effects(name):
     arm = load_arm(name)
     path = simulate(load_scenario(name, ["duration=2", "simulated_effects=[all]"])).recording.q
-    # Cables and springs, which it does not know, pull it by their torque over its gain until its integral has grown.
+    # Cables and springs, which are not in its model, deflect it by torque / gain until its integral has grown.
     assert np.abs(path - path[0]).max() < 0.1
     rest = [part for part in EFFECT_NAMES if part not in ("cables", "springs")]
     recording = simulate(load_scenario(name, ["duration=2", f"simulated_effects={rest}"])).recording
     resolution = np.array([arm.effects.encoder.resolution[joint] for joint in arm.joint_names])
     counts = arm.transmission.position(recording.q - recording.q[0]) / resolution
-    # Presliding alone is some counts of the fine encoders: 3 mrad under its load.
+    # Presliding alone is a few counts of the fine encoders: 3 mrad under its load.
     assert np.all(np.abs(counts * resolution) < np.maximum(2 * resolution, 0.003))
     assert np.all(np.abs(recording.tau) <= 1.1 * arm.effort_limits)
 
@@ -92,7 +92,7 @@ def test_unknown_coordinate_is_refused():
 
 
 def test_no_sdf_has_friction_tags():
-    """Drake drops them without a word: friction is stated in the YAML files."""
+    """Drake ignores them without a message. Friction is stated in the YAML files."""
     paths = {path.name: path for path in (MODELS_FOLDER / "sdf").glob("*.sdf")}
     assert {"mtm.sdf", "psm.sdf"} <= set(paths)
     for name, path in paths.items():
@@ -119,13 +119,13 @@ def test_hand_moves_and_releases_the_arm():
     k = np.flatnonzero(gripped)[-1]
     reached = frame.pose(simulation.state_true[k, :7]).translation() - frame.pose(TWO_POSES[1]).translation()
     assert np.linalg.norm(reached) < 0.2 * way[0]
-    # Friction stops it where the hand left it; what goes on is to and fro in the friction's springs.
+    # Friction stops it where the hand released it. The remaining motion is oscillation of the friction springs.
     assert np.ptp(simulation.state_true[-50:, :7], axis=0).max() < 5e-3
 
 
 @pytest.mark.slow
 def test_model_with_cables_and_springs_holds_exactly():
-    """Gravity compensation alone, without friction: nothing is left that moves the arm."""
+    """With gravity compensation alone and without friction, no effort moves the arm."""
     parts = ["simulated_effects=[cables, springs]", "duration=1", "controller.mode=gravity", f"start={TWO_POSES[1]}"]
     moved = {}
     for knows in ("[]", "[cables, springs]"):
@@ -136,7 +136,7 @@ def test_model_with_cables_and_springs_holds_exactly():
 
 
 def test_saturation_limits_fast_motion():
-    """From 0.05 to 0.9 rad in 0.25 s: more than the shoulder's motor has, though not than the joint's limit."""
+    """0.05 to 0.9 rad in 0.25 s needs more than the shoulder's motor limit, but less than the joint limit."""
     arm = load_arm("mtml")
     low, high = [0, 0.05, 0, 0, 0, 0, 0], [0, 0.6, -0.5, 0, 0, 0, 0]
     settings = [f"start={low}", f"targets=[{{time: 0.2, pose: {high}}}]", "duration=0.4"]
@@ -152,7 +152,7 @@ def test_saturation_limits_fast_motion():
 
 
 def test_scenario_cable_stretches():
-    """At rest it carries what the motor gives, but for the friction at the motor."""
+    """At rest it carries the motor effort minus the friction at the motor."""
     arm, start = load_arm("mtml"), "start=[0.0, 0.4, -0.2, 0.0, 0.5, 0.0, 0.0]"
     friction = sum(e.coefficient for e in arm.effects.friction if e.coordinate == "actuator.shoulder_pitch")
     stretch, load = {}, {}

@@ -1,4 +1,4 @@
-"""The bridge in docs/connecting_a_real_dvrk.md, against an arm and a network that are not real."""
+"""Bridge of docs/connecting_a_real_dvrk.md with a simulated arm and network."""
 
 import re
 from collections import deque
@@ -18,7 +18,7 @@ DOCUMENT = ROOT / "docs" / "connecting_a_real_dvrk.md"
 ARM = load_arm("mtml")
 N = ARM.num_joints
 BAD = GuardSettings().plausibility.bad_samples
-#: The arm is not real and has no weight.
+#: The simulated arm has no weight.
 MODEL = IdentifiedModel.from_arm(ARM).with_scaled_parameters(
     np.zeros(len(IdentifiedModel.from_arm(ARM).base_parameters))
 )
@@ -26,7 +26,7 @@ HELD = 0.02 * ARM.effort_limits
 
 
 class Network:
-    """As much of lcm.LCM as a bridge uses: what is published is handled later, in order."""
+    """Part of lcm.LCM that a bridge uses. Published messages are handled later, in order."""
 
     def __init__(self):
         self.handlers, self.queue, self.published = {}, deque(), []
@@ -49,7 +49,7 @@ class Network:
 
 
 class Crtk:
-    """The ROS side of an arm that stays where it is, and notes what it was told last."""
+    """ROS interface of an arm that does not move. It stores the last command."""
 
     def __init__(self, clock):
         self.q, self.age, self.state, self.told = np.full(N, 0.1), 0.0, "ENABLED", []
@@ -161,16 +161,16 @@ def test_missing_measurements_end_efforts():
 
     scene = Scene(script, 400).run()
     assert scene.topics(260, 320) == {"servo_jf"}
-    # Some bad measurements are tolerated in a hold.
+    # A few bad measurements are tolerated in HOLD.
     assert scene.topics(321, 321 + BAD) == {"servo_jp"}
     assert scene.topics(321 + BAD, 400) == {"hold"}
     assert scene.statuses[-1].fault_text == "the measurement is 0.041 s old; allowed is 0 to 0.02 s"
-    # Statuses carry the time of the measurement, which stands still: nothing is recorded twice.
+    # Statuses carry the constant time of the measurement, so nothing is recorded twice.
     assert len({status.utime for status in scene.statuses[300:]}) == 1
 
 
 def test_repeated_measurement_keeps_its_time():
-    """A state at 500 Hz in a loop at 1 kHz that takes a while: as one measurement, it is recorded once."""
+    """A state at 500 Hz in a slow loop at 1 kHz is one measurement and is recorded once."""
 
     def script(scene, k):
         crtk = scene.crtk

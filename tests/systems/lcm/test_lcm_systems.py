@@ -1,4 +1,4 @@
-"""Both ends of an arm's LCM channels, in one process: the same controller on the simulated driver as on a plant."""
+"""Both ends of an arm's LCM channels in one process, with a controller on the simulated driver."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_controller_starts_acts_and_hold_follows(name):
     assert [s.sequence for s in arm.statuses] == list(range(301))
     assert arm.drift() < 1e-4
     effort_before = np.array(status.effort_commanded)
-    # The controller dies: the arm holds after 50 ms, without a jump of the effort or the pose.
+    # The controller stops: the arm holds after 50 ms, without a jump of the effort or the pose.
     run(lcm, 60, arm)
     states = [s.guard_state for s in arm.statuses[-60:]]
     assert states == sorted(states, reverse=True)
@@ -43,7 +43,7 @@ def test_controller_starts_acts_and_hold_follows(name):
     assert (status.num_expired, status.command_sender_id, status.num_accepted) == (1, 0, accepted)
     assert np.abs(np.array(status.effort_commanded) - effort_before).max() < 0.01 * arm.arm.effort_limits.max()
     assert arm.drift() < 1e-3
-    # It comes back as another sender, but an operator did not resume.
+    # It restarts as another sender, but an operator did not resume.
     controller = Controller(lcm, name)
     run(lcm, 300, arm, controller)
     status = arm.statuses[-1]
@@ -56,7 +56,7 @@ def test_controller_starts_acts_and_hold_follows(name):
     run(lcm, 5, arm, operator)
     run(lcm, 60, arm)
     assert not arm.statuses[-1].fault_text
-    # It comes back again, and is watched first.
+    # It restarts again and passes STARTING first.
     controller = Controller(lcm, name)
     run(lcm, 200, arm, controller)
     assert arm.statuses[-1].guard_state == Status.STATE_STARTING
@@ -71,7 +71,7 @@ def test_the_status_echoes_the_last_accepted_command():
     lcm.Subscribe("DVRK_COMMAND_MTML", lambda data: sent.append(Command.decode(data)))
     arm, controller = SimulatedArm(lcm), Controller(lcm)
     run(lcm, 20, arm, controller)
-    arm.step()  # it steps with what came last, and says so one period later
+    arm.step()  # it uses the last command and reports it one period later
     arm.step()
     lcm.HandleSubscriptions(0)
     status, command = arm.statuses[-1], sent[-1]
@@ -167,7 +167,7 @@ def test_efforts_after_off_are_refused_while_braking():
         shares.append(np.max(np.abs(status.effort_measured - gravity) / arm.arm.effort_limits))
         run(lcm, 1, arm, sender)
     assert (status.guard_state, status.refusal_code) == (Status.STATE_EFFORT, Status.REFUSAL_START_FAR)
-    # A command is judged in the period after the status that it answers.
+    # A command is checked in the period after the status that it answers.
     refused = np.diff([status.num_refused for status in arm.statuses[-len(shares) :]]) > 0
     shares = np.array(shares[:-1])
     assert refused.sum() > 10
@@ -300,7 +300,7 @@ def test_messages_require_the_same_key(tmp_path):
     owner = Controller(lcm, driver=driver)
     run(lcm, 300, arm, stranger, owner)
     assert arm.statuses[-1].guard_state == Status.STATE_EFFORT
-    # And the owner's station does not take an unsigned status.
+    # The station with the key ignores an unsigned status.
     spoofed = full_status(utime=arm.statuses[-1].utime + 1000)
     spoofed.sequence, spoofed.session_id = arm.statuses[-1].sequence + 1, arm.statuses[-1].session_id
     station = owner.simulator.get_system().GetSubsystemByName("mtml_station")

@@ -1,6 +1,6 @@
-"""Wrong sensor data and bad controllers on simulated arms with real sensors: what the guard and the arm do.
+"""Response of guard and arm to wrong sensor data and faulty controllers, on simulated arms with real sensors.
 
-`benchmarks/sensor_faults.py` has the table over all faults and joints.
+`benchmarks/sensor_faults.py` computes the table of all faults and joints.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ ELBOW, SHOULDER, ROLL = 2, 1, 6
 
 @pytest.fixture(scope="module")
 def moving_arm():
-    """A factory of MTMs that move under effort commands."""
+    """Returns a factory of MTMs that move under effort commands."""
     return lambda **arguments: FaultyArm("mtml", "effort", **arguments)
 
 
@@ -45,7 +45,7 @@ def test_a_jump_while_holding_is_a_fault(name):
 
 
 def test_efforts_do_not_start_with_zero_effort_sensor():
-    """The arm would drop: efforts begin at the measured one, and here a joint bears a quarter of its limit."""
+    """The arm would fall: efforts start at the measured ones, and gravity needs a quarter of a joint's limit."""
     poses = load_arm("mtml").sample_poses(200, np.random.default_rng(0), margin=0.1)
     model = IdentifiedModel.from_arm(load_arm("mtml"))
     loads = np.abs(model.holding_torque(poses)[:, :3]) / load_arm("mtml").effort_limits[:3]
@@ -63,7 +63,7 @@ def test_efforts_do_not_start_with_zero_effort_sensor():
 
 
 def run_until_fault(arm, seconds):
-    """Time from the first effort to the fault [s]."""
+    """Returns the time from the first effort to the fault [s]."""
     acted = None
     for _ in range(round(seconds / PERIOD)):
         arm.step()
@@ -75,7 +75,7 @@ def run_until_fault(arm, seconds):
 
 
 def test_controller_without_damping_is_stopped():
-    """The wrist roll with kd = 0 and ten times ki, which swings ever wider."""
+    """The wrist roll with kd = 0 and ten times ki is unstable."""
     arm = FaultyArm("mtml", "effort", effects=False)
     gains = arm.arm.gains
     kd, ki = list(gains.kd), list(gains.ki)
@@ -90,7 +90,7 @@ def test_controller_without_damping_is_stopped():
 
 @pytest.mark.parametrize("frequency", [3.0, 25.0])
 def test_efforts_jumping_between_limits_are_stopped(frequency):
-    """Commands between -1 and 1 of a limit, around the gravity effort, from a controller that is out of its mind."""
+    """A faulty controller commands efforts between both limits, around the gravity effort."""
     arm = FaultyArm("mtml", "gravity")
     answer = arm.controller.answer
 

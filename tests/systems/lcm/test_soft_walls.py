@@ -1,4 +1,4 @@
-"""The guard's soft walls on simulated arms without stops: no command gets a joint beyond its limit."""
+"""Soft walls of the guard on simulated arms without stops: no command moves a joint beyond its limit."""
 
 import numpy as np
 import pytest
@@ -13,11 +13,11 @@ from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_feedforward_velocity_keeps_joints_inside_limits(name):
-    """Positions that stand just inside the limits, with velocities that lead outward; no stop of the plant helps."""
+    """Constant positions just inside the limits with outward velocities. The plant has no stops."""
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
     A, lower, upper = arm.arm.limit_matrix()
-    outward = np.where(np.arange(7) == 2, -1.0, 1.0)  # shoulder and elbow apart, for the coupled limit's sake
+    outward = np.where(np.arange(7) == 2, -1.0, 1.0)  # shoulder and elbow in opposite directions, for the coupled limit
     goal = np.where(outward > 0, arm.arm.position_upper - 1e-3, arm.arm.position_lower + 1e-3)
     sender = Sending(lcm, arm.arm, desired_state=np.concatenate([POSES[name], np.zeros(7)]))
     run(lcm, 60, arm, sender)
@@ -46,7 +46,7 @@ def test_effort_plus_gravity_compensation_stays_limited():
 
 
 def pushed(name, push, seconds):
-    """Furthest way beyond any limit [guard's margins], under efforts that ramp to `push` in 0.2 s; last status."""
+    """Returns the largest excess of a limit [guard's margins] under efforts that ramp to `push` in 0.2 s; last status."""
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
     A, lower, upper = arm.arm.limit_matrix()
@@ -65,7 +65,7 @@ def pushed(name, push, seconds):
 @pytest.mark.parametrize(("name", "row"), [("mtml", k) for k in range(8)] + [("psm", k) for k in range(7)])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_full_motor_effort_keeps_joints_inside_limits(name, row, side):
-    # Neither friction nor damping nor a stop of the plant helps: the soft wall does it alone.
+    # The plant has no friction, damping or stops. Only the soft wall acts.
     arm = load_arm(name)
     push = side * np.sign(arm.limit_matrix()[0][row]) * arm.effort_limits
     worst, status = pushed(name, push, 0.6)
@@ -75,7 +75,7 @@ def test_full_motor_effort_keeps_joints_inside_limits(name, row, side):
 
 @pytest.mark.parametrize(("name", "joint"), [("mtml", 3), ("mtml", 5), ("mtml", 6), ("psm", 3), ("psm", 4), ("psm", 6)])
 def test_wrist_on_soft_wall_comes_to_rest(name, joint):
-    """The light joints, on which a wall that is too stiff for a period of delay makes the motors hammer."""
+    """On light joints, a wall that is too stiff for one period of delay makes the motors chatter."""
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
     held = IdentifiedModel.from_arm(arm.arm).holding_torque(POSES[name])
