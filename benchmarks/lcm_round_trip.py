@@ -2,9 +2,9 @@
 
     python benchmarks/lcm_round_trip.py [--seconds 60]
 
-The time is taken from when a status goes out to when the command that answers it is heard, in the process of the arm.
+The time is taken from when a status goes out to when the command that answers it is received, in the process of the arm.
 That is one of two: "standing", a bridge that sends the messages of a driver at 1 kHz and has no physics in its loop: it
-shows what the controller needs; and "simulated", `dvrk-drake arm`, which hears an answer when it has computed its next
+shows what the controller needs; and "simulated", `dvrk-drake arm`, which receives an answer when it has computed its next
 state, in which the answer then acts.
 
 Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo that decodes a status and encodes a
@@ -55,7 +55,7 @@ RUN = ["-m", "dvrk_drake.cli", "run", "--arm", ARM.name.lower(), "--mode", "hold
 
 
 class Times:
-    """When each status went out and the first command that answers it was heard [s]."""
+    """When each status went out and the first command that answers it was received [s]."""
 
     def __init__(self) -> None:
         self.out: list[float] = []
@@ -65,7 +65,7 @@ class Times:
         """To be called before publishing: after it is too late, a woken peer may come first on this core."""
         self.out.append(time.monotonic())
 
-    def heard(self, data: bytes, first: int) -> lcmt_dvrk_command:
+    def received(self, data: bytes, first: int) -> lcmt_dvrk_command:
         """A command, which counts if it answers the last status; `first` is the sequence number of the first one."""
         now, command = time.monotonic(), lcmt_dvrk_command.decode(data)
         if command.sequence == first + len(self.out) - 1:
@@ -73,7 +73,7 @@ class Times:
         return command
 
     def trips(self, begin: int) -> np.ndarray:
-        """Round trips [s] of the statuses from `begin` on, NaN where no command was heard."""
+        """Round trips [s] of the statuses from `begin` on, NaN where no command was received."""
         # The last one may still be on its way.
         return np.array([self.back.get(k, np.nan) - out for k, out in enumerate(self.out)][begin:-1])
 
@@ -116,7 +116,7 @@ class StandingArm:
 
     def hear(self, channel: str, data: bytes) -> None:
         """Takes a command, and makes its sender the one that acts."""
-        command = self.times.heard(data, first=0)
+        command = self.times.received(data, first=0)
         self.sender_id = command.sender_id
         self.status.command_sender_id, self.status.command_sequence = command.sender_id, command.sequence
         self.status.command_utime, self.status.guard_state = command.utime, lcmt_dvrk_status.STATE_EFFORT
@@ -136,7 +136,7 @@ class TimedSimulatedArm(SimulatedArm):
 
     def hear(self, channel: str, data: bytes) -> None:
         """As the arm does, noting when."""
-        self.times.heard(data, first=1)
+        self.times.received(data, first=1)
         super().hear(channel, data)
 
     def send(self, network: lcm.LCM) -> None:
@@ -207,7 +207,7 @@ def measure(peer: list[str], simulated: bool, condition: str, seconds: float, re
 
 
 def be_the_arm(peer: list[str], simulated: bool, condition: str, seconds: float, realtime: bool) -> np.ndarray:
-    """Round trips [s] of `peer` for so long, from 2 s after its commands act, NaN where none was heard in time."""
+    """Round trips [s] of `peer` for so long, from 2 s after its commands act, NaN where none was received in time."""
     arm = TimedSimulatedArm() if simulated else StandingArm()
     settle_memory()
     load: list[list[str]] = []

@@ -1,4 +1,4 @@
-"""Every script of examples/ runs, writes only where it is told to, and names no page that is gone."""
+"""Every script of examples/ runs, writes only to given paths, and names no page that is gone."""
 
 import os
 import pty

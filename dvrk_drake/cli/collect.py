@@ -124,7 +124,7 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
         controller, link, _ = ready_controller(controlled, "gravity")
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
-    teacher = Teacher(controller, poses, at_rest=at_rest, told=EnterKey(sys.stdin), report=_reporter(line))
+    teacher = Teacher(controller, poses, at_rest=at_rest, requested=EnterKey(sys.stdin), report=_reporter(line))
     when = "Enter, or a second's rest, takes" if at_rest else "Enter takes"
     print(f"the weight of {controller.arm.name} is carried: move it by hand; {when} a pose, Ctrl-C ends", flush=True)
     try:

@@ -73,7 +73,7 @@ def identify(
         read = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
         print_notes(recording, read.notes)
         result = dvrk.identify(read, recorded_arm, method=method, low_speed_segments=low_speed_segments, progress=steps)
-    # Before anything is printed: whoever reads the output may close it (head).
+    # Before anything is printed: the reader of the output may close it (head).
     result.save(output, overwrite=True)
     if folder is not None:
         from dvrk_drake.reports.figures.identification import plot_identification
@@ -136,7 +136,7 @@ def validate(
                 saved = loaded.validation.recording
                 raise ModelError(f"{model}: has verdicts from {saved} already; replace them with --overwrite")
         validation = dvrk.validate(loaded, read, low_speed_segments=low_speed_segments, progress=steps)
-    # Before anything is printed: whoever reads the output may close it (head).
+    # Before anything is printed: the reader of the output may close it (head).
     if save:
         validation.save(model, overwrite=True)
     if json is not None:

@@ -42,7 +42,7 @@ def check(
     with Steps("reading", "checking the recording") as steps:
         checked = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
         report = dvrk.check(checked, recorded_arm, progress=steps)
-    # Before anything is printed: whoever reads the output may close it (head).
+    # Before anything is printed: the reader of the output may close it (head).
     if json is not None:
         write_json(json, report.as_dict())
     options = arm if coordinates == "joint" else f"{arm} --coordinates {coordinates}"

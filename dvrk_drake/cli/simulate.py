@@ -194,7 +194,7 @@ def transparency(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Simulate what an operator feels at the handle of an arm.
+    """Simulate the interaction force between an operator and the handle of an arm.
 
     Args:
         path: Recording of the motion to follow. Without it: through random poses.

@@ -161,10 +161,10 @@ def paper_arm(recording: Recording, folder: Path) -> GroundTruth:
     effects = dataclasses.replace(arm.effects, cables=laws, springs=[])
     ground_truth_arm = with_links(arm, model_bodies(model).links, folder / "true_mtm.sdf", "the paper's recording")
     origin = (
-        "The true arm is the paper's MTM as our identification sees it in the paper's 72 poses (gravity, cables, "
+        "The ground-truth arm is the paper's MTM as our identification sees it in the paper's 72 poses (gravity, cables, "
         "springs), with the friction, stops, encoders, motors and delays of `mechanisms/mtm.yaml`, which are "
         "another MTM's. Joint 6 shows no torque in that recording beyond friction, and joint 7 a constant one, "
-        "which is what its friction leaves, larger towards one side: there the true arm has less to compensate than "
+        "which is what its friction leaves, larger towards one side: there the ground-truth arm has less to compensate than "
         "the real one seems to have had."
     )
     return GroundTruth(dataclasses.replace(ground_truth_arm, effects=effects), model, True, origin)
@@ -190,7 +190,7 @@ def perturbed_ground_truth(name: str, folder: Path, seed: int) -> GroundTruth:
     laws = [*ground_truth_arm.effects.cables, *ground_truth_arm.effects.springs]
     model = dataclasses.replace(IdentifiedModel.from_arm(ground_truth_arm, laws), arm=arm)
     origin = (
-        f"The true arm is the SDF's with links that are each up to {100 * SPREAD:.0f} % heavier or lighter (drawn with "
+        f"The ground-truth arm is the SDF's with links that are each up to {100 * SPREAD:.0f} % heavier or lighter (drawn with "
         f"seed {seed}), and the effects of `mechanisms/`: friction, cables, encoders, motors, delays."
     )
     return GroundTruth(ground_truth_arm, model, False, origin)

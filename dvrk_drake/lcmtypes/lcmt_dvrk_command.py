@@ -54,7 +54,7 @@ class lcmt_dvrk_command(object):
 
         self.sender_id = 0
         """
-        not 0; random, drawn when the sender starts: two senders are told apart by it
+        not 0; random, drawn when the sender starts: identifies the sender
         LCM Type: int64_t
         """
 
@@ -66,7 +66,7 @@ class lcmt_dvrk_command(object):
 
         self.status_utime = 0
         """
-        utime of the status that this answers: by it the arm knows, on its own clock, how old the measurement is that this
+        utime of the status that this answers: gives the arm, on its own clock, the age of the measurement is that this
         was computed from
         LCM Type: int64_t
         """

@@ -43,7 +43,7 @@ class lcmt_dvrk_status(object):
     FAULT_CLOCK = 4
     """ the arm's own clock went backwards or stood still """
     FAULT_DRIVER = 5
-    """ for bridges: whatever the arm itself reports, told in fault_text """
+    """ for bridges: fault of the arm itself, described in fault_text """
     FAULT_FOLLOWING = 6
     """ a joint was too far from where position commands led it: something is in its way """
     FAULT_IMPLAUSIBLE = 7
@@ -183,7 +183,7 @@ class lcmt_dvrk_status(object):
 
         self.command_sequence = 0
         """
-        sequence of the last accepted command, whoever sent it
+        sequence of the last accepted command of any sender
         LCM Type: int64_t
         """
 
@@ -268,7 +268,7 @@ class lcmt_dvrk_status(object):
 
         self.effort_commanded = []
         """
-        what the motors were told, after all limits [N m, N]
+        effort commanded to the motors, after all limits [N m, N]
         LCM Type: double[num_joints]
         """
 

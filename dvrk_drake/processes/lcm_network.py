@@ -27,15 +27,15 @@ def open_lcm(url: str = "") -> DrakeLcm:
     name = network.get_lcm_url()
     try:
         own = lcm.LCM(name)
-        channel, heard = f"DVRK_SELF_TEST_{secrets.token_hex(8)}", []
-        own.subscribe(channel, lambda channel, data: heard.append(data))
+        channel, received = f"DVRK_SELF_TEST_{secrets.token_hex(8)}", []
+        own.subscribe(channel, lambda channel, data: received.append(data))
         end = time.monotonic() + _OWN_MESSAGES
-        while not heard and time.monotonic() < end:
+        while not received and time.monotonic() < end:
             own.publish(channel, b"")
             handle_message(own, _NEXT_MESSAGE)
     except (RuntimeError, OSError) as error:
         raise DvrkDrakeError(f'LCM network "{name}" cannot be used: {error}; e.g. udpm://239.255.76.67:7667') from error
-    if not heard:
+    if not received:
         raise DvrkDrakeError(
             f'LCM network "{name}" carries no message: is there a route for its multicast address? On one machine: '
             "ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo"

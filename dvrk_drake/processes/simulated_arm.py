@@ -152,7 +152,7 @@ class SimulatedArm:
         self.step()
         self.step()
         pace = Pace(self.driver.status_period, sleep=lambda seconds: listen(network, seconds))
-        told = ""
+        described = ""
         while not stopped():
             pace.wait()
             for _ in range(_MESSAGES_A_STEP):
@@ -160,9 +160,9 @@ class SimulatedArm:
                     break
             self.send(network)
             self.step()
-            if (state := self._describe()) != told:
+            if (state := self._describe()) != described:
                 tell(f"{self._simulator.get_context().get_time():9.3f} s  {state}")
-                told = state
+                described = state
         return pace
 
     def _keep_status(self, data: bytes) -> None:

@@ -93,7 +93,7 @@ class Teacher:
         path: str | Path,
         *,
         at_rest: bool,
-        told: Callable[[], bool],
+        requested: Callable[[], bool],
         report: Callable[[str], None],
         writer: Executor | None = None,
     ) -> None:
@@ -103,7 +103,7 @@ class Teacher:
             controller: Controller in "gravity" mode.
             path: Path of the file, which is created or extended. It is complete at any time.
             at_rest: Records each pose at which the arm rests for a second.
-            told: Function that returns whether to record the present pose. It is called once per status.
+            requested: Function that returns whether to record the present pose. It is called once per status.
             report: Function that is called with one line per pose.
             writer: Executor that writes the file. Defaults to a separate thread.
 
@@ -112,7 +112,7 @@ class Teacher:
         """
         self.poses = load_poses_if_any(path, controller.arm)
         self._controller, self._path, self._at_rest = controller, path, at_rest
-        self._identifiability, self._report = told, report
+        self._requested, self._report = requested, report
         self._detector = RestDetector(controller.arm.per_joint(*_REST), _REST_TIME)
         # Writing to disk may take longer than the arm waits for a command.
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
@@ -126,7 +126,7 @@ class Teacher:
         """
         q = np.array(status.position)
         rests = self._detector.rests(time, q)
-        told = self._identifiability()
+        requested = self._requested()
         if self._writing is not None:
             if not self._writing.done():
                 return
@@ -137,7 +137,7 @@ class Teacher:
             return
         arm = self._controller.arm
         known = same_pose(self.poses, q, arm)
-        if told:
+        if requested:
             if reason := self._refusal(arm, q, known):
                 self._report(f"not taken: {reason}")
                 return

@@ -271,7 +271,7 @@ def test_an_existing_output_is_replaced_on_request(tmp_path, capsys):
 
 
 def test_all_commands_take_an_arm_file(folder, tmp_path, capsys):
-    """A calibrated coupled limit in a file; the model remembers the file."""
+    """A calibrated coupled limit in a file; the model stores its path."""
     text = (MODELS_FOLDER / "arms/mtmr.yaml").read_text().replace("name: MTMR", "name: OURS")
     arm_file = tmp_path / "ours.yaml"
     arm_file.write_text(text + "coupled_limits:\n  parallelogram: [-0.22, 0.5]\n")

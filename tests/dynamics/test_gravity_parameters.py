@@ -48,11 +48,11 @@ def ur_like(tmp_path_factory):
     return load_arm(folder / "arm.yaml")
 
 
-@pytest.fixture(scope="module", params=["mtmr", "psm", "mtmr leaning", "ur"])
+@pytest.fixture(scope="module", params=["mtmr", "psm", "mtmr tilted", "ur"])
 def arm(request, ur_like):
-    name, _, leaning = request.param.partition(" ")
+    name, _, tilted = request.param.partition(" ")
     arm = ur_like if name == "ur" else load_arm(name)
-    return arm.with_gravity([0.1, -0.5, -9.79]) if leaning else arm
+    return arm.with_gravity([0.1, -0.5, -9.79]) if tilted else arm
 
 
 def test_base_parameters_are_those_of_the_symbolic_derivation(arm):

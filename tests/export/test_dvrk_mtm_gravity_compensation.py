@@ -29,8 +29,8 @@ from dvrk_drake.reports.figures.export import plot_compensation
 
 pytestmark = pytest.mark.slow
 
-#: Gravity [m/s^2] of an arm whose base leans by 2.3 degrees.
-LEANING = [0.01, -0.39, -9.80]
+#: Gravity [m/s^2] of an arm whose base is tilted by 2.3 degrees.
+TILTED = [0.01, -0.39, -9.80]
 
 
 def dvrk_controller(path, q, qd):
@@ -204,7 +204,7 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
         compensation_from_model(spring)
     # A quartic over +-2.44 rad misses 0.05 sin(q) by a few hundredths of it, not more.
     compensation_from_model(spring, CompensationOptions(tolerance=0.05 * 0.08))
-    for change in ({"feedforward_scale": 0.5}, {"gravity": LEANING}):
+    for change in ({"feedforward_scale": 0.5}, {"gravity": TILTED}):
         model = balanced()
         if "feedforward_scale" in change:
             model.joints[4].feedforward_scale = change["feedforward_scale"]
@@ -232,7 +232,7 @@ def test_a_tolerance_that_is_no_number_accepts_nothing(arm, option, tolerance, t
 
 def test_a_leaning_base_is_refused_by_default_and_held_as_well_as_the_file_can(tmp_path, capsys):
     model = balanced()
-    model.arm = model.arm.with_gravity(LEANING)
+    model.arm = model.arm.with_gravity(TILTED)
     model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
     given, out = tmp_path / "model.yaml", tmp_path / "gc.json"
     model.save(given)
@@ -249,7 +249,7 @@ def test_a_leaning_base_is_refused_by_default_and_held_as_well_as_the_file_can(t
     stated = largest_differences(GravityCompensationFile.load(out), model)
     assert np.all(off <= 1.1 * stated + 1e-9) and off.max() < 1.1 * float(tolerance)
     assert all(f"{x:.1e}" in printed for x in stated)
-    # Without a polynomial the outer yaw, which an upright arm leaves alone, would be off by all that leaning adds.
+    # Without a polynomial the outer yaw, which an upright arm leaves alone, would be off by all that the tilt adds.
     assert stated[0] < 0.6 * np.abs(model.holding_torque(q)[:, 0]).max()
 
 

@@ -83,7 +83,7 @@ def test_the_written_arm_moves_by_the_parameters_it_was_given(name, tmp_path):
 
 
 def parse(path):
-    """A plant and scene graph of one model file, by a parser that knows no packages and lets nothing pass."""
+    """A plant and scene graph of one model file, by a parser without packages and lets nothing pass."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
     plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)

@@ -152,15 +152,15 @@ def test_an_arm_that_tells_nothing_new():
         first_status(link)
 
 
-@pytest.mark.parametrize(("measured", "told", "refused"), [(1, 1, False), (5, 5, False), (10, 10, True), (10, 1, True)])
-def test_an_arm_that_is_measured_too_seldom_is_refused_however_often_it_is_told(measured, told, refused):
+@pytest.mark.parametrize(("measured", "reported", "refused"), [(1, 1, False), (5, 5, False), (10, 10, True), (10, 1, True)])
+def test_an_arm_that_is_measured_too_seldom_is_refused(measured, reported, refused):
     """A dVRK's 100 Hz, at which the pose hold of `run --mode hold` swings by 0.9 rad; its bridge may tell at 1 kHz."""
     link, count = GuardedArm(), itertools.count()
     good = link.next_status(1.0)
 
     def next_status(seconds):
-        status, milliseconds = Status.decode(good.encode()), told * next(count)
-        status.sequence = good.sequence + milliseconds // told
+        status, milliseconds = Status.decode(good.encode()), reported * next(count)
+        status.sequence = good.sequence + milliseconds // reported
         status.utime = good.utime + 1000 * (milliseconds - milliseconds % measured)
         return status
 
@@ -169,7 +169,7 @@ def test_an_arm_that_is_measured_too_seldom_is_refused_however_often_it_is_told(
         with pytest.raises(ControllerError, match="MTML is measured at 100 Hz; control needs 200 Hz"):
             first_status(link)
     else:
-        assert first_status(link)[1] == pytest.approx(1e-3 * told)
+        assert first_status(link)[1] == pytest.approx(1e-3 * reported)
 
 
 @pytest.mark.parametrize("name", ["position", "velocity", "effort_measured"])
@@ -193,11 +193,11 @@ def test_the_release_of_an_arm_that_faults_does_not_wait(controller):
 
 
 def test_control_acts_tells_how_it_goes_and_releases(controller):
-    link, told = GuardedArm(), []
+    link, reports = GuardedArm(), []
     end = link.now() + 1.5
-    control(link, controller, lambda: link.now() > end, told.append)
-    assert {status.state for status in told} >= {"starting", "effort"}
-    assert "round trip" in str(told[-1]) and not told[-1].problem
+    control(link, controller, lambda: link.now() > end, reports.append)
+    assert {status.state for status in reports} >= {"starting", "effort"}
+    assert "round trip" in str(reports[-1]) and not reports[-1].problem
     assert link.guard.state == Status.STATE_HOLD and link.commands[-1].control_mode == Command.HOLD
 
 

@@ -53,7 +53,7 @@ class Loop:
             self.arm.hear("", self.controller.answer(self.status, self.time, desired).encode())
 
     def stall_of_the_bridge(self, seconds):
-        """Its motors do what they were told last."""
+        """Its motors do what was commanded last."""
         self.wait(seconds)
         self.arm.stall(seconds)
 

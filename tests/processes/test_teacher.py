@@ -20,10 +20,10 @@ class Hand:
         self.controller = SimpleNamespace(arm=load_arm("mtml"), ramped=True)
         self.lines, self.enter, self.time = [], False, 0.0
         self.teacher = Teacher(
-            self.controller, path, at_rest=at_rest, told=self.told, report=self.lines.append, writer=Disk()
+            self.controller, path, at_rest=at_rest, requested=self.requested, report=self.lines.append, writer=Disk()
         )
 
-    def told(self):
+    def requested(self):
         enter, self.enter = self.enter, False
         return enter
 

@@ -20,7 +20,7 @@ class Observer:
     running: ClassVar[set] = set()
 
     def __init__(self, name, url=NETWORK_URL):
-        self.heard, self.times = [], []
+        self.received, self.times = [], []
         self.listens, self.ended = threading.Event(), threading.Event()
         self.thread = threading.Thread(target=self.listen, args=(name, url), daemon=True)
         self.thread.start()
@@ -46,23 +46,23 @@ class Observer:
 
     def hear(self, channel, data):
         self.times.append(time.monotonic())
-        self.heard.append(Status.decode(data))
+        self.received.append(Status.decode(data))
 
     @property
     def last(self):
-        return self.heard[-1]
+        return self.received[-1]
 
     def until(self, condition, what, since=None, process=None):
         """Returns the index of the first status that meets the condition, from now on or since an index.
 
         `process` is the process that is expected to fulfil the condition.
         """
-        seen = len(self.heard) if since is None else since
+        seen = len(self.received) if since is None else since
 
         def met():
             nonlocal seen
-            while seen < len(self.heard):
-                if condition(self.heard[seen]):
+            while seen < len(self.received):
+                if condition(self.received[seen]):
                     return True
                 seen += 1
             return False
@@ -70,14 +70,14 @@ class Observer:
         try:
             wait_until(met, what, process)
         except AssertionError as error:
-            last = self.last if self.heard else Status()
+            last = self.last if self.received else Status()
             raise AssertionError(f"{error}; state {last.guard_state}, refusal {last.refusal_code}") from None
         return seen
 
     def during(self, seconds):
         """Returns the statuses of the next `seconds` of the arm's clock."""
-        first, end = len(self.heard), self.last.utime + 1e6 * seconds
-        return self.heard[first : 1 + self.until(lambda status: status.utime >= end, f"{seconds} s of the arm's clock")]
+        first, end = len(self.received), self.last.utime + 1e6 * seconds
+        return self.received[first : 1 + self.until(lambda status: status.utime >= end, f"{seconds} s of the arm's clock")]
 
 
 def check_clock(statuses):

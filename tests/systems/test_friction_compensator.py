@@ -44,7 +44,7 @@ def holding_friction(friction):
 
 
 def motion(seed, steps=6000, period=1e-3):
-    """A hand's rambling: q and v (steps, 7), with stretches of fine trembling, where presliding matters most."""
+    """Random motion of a hand: q and v (steps, 7), with stretches of fine trembling, where presliding matters most."""
     generator = np.random.default_rng(seed)
     t = period * np.arange(steps)
     q, v = np.zeros((steps, 7)), np.zeros((steps, 7))

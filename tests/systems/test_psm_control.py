@@ -96,7 +96,7 @@ def test_step_of_each_joint_settles_within_a_second(gravity_factor, poses):
 
 
 def test_step_settles_with_three_times_the_inertia():
-    """A real arm has up to twice the inertia of the SDF; here three times, and the gravity model knows it to 20 %."""
+    """A real arm has up to twice the inertia of the SDF; here three times, and the gravity model has an error of 20 %."""
     bench = Bench(gravity_factor=0.8 * 3, inertia_factor=3)
     # Its weight is beyond the effort limits in some of the box: poses where the motors have something left.
     poses = ARM.sample_poses(200, np.random.default_rng(5), margin=0.1)

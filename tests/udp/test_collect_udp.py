@@ -20,7 +20,7 @@ from dvrk_drake.recordings.recording import read_recording
 
 #: As few as identification takes.
 POSES = 8
-#: So long the arm remembers a sender that is silent, the expiry and a little [s]; another one would be a second sender.
+#: Time until the arm releases a silent sender: the expiry and a margin [s]; earlier, another one is refused.
 FORGOTTEN = 0.6
 
 
@@ -81,7 +81,7 @@ def test_collect_kill_resume_identify_and_release(observer, tmp_path):
     process = dvrk_drake("run", "--arm", "mtml", "--model", model, "--mode", "gravity", "--realtime")
     begun = observer.until(takes_efforts, "run", process=process)
     observer.during(3.0)
-    released = np.array([status.position for status in observer.heard[begun:]])
+    released = np.array([status.position for status in observer.received[begun:]])
     said = process.end(signal.SIGINT)
     assert process.wait() == 0, said
     drift = np.abs(released - released[0]).max(axis=0)

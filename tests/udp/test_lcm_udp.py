@@ -31,7 +31,7 @@ from dvrk_drake.systems.lcm.dvrk_command import draw_id
 OTHER_URL = "udpm://239.255.76.67:7668?ttl=0"
 #: Of tests that publish garbage, which observers do not read.
 THIRD_URL = "udpm://239.255.76.67:7669?ttl=0"
-#: Options of a patient arm, and its expiry [s] and a little: so long it remembers a sender that is silent.
+#: Options of a patient arm, and its expiry [s] and a little: time until it releases a silent sender.
 PATIENT, FORGOTTEN = ("--driver", PATIENT_DRIVER), 0.6
 #: Speed at which logs are played: the network loses nothing when a busy computer delays the player.
 SLOWLY = 0.2
@@ -65,7 +65,7 @@ def end_observers():
 
 @pytest.fixture
 def arm(running_arm):
-    """A running arm that holds and remembers no sender: its name, its process, what it says."""
+    """A running arm that holds and has no sender: its name, its process, its output."""
     name, process, observer = running_arm
     observer.during(FORGOTTEN)
     if observer.last.guard_state != Status.STATE_HOLD:  # a test before failed
@@ -96,7 +96,7 @@ def reset(name, observer):
     network = lcm.LCM()
 
     def is_cleared():
-        observer.during(FORGOTTEN)  # whoever commanded before is silent by then
+        observer.during(FORGOTTEN)  # earlier senders have expired by then
         sender_id = draw_id()
         for k, asks in enumerate((False, False, True)):
             send(network, observer.last, k, sender_id, reset_fault=asks)
@@ -116,12 +116,12 @@ def test_command_and_status_round_trip(arm):
         last = observer.until(lambda status: status.num_accepted > before + 2000, "2000 commands")
     finally:
         controller.end()
-    heard = observer.heard[first : last + 1]
-    check_clock(heard)
-    assert all(map(holds, heard))
-    assert heard[-1].num_refused == heard[0].num_refused
-    assert heard[-1].command_sequence > 2000
-    assert drift(*heard) < 1e-4
+    received = observer.received[first : last + 1]
+    check_clock(received)
+    assert all(map(holds, received))
+    assert received[-1].num_refused == received[0].num_refused
+    assert received[-1].command_sequence > 2000
+    assert drift(*received) < 1e-4
 
 
 @inside
@@ -140,15 +140,15 @@ def test_arm_holds_after_controller_is_killed(name, tmp_path):
         wait_until(lambda: all(map(takes_efforts, observer.during(1.0))), "a second of efforts", controller)
         realtime = not make_realtime()  # this thread too: it shares Python's lock with the observer's
         controller.send_signal(signal.SIGKILL)
-        first = len(observer.heard)
+        first = len(observer.received)
         held = observer.until(holds, "hold")
-        last_command = max(k for k in range(held) if observer.heard[k].num_accepted < observer.heard[held].num_accepted)
-        worst = drift(*observer.heard[first:], *observer.during(2.0))
+        last_command = max(k for k in range(held) if observer.received[k].num_accepted < observer.received[held].num_accepted)
+        worst = drift(*observer.received[first:], *observer.during(2.0))
     finally:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # processes started later would inherit it
         print(controller.end(), arm.end(signal.SIGINT))
     assert arm.wait() == 0
-    by_its_clock = 1e-6 * (observer.heard[held].utime - observer.heard[last_command].utime)
+    by_its_clock = 1e-6 * (observer.received[held].utime - observer.received[last_command].utime)
     by_the_wall = observer.times[held] - observer.times[last_command]
     print(f"{name}: hold {1e3 * by_its_clock:.1f} ms after the last command, {1e3 * by_the_wall:.1f} ms by the wall")
     print(f"{name}: drift {1e3 * worst:.3g} mrad or mm; real-time scheduling: {realtime}")
@@ -194,14 +194,14 @@ def test_arm_holds_after_stall_until_operator_resumes(stalled, seconds):
             held,
             controller,
         )
-        after = observer.heard[held:]
+        after = observer.received[held:]
     finally:
         said = controller.end(), arm.end(signal.SIGINT)
         print(*said)
     assert arm.wait() == 0
     assert all(map(waits_for_an_operator, after))
     assert f"hold: {after[0].fault_text}" in said[1]
-    farthest = drift(*observer.heard[begun:])
+    farthest = drift(*observer.received[begun:])
     print(f"{stalled} stopped for {seconds} s: {after[0].fault_text}; the arm moves {farthest:.2g} rad or m")
     assert farthest < 1e-3
 
@@ -225,7 +225,7 @@ def test_run_ends_after_stall_and_operator_restarts(stalled):
             (line,) = lines
             assert line.startswith("dvrk-drake: error: MTML took over and holds: ")
             assert line.endswith("Look at the arm, then start again with --reset")
-        assert all(map(waits_for_an_operator, observer.heard[held:]))
+        assert all(map(waits_for_an_operator, observer.received[held:]))
         runs.append(start_run("mtml", *url, "--reset"))
         observer.until(lambda status: holds(status) and not status.fault_text, "resume", held, runs[-1])
         observer.until(takes_efforts, "run", held, runs[-1])
@@ -245,7 +245,7 @@ def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     try:
         begun = observer.until(takes_efforts, "run", process=process)
         observer.during(2.0)
-        acting = observer.heard[begun:]
+        acting = observer.received[begun:]
     finally:
         said = process.end(signal.SIGINT)
     assert process.wait() == 0, said
@@ -253,8 +253,8 @@ def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     steps = np.diff([status.sequence for status in acting])[:, None]
     efforts = np.array([status.effort_commanded for status in acting])
     assert np.all(np.abs(np.diff(efforts, axis=0)) < 0.01 * steps * load_arm(name).effort_limits)
-    held = observer.heard[observer.until(holds, "hold", begun)]
-    assert held.num_expired == expired  # it was told to hold, it did not have to notice
+    held = observer.received[observer.until(holds, "hold", begun)]
+    assert held.num_expired == expired  # it was commanded to hold
     assert drift(*observer.during(0.1)) < 1e-3
     assert "holds by itself" in said
     assert "effort; " in said and " Hz, round trip " in said
@@ -314,7 +314,7 @@ def test_invalid_messages_neither_stop_nor_move_the_arm(arm):
     def unaccepted(status):
         return status.num_refused + status.num_ignored
 
-    before, first = unaccepted(observer.last), len(observer.heard)
+    before, first = unaccepted(observer.last), len(observer.received)
     for k in range(10_000):
         command.status_utime, command.sequence, command.utime = observer.last.utime, k, observer.last.utime
         data = bytearray(command.encode() if k % 2 else generator.bytes(int(generator.integers(0, 400))))
@@ -327,16 +327,16 @@ def test_invalid_messages_neither_stop_nor_move_the_arm(arm):
             wait_until(lambda k=k: k <= unaccepted(observer.last) - before + 100, "refusals", process)
     # UDP may lose a few.
     observer.until(lambda status: unaccepted(status) - before > 9_000, "refusals", first, process)
-    heard = observer.heard[first:]
-    check_clock(heard)
-    assert all(map(holds, heard))
-    assert drift(*heard) < 1e-4
+    received = observer.received[first:]
+    check_clock(received)
+    assert all(map(holds, received))
+    assert drift(*received) < 1e-4
 
 
 @inside
 def test_controller_clock_jump_leads_to_hold_and_restart(arm):
     name, _, observer = arm
-    first = len(observer.heard)
+    first = len(observer.received)
     controller = start_controller(name, "--clock-jump", {"mtml": "10", "psm": "-10"}[name])
     try:
         begun = observer.until(takes_efforts, "start of the controller", process=controller)
@@ -349,7 +349,7 @@ def test_controller_clock_jump_leads_to_hold_and_restart(arm):
         observer.during(0.2)
     finally:
         controller.end()
-    assert drift(*observer.heard[first:]) < 1e-3
+    assert drift(*observer.received[first:]) < 1e-3
 
 
 class Logged:
@@ -390,21 +390,21 @@ def test_replayed_commands_of_a_log_are_refused(arm, tmp_path):
         controller = start_controller(name)
         try:
             begun = observer.until(takes_efforts, "start of the controller", process=controller)
-            accepted = observer.heard[begun].num_accepted
+            accepted = observer.received[begun].num_accepted
             observer.until(lambda status: status.num_accepted > accepted + 500, "500 commands", process=controller)
         finally:
             controller.end()
         observer.until(holds, "hold")
-    before, first = observer.last, len(observer.heard)
+    before, first = observer.last, len(observer.received)
     assert log.count(name) > 500
     log.play()
     enough = before.num_refused + 0.9 * log.count(name)
     observer.until(lambda status: status.num_refused > enough, "refusals", first)
-    heard = observer.heard[first:]
-    assert all(map(holds, heard))
-    assert heard[-1].num_accepted == before.num_accepted
-    assert heard[-1].refusal_code == Status.REFUSAL_STALE
-    assert drift(*heard) < 1e-3
+    received = observer.received[first:]
+    assert all(map(holds, received))
+    assert received[-1].num_accepted == before.num_accepted
+    assert received[-1].refusal_code == Status.REFUSAL_STALE
+    assert drift(*received) < 1e-3
 
 
 @watchdog
@@ -418,7 +418,7 @@ def test_restarted_arm_ignores_run_and_log(tmp_path):
     try:
         with Logged(tmp_path / "commands", OTHER_URL) as log:
             begun = observer.until(takes_efforts, "run", process=run)
-            killed, accepted = observer.heard[begun].session_id, observer.heard[begun].num_accepted
+            killed, accepted = observer.received[begun].session_id, observer.received[begun].num_accepted
             observer.until(lambda status: status.num_accepted > accepted + 500, "500 commands", process=run)
             arm.end(signal.SIGKILL)
             arm = start_arm("mtml", *PATIENT, *on_other)
@@ -432,15 +432,15 @@ def test_restarted_arm_ignores_run_and_log(tmp_path):
         observer.until(lambda status: status.num_ignored > enough, "ignored commands", first)
     finally:
         print(run.end(), arm.end())
-    heard = observer.heard[first:]
-    assert all(map(holds, heard))
-    assert heard[-1].num_accepted == 0
-    assert heard[-1].ignored_code == Status.REFUSAL_WRONG_SESSION
-    assert drift(*heard) < 1e-3
+    received = observer.received[first:]
+    assert all(map(holds, received))
+    assert received[-1].num_accepted == 0
+    assert received[-1].ignored_code == Status.REFUSAL_WRONG_SESSION
+    assert drift(*received) < 1e-3
 
 
 class ScriptedArm:
-    """An arm that says what the test wants, and hears every command."""
+    """An arm that sends the statuses of the test, and receives every command."""
 
     def __init__(self, url):
         self.commands, self.lcm, self.pace = [], lcm.LCM(url), Pace(1e-3)
@@ -526,7 +526,7 @@ def test_of_two_controllers_the_first_stays_in_command(arm):
     second = None
     try:
         begun = observer.until(takes_efforts, "start of the controller", process=first)
-        sender = observer.heard[begun].command_sender_id
+        sender = observer.received[begun].command_sender_id
         second = start_controller(name)
         ignored = observer.last.num_ignored
         last = observer.until(lambda status: status.num_ignored > ignored + 500, "the second controller", begun, second)
@@ -534,10 +534,10 @@ def test_of_two_controllers_the_first_stays_in_command(arm):
         first.end()
         if second is not None:
             second.end()
-    heard = observer.heard[begun : last + 1]
-    assert {(status.guard_state, status.command_sender_id) for status in heard} == {(Status.STATE_EFFORT, sender)}
-    assert heard[-1].ignored_code == Status.REFUSAL_OTHER_SENDER
-    assert drift(*heard) < 1e-3
+    received = observer.received[begun : last + 1]
+    assert {(status.guard_state, status.command_sender_id) for status in received} == {(Status.STATE_EFFORT, sender)}
+    assert received[-1].ignored_code == Status.REFUSAL_OTHER_SENDER
+    assert drift(*received) < 1e-3
 
 
 @watchdog
@@ -569,20 +569,20 @@ def test_key_protects_from_flood_of_foreign_commands(tmp_path):
         of_arm, of_peer = observer.last.utime, ticks.value
         observer.during(2.0)
         of_arm, of_peer = (observer.last.utime - of_arm) // 1000, ticks.value - of_peer
-        heard = observer.heard[begun:]
+        received = observer.received[begun:]
     finally:
         for process in others:
             process.end()
         said = run.end(signal.SIGINT)
         said += arm.end(signal.SIGINT)
     realtime = "no real-time scheduling" not in said
-    acting = np.mean([takes_efforts(status) for status in heard])
-    flooded = heard[-1].num_ignored - heard[0].num_ignored
+    acting = np.mean([takes_efforts(status) for status in received])
+    flooded = received[-1].num_ignored - received[0].num_ignored
     print(f"{of_arm} periods of the arm, {of_peer} of the peer, {flooded} foreign messages; {realtime=}")
     print(f"efforts act in {acting:.3f} of the time")
     assert flooded > of_arm
     assert of_arm > 0.9 * of_peer or not realtime, said
     assert acting == 1.0, said
-    assert heard[-1].ignored_code == Status.REFUSAL_NOT_AUTHENTIC, said
-    assert {status.command_sender_id for status in observer.heard[first:]} <= {0, heard[0].command_sender_id}
-    assert drift(*observer.heard[first:]) < 1e-3
+    assert received[-1].ignored_code == Status.REFUSAL_NOT_AUTHENTIC, said
+    assert {status.command_sender_id for status in observer.received[first:]} <= {0, received[0].command_sender_id}
+    assert drift(*observer.received[first:]) < 1e-3

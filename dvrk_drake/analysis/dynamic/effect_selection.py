@@ -15,7 +15,7 @@ from dvrk_drake.analysis.dynamic.stepwise_selection import StepwiseSelection
 #: Alternations between estimating the base tilt and the link parameters. A third changes errors by less than 0.01 %.
 NUM_TILT_ITERATIONS = 2
 #: Adjacent folds that are held out together in `cross_validate`. Longer segments resemble another motion more closely.
-MIN_CORRELATION = 2
+NUM_HELD_OUT_FOLDS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def cross_validate(
 ) -> NDArray[np.float64]:
     """Returns the squared prediction errors (n,) of the actuators, summed over held-out phases.
 
-    Groups of `MIN_CORRELATION` adjacent folds are held out. The effects, the direction of gravity and the consistent
+    Groups of `NUM_HELD_OUT_FOLDS` adjacent folds are held out. The effects, the direction of gravity and the consistent
     parameters are estimated anew without them.
 
     Args:
@@ -81,14 +81,14 @@ def cross_validate(
         IdentificationError: The solver did not converge.
     """
     problem, tilts = choice.problem, len(choice.problem.columns.tilts)
-    firsts = range(0, choice.selection.equations.folds, MIN_CORRELATION)
+    firsts = range(0, choice.selection.equations.folds, NUM_HELD_OUT_FOLDS)
     parts = []
     for first in firsts:
         parts.append(_part(choice, first))
         progress(0.3 * len(parts) / len(firsts))
     used = np.unique(np.concatenate([chosen for chosen, _, _ in parts]))
-    leaning = problem.columns.tilts @ (problem.columns.base @ phi)
-    columns = (problem.chosen_columns(i, used, leaning) for i in range(len(problem.efforts)))
+    tilt_efforts = problem.columns.tilts @ (problem.columns.base @ phi)
+    columns = (problem.chosen_columns(i, used, tilt_efforts) for i in range(len(problem.efforts)))
     size, b = problem.rigid.shape[2] + len(used) + tilts, problem.rigid.shape[2]
     equations = NormalEquations.of(columns, size, problem.columns.tau, problem.fold, problem.edge)
     errors = np.zeros(len(problem.efforts))
@@ -99,16 +99,16 @@ def cross_validate(
         T[:b, : problem.num_rigid] = problem.columns.base
         T[b + np.searchsorted(used, chosen), problem.num_rigid + np.arange(len(chosen))] = 1.0
         T[-1 - tilts :, -1] = np.append(problem.tilt[:tilts] - tilt, 1.0)
-        learnt = equations.without_fold(first, MIN_CORRELATION).weighted(weights)
+        learnt = equations.without_fold(first, NUM_HELD_OUT_FOLDS).weighted(weights)
         y = ConsistentProgram(problem, chosen).solve(T.T @ learnt @ T)
-        errors += equations.of_fold(first, MIN_CORRELATION).squares(T @ np.append(-y, 1.0))
+        errors += equations.of_fold(first, NUM_HELD_OUT_FOLDS).squares(T @ np.append(-y, 1.0))
     return errors
 
 
 def _part(choice: EffectSelection, first: int) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
     """Returns effect indices, actuator weights and tilt, estimated without the folds from `first` on."""
     problem = choice.problem
-    selection = choice.selection.without(first, MIN_CORRELATION)
+    selection = choice.selection.without(first, NUM_HELD_OUT_FOLDS)
     found = selection.choose(choice.start, problem.candidates)
     x = selection.fit(found)
     return found[found < problem.num_effects], selection.weights, x[len(x) - len(problem.columns.tilts) :]

@@ -246,10 +246,10 @@ class DynamicEstimates:
                 base.base.names, base.base.units, values, uncertainty.standard_errors, before, strict=False
             )
         ]
-        told = {estimate.name for estimate in estimates if estimate.identifiability >= MIN_IDENTIFIABILITY}
+        identifiable = {estimate.name for estimate in estimates if estimate.identifiability >= MIN_IDENTIFIABILITY}
         pairs = uncertainty.strong_correlations()
         return estimates, [
-            CorrelatedEstimates(pair.first, pair.second, pair.correlation) for pair in pairs if pair.first in told
+            CorrelatedEstimates(pair.first, pair.second, pair.correlation) for pair in pairs if pair.first in identifiable
         ]
 
     def dry_friction(self) -> dict[str, tuple[float, float]]:

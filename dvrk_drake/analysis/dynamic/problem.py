@@ -140,12 +140,12 @@ class DynamicProblem:
         """
         base, tilts = self.columns.base, len(self.columns.tilts) if phi is not None else 0
         left = self.columns.tau - self.rigid @ (base @ self.prior)
-        leaning = self.columns.tilts[:tilts] @ (base @ (self.prior if phi is None else phi))
-        left += np.tensordot(self.tilt[:tilts], leaning, axes=(0, 0))
+        tilt_efforts = self.columns.tilts[:tilts] @ (base @ (self.prior if phi is None else phi))
+        left += np.tensordot(self.tilt[:tilts], tilt_efforts, axes=(0, 0))
         directions = base @ (self.deviation[:, None] * self._informative)
         informative = directions.shape[1]
         columns = (
-            self._own_columns(i, self.rigid[:, i] @ directions, np.arange(self.num_effects), leaning)
+            self._own_columns(i, self.rigid[:, i] @ directions, np.arange(self.num_effects), tilt_efforts)
             for i in range(len(self.efforts))
         )
         fold, edge = (self.fold, self.edge) if folds else (np.zeros_like(self.fold), None)
@@ -162,25 +162,25 @@ class DynamicProblem:
         )
 
     def _own_columns(
-        self, i: int, rigid: NDArray[np.float64], chosen: NDArray[np.int_], leaning: NDArray[np.float64]
+        self, i: int, rigid: NDArray[np.float64], chosen: NDArray[np.int_], tilt_efforts: NDArray[np.float64]
     ) -> OwnColumns:
         """Returns the columns of one actuator for the rigid body (r, k), the chosen effects and the tilts (t, r, n)."""
         moved = np.flatnonzero(np.any(rigid, axis=0))
         acting = np.flatnonzero(self.columns.rows[chosen, i])
         effects = self.columns.shapes[i][:, chosen[acting]] * self.columns.rows[chosen[acting], i]
         first = rigid.shape[1]
-        own = np.concatenate([moved, first + acting, first + len(chosen) + np.arange(len(leaning))])
-        return own, np.column_stack([rigid[:, moved], effects, *(x[:, i] for x in leaning)])
+        own = np.concatenate([moved, first + acting, first + len(chosen) + np.arange(len(tilt_efforts))])
+        return own, np.column_stack([rigid[:, moved], effects, *(x[:, i] for x in tilt_efforts)])
 
     def chosen_columns(
-        self, i: int, chosen: NDArray[np.int_], leaning: NDArray[np.float64] | None = None
+        self, i: int, chosen: NDArray[np.int_], tilt_efforts: NDArray[np.float64] | None = None
     ) -> OwnColumns:
         """Returns the columns of one actuator: rigid-body base parameters, then chosen effects, b + e in all.
 
-        With `leaning` (t, r, n), the derivatives of the efforts with respect to the tilts, t columns are appended.
+        With `tilt_efforts` (t, r, n), the derivatives of the efforts with respect to the tilts, t columns are appended.
         """
         return self._own_columns(
-            i, self.rigid[:, i], chosen, np.empty((0, *self.columns.tau.shape)) if leaning is None else leaning
+            i, self.rigid[:, i], chosen, np.empty((0, *self.columns.tau.shape)) if tilt_efforts is None else tilt_efforts
         )
 
     def to_base(self, num_effects: int) -> NDArray[np.float64]:

@@ -24,7 +24,7 @@ def plot_transparency(path: Path, arm: Arm, forces: Sequence[OperatorForces]) ->
         axes.set_ylabel(label)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
-    figure.suptitle(f"{arm.name}, simulated: what a hand feels that leads the handle")
+    figure.suptitle(f"{arm.name}, simulated: interaction force and torque at the handle")
     both[0].legend(fontsize=8, ncols=min(4, len(forces)), loc="lower right", bbox_to_anchor=(1.0, 1.0))
     both[1].set_xlabel("time [s]")
     save_figure(figure, path)

@@ -160,7 +160,7 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
     )
     remarks = (
         mtm.truth.origin,
-        f"**Ours** knows {sample_sizes.collected} poses that were collected on that arm, with its friction, noise and "
+        f"**Ours** is identified from {sample_sizes.collected} poses that were collected on that arm, with its friction, noise and "
         "encoders, each approached from both sides; `identify` made a model of them, which alone carries the arm. "
         f"**The paper's** is {_whose(session)}. Each release starts at rest at a random pose anywhere inside the "
         f"limits, its friction unloaded, and is watched for {sample_sizes.duration:g} s.",
@@ -205,8 +205,8 @@ def reproduce_figure_6(session: ReproductionSession) -> Section:
         f"{share(paper.num_held, len(few))} of the poses, with ours at {share(ours.num_held, len(few))}. Zeroing "
         "hides wrong torques and adds no right ones: joint 5 still falls where the spring and the weight that it "
         "should balance exceed its friction.",
-        "What differs: of the weight of joints 6 and 7 the true arm has only what the recording of 72 poses shows, "
-        "which is about what their friction holds, so they drift less here than the team's did. See the true arm of "
+        "What differs: of the weight of joints 6 and 7 the ground-truth arm has only what the recording of 72 poses shows, "
+        "which is about what their friction holds, so they drift less here than the team's did. See the ground-truth arm of "
         "Fig. 5.",
     )
     return Section("fig6", "Fig. 6: drift after release, joints 5-7 zeroed", remarks, (table,), figures)

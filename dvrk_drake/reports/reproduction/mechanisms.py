@@ -66,7 +66,7 @@ def reproduce_table_1() -> Section:
             f"Found from how the links of the simulated plant move at {POSES} random poses; the transforms that these "
             f"numbers give err by at most {worst:.0e}. They differ from the paper's by at most {angles:.0e} rad and "
             f"{lengths:.0e} m: it is the same arm. What differs is what the table leaves out: the parallelogram, which "
-            "carries elbow torque to the shoulder's motor and has stops in q2 + q3, and L1, which no joint feels.",
+            "carries elbow torque to the shoulder's motor and has stops in q2 + q3, and L1, which affects no joint.",
         ),
         (ResultTable("table1", "DH parameters [rad, m], theta = +-q + offset", header, tuple(rows)),),
     )

@@ -34,15 +34,15 @@ def reproduce_transparency(session: ReproductionSession) -> Section:
         tuple(_row(one) for one in forces),
     )
     remarks = (
-        "The paper wishes for it and gives no number: force and torque at the handle while a hand (a spring and damper "
-        "of a person's stiffness) leads the true arm along a path through random poses, slowly.",
+        "The paper proposes it and gives no number: force and torque at the handle while a hand (a spring and damper "
+        "of a person's stiffness) moves the ground-truth arm along a path through random poses, slowly.",
         mtm.truth.origin,
         f"The last row also takes {MAX_RATIO:g} of the friction off the hand, less where what remains must hold "
         "the arm against the error of the identified gravity (docs/friction_compensation.md).",
     )
     return Section(
         "transparency",
-        "Transparency: what the operator feels",
+        "Transparency: interaction force at the handle",
         remarks,
         (table,),
         {"transparency.png": "Force and torque of the hand over time"},

@@ -212,16 +212,16 @@ class DvrkCommandReceiver(LeafSystem):
         output.SetAtIndex(0, self.GetGuard(context).output.control_mode)
 
     def _calc_desired_state(self, context: Context, output: BasicVector) -> None:
-        told = self.GetGuard(context).output
-        output.SetFromVector(np.concatenate([told.position, told.velocity]))
+        guarded = self.GetGuard(context).output
+        output.SetFromVector(np.concatenate([guarded.position, guarded.velocity]))
 
     def _calc_effort(self, context: Context, output: BasicVector) -> None:
-        told = self.GetGuard(context).output
-        if told.control_mode == lcmt_dvrk_command.OFF:
+        guarded = self.GetGuard(context).output
+        if guarded.control_mode == lcmt_dvrk_command.OFF:
             output.SetZero()
-        elif told.control_mode == lcmt_dvrk_command.EFFORT:
+        elif guarded.control_mode == lcmt_dvrk_command.EFFORT:
             gravity = self._gravity.Eval(context) if self._gravity.HasValue(context) else 0.0
-            output.SetFromVector(np.clip(told.effort + gravity, -self._effort_limits, self._effort_limits))
+            output.SetFromVector(np.clip(guarded.effort + gravity, -self._effort_limits, self._effort_limits))
         else:
             effort = self._position_control.Eval(context)
             # The position controller has no valid effort while its measurement is lost for a few periods.

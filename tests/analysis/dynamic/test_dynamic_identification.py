@@ -102,7 +102,7 @@ def test_true_friction_is_found(case):
     _, q, v, _ = fourier_motion(arm, np.random.default_rng(2), 9.0, 9.0, RATE)
     friction, found = truth.effect_effort(q, v), result.model.dynamic_model.effect_effort(q, v)
     share = np.sqrt(np.mean((found - friction) ** 2, axis=0) / np.mean(friction**2, axis=0))
-    assert np.all(share < 0.2), "what a spring or weight could also be is told apart by the other phases only"
+    assert np.all(share < 0.2), "what a spring or weight could also be is identifiable from the other phases only"
 
 
 def test_links_are_consistent_and_energy_is_positive(case):

@@ -128,9 +128,9 @@ def test_model_with_cables_and_springs_holds_exactly():
     """With gravity compensation alone and without friction, no effort moves the arm."""
     parts = ["simulated_effects=[cables, springs]", "duration=1", "controller.mode=gravity", f"start={TWO_POSES[1]}"]
     moved = {}
-    for knows in ("[]", "[cables, springs]"):
-        path = simulate(load_scenario("mtml", [*parts, f"controller.compensated_effects={knows}"])).state_true
-        moved[knows] = np.abs(path[:, :7] - path[0, :7]).max()
+    for effects in ("[]", "[cables, springs]"):
+        path = simulate(load_scenario("mtml", [*parts, f"controller.compensated_effects={effects}"])).state_true
+        moved[effects] = np.abs(path[:, :7] - path[0, :7]).max()
     assert moved["[cables, springs]"] < 1e-3
     assert moved["[]"] > 0.05
 

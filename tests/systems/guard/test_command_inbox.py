@@ -88,7 +88,7 @@ def test_good_commands_of_any_arm_are_delivered(name, key):
 
 
 @pytest.mark.parametrize(
-    "kind", ["garbage", "other session", "other senders", "signed by somebody else", "copies of the sender's own"]
+    "kind", ["garbage", "other session", "other senders", "signed with another key", "copies of the sender's own"]
 )
 @pytest.mark.parametrize("key", [None, KEY])
 def test_flood_does_not_displace_sender_in_control(kind, key):
@@ -98,7 +98,7 @@ def test_flood_does_not_displace_sender_in_control(kind, key):
             "garbage": [bytes(300)] * FLOOD,
             "other session": [stranger(bench, session_id=5)] * FLOOD,
             "other senders": [stranger(bench, sender_id=1000 + k) for k in range(FLOOD)],
-            "signed by somebody else": [MessageKey(bytes(32)).sign(stranger(bench, sender_id=9))] * FLOOD,
+            "signed with another key": [MessageKey(bytes(32)).sign(stranger(bench, sender_id=9))] * FLOOD,
             "copies of the sender's own": bench.sent[-FLOOD:],
         }[kind]
         output = bench.round(flood, flood)

@@ -52,7 +52,7 @@ class Crtk:
     """ROS interface of an arm that does not move. It stores the last command."""
 
     def __init__(self, clock):
-        self.q, self.age, self.state, self.told = np.full(N, 0.1), 0.0, "ENABLED", []
+        self.q, self.age, self.state, self.sent = np.full(N, 0.1), 0.0, "ENABLED", []
         self.clock, self.came = clock, lambda: clock() - round(1e6 * self.age)
 
     def measured(self):
@@ -65,17 +65,17 @@ class Crtk:
         return on
 
     def servo_jf(self, effort):
-        self.told.append(("servo_jf", np.array(effort)))
+        self.sent.append(("servo_jf", np.array(effort)))
 
     def servo_jp(self, position, velocity):
-        self.told.append(("servo_jp", np.array(position)))
+        self.sent.append(("servo_jp", np.array(position)))
 
     def state_command(self, command):
-        self.told.append((command, None))
+        self.sent.append((command, None))
         self.state = "DISABLED"
 
     def hold(self):
-        self.told.append(("hold", None))
+        self.sent.append(("hold", None))
 
 
 class Scene:
@@ -132,7 +132,7 @@ class Scene:
         self.network.queue.append(command.encode())
 
     def topics(self, begin, end):
-        return {topic for topic, _ in self.crtk.told[begin:end]}
+        return {topic for topic, _ in self.crtk.sent[begin:end]}
 
 
 @pytest.mark.parametrize("message", [Command, Status])
@@ -146,8 +146,8 @@ def test_efforts_act_and_end_in_hold_without_controller():
     assert scene.topics(0, 250) == {"servo_jp"}
     assert scene.topics(260, 445) == {"servo_jf"}
     assert scene.topics(455, 500) == {"servo_jp"}
-    np.testing.assert_allclose(scene.crtk.told[400][1], HELD, atol=1e-12)
-    assert scene.crtk.told[500:] == [("hold", None)]
+    np.testing.assert_allclose(scene.crtk.sent[400][1], HELD, atol=1e-12)
+    assert scene.crtk.sent[500:] == [("hold", None)]
     assert [s.sequence for s in scene.statuses] == list(range(1, 501))
     assert {s.session_id for s in scene.statuses} == {scene.statuses[0].session_id} != {0}
     assert scene.statuses[-1].num_expired == 1
@@ -202,7 +202,7 @@ def test_arm_after_off_is_held_at_measured_pose():
     assert scene.topics(290, 300) == {"servo_jf"}
     assert scene.topics(300, 455) == {"hold"}
     assert scene.topics(457, 500) == {"servo_jp"}
-    np.testing.assert_array_equal(scene.crtk.told[470][1], scene.crtk.q)
+    np.testing.assert_array_equal(scene.crtk.sent[470][1], scene.crtk.q)
     assert scene.statuses[299].guard_state == Status.STATE_EFFORT
     assert {s.fault_text for s in scene.statuses[300:455]} == {"operating_state is DISABLED"}
     assert scene.statuses[-1].guard_state == Status.STATE_HOLD
@@ -219,7 +219,7 @@ def test_off_disables_arm_if_bridge_accepts_it():
     scene.modes = (Command.POSITION, Command.EFFORT, Command.OFF)
     scene.run()
     assert scene.topics(0, 300) == {"servo_jp"}
-    topics = [topic for topic, _ in scene.crtk.told[300:]]
+    topics = [topic for topic, _ in scene.crtk.sent[300:]]
     assert topics[0] == "disable" and set(topics[1:]) == {"hold"}
     assert scene.statuses[-1].fault_text == "operating_state is DISABLED"
 
@@ -252,7 +252,7 @@ def test_bridge_with_key_verifies_and_signs():
     scene.key = key
     scene.run()
     assert scene.topics(301, 400) == {"servo_jf"}
-    np.testing.assert_allclose(scene.crtk.told[399][1], HELD, atol=1e-12)
+    np.testing.assert_allclose(scene.crtk.sent[399][1], HELD, atol=1e-12)
     last = scene.statuses[-1]
     assert (last.num_ignored, last.ignored_code) == (100, Status.REFUSAL_NOT_AUTHENTIC)
     assert {status.mac_size for status in scene.statuses} == {16}
@@ -264,6 +264,6 @@ def test_tenth_of_the_limits_of_the_checklist():
     scene = Scene(lambda scene, k: scene.send(Command.EFFORT, effort=list(HELD if k < 300 else ARM.effort_limits)), 600)
     scene.settings = settings
     scene.run()
-    efforts = np.array([effort for topic, effort in scene.crtk.told if topic == "servo_jf"])
+    efforts = np.array([effort for topic, effort in scene.crtk.sent if topic == "servo_jf"])
     assert efforts.max(axis=0) == pytest.approx(0.1 * ARM.effort_limits)
     assert np.all(np.abs(np.diff(efforts, axis=0)) <= 0.005 * ARM.effort_limits * (1 + 1e-9))
