@@ -68,11 +68,11 @@ class JointComparison:
 
 @dataclass(frozen=True, eq=False)
 class CompensationComparison:
-    """A file and a model at the same random poses of the joint box.
+    """Comparison of a file and a model at the same random poses of the joint box.
 
     Attributes:
-        file, model: what was compared.
-        joints: one a joint.
+        file, model: File and model that are compared.
+        joints: One comparison per joint.
         q: (m, 7) poses [rad], inside the joint box and the coupled limits.
         model_torque, file_torque, clipped_torque: (m, 7) [N m] at rest; `file_torque` before the clip.
         clipped, opposed, runaway: (m, 7) True where `JointComparison` counts the pose.
@@ -115,10 +115,10 @@ class CompensationComparison:
 
 
 def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) -> CompensationComparison:
-    """Compares at random poses, uniform in the joint box and inside the coupled limits.
+    """Compares file and model at random poses, uniform in the joint box and inside the coupled limits.
 
     Raises:
-        ModelError: the model is not of an MTM, or the file is named as one of another arm of this project.
+        ModelError: The model is not of an MTM, or the name in the file is that of another arm of this project.
     """
     arm = model.arm
     if arm.joint_names != MTM_JOINTS:
