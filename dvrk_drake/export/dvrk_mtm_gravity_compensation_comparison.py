@@ -34,19 +34,19 @@ POSES = 20000
 
 @dataclass(frozen=True)
 class JointComparison:
-    """One joint over the joint box, at rest; torques in N m, shares 0..1 of the poses.
+    """Comparison of one joint over the joint box, at rest. Torques are in N m, shares of the poses are 0..1.
 
     Attributes:
-        name: of the joint.
-        model_lower, model_upper: range of the model's torque.
-        file_lower, file_upper: range of the file's torque before its clip.
-        clip_lower, clip_upper: the file's limits.
-        clipped: share of poses at which the clip is active: there the file's torque is a constant.
+        name: Name of the joint.
+        model_lower, model_upper: Range of the model's torque.
+        file_lower, file_upper: Range of the file's torque before clipping.
+        clip_lower, clip_upper: Torque limits of the file.
+        clipped: Share of poses at which the torque of the file is at a limit and therefore constant.
         opposed: share of poses at which file (clipped) and model push opposite ways, both by more than a tenth of the
             model's largest torque.
         runaway: share of poses at which the file (unclipped) lies outside the model's range widened by half of it on
             both sides: a torque that the model has nowhere on this joint. Not of the last joint, which no file has.
-        polynomial: largest |torque| of the file's polynomial in the joint's own position, constant left out.
+        polynomial: Largest |torque| of the file's polynomial in the joint position, without the constant.
         rms_inside, rms_outside: RMS of file (clipped) less model inside and outside of the sweep that the file says
             its data are from; if it does not say, all poses are outside. NaN where there are no such poses.
     """
