@@ -35,13 +35,13 @@ MTM_JOINTS = (
 
 @dataclass(frozen=True)
 class CompensationOptions:
-    """What a model does not say and the controller's file must.
+    """Entries of the controller's file that a model does not contain.
 
     Attributes:
-        coulomb: (7,) dry friction of each joint [N m], compensated by `friction_ratio` of it in motion.
-        friction_ratio: (7,) 0..1; what dVRK files in use have.
-        dead_band, saturation: (7,) [rad/s]; what dVRK files in use have.
-        tolerance: error [N m] that is accepted where the file has no place for what the model holds.
+        coulomb: Coulomb friction (7,) of each joint [N m], of which `friction_ratio` is compensated in motion.
+        friction_ratio: Compensated share (7,), 0..1. Defaults to the values of dVRK files in use.
+        dead_band, saturation: Speeds (7,) [rad/s]. Default to the values of dVRK files in use.
+        tolerance: Accepted error [N m] of the approximation of the model by the file.
     """
 
     coulomb: tuple[float, ...] = (0.0,) * NUM_JOINTS
@@ -120,16 +120,16 @@ def controller_torque(file: GravityCompensationFile, q: ArrayLike, v: ArrayLike 
 def compensation_from_model(
     model: IdentifiedModel, options: CompensationOptions | None = None
 ) -> GravityCompensationFile:
-    """The controller's file that says what the model says.
+    """Converts a model to the file of the controller.
 
-    The ten columns span the gravity of an upright MTM whose last link is balanced about its axis, so they follow from
-    the base parameters exactly; what a leaning base adds gets the best polynomials in the joints' own positions. A
-    joint's offset is its constant, the shoulder's cable the first two columns; an effect elsewhere has no exact place
-    and gets the best polynomial over the joint's range. Torque limits are the range
-    that is needed over the joint box and a tenth more, at most the arm's effort limits; joint 7 gets none.
+    The ten columns span the gravity of an upright MTM whose last link is balanced about its axis. They follow exactly
+    from the base parameters. The additional gravity of a tilted base is approximated by polynomials in the joint
+    positions. The offset of a joint is its constant, and the cable torque of the shoulder uses the first two columns.
+    Other effects are approximated by polynomials over the joint's range. Torque limits are the required range over the
+    joint box plus a tenth, at most the arm's effort limits. Joint 7 has no torque.
 
     Raises:
-        ModelError: not the model of an MTM, options of the wrong length, or an error above `options.tolerance`.
+        ModelError: The model is not of an MTM, options have the wrong length, or the error exceeds `options.tolerance`.
     """
     options = options or CompensationOptions()
     arm = model.arm
@@ -159,13 +159,13 @@ def compensation_from_model(
 
 
 def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
-    """Coulomb friction [N m] that each joint feels when it alone moves, from the effects of the model's dynamics.
+    """Returns the Coulomb friction [N m] of each joint when it moves alone, from the effects of the model's dynamics.
 
     Smoothed Coulomb terms and presliding elements, which friction is once they slip, add up; along a coordinate of the
     drive that several joints move, each of them feels its share.
 
     Raises:
-        ModelError: the model has no dynamics.
+        ModelError: The model has no dynamics.
     """
     if model.dynamics is None:
         raise ModelError("the model has no dynamics, so it knows no friction; give it with --coulomb")

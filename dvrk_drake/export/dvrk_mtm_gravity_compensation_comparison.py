@@ -34,19 +34,19 @@ POSES = 20000
 
 @dataclass(frozen=True)
 class JointComparison:
-    """One joint over the joint box, at rest; torques in N m, shares 0..1 of the poses.
+    """Comparison of one joint over the joint box, at rest. Torques are in N m, shares of the poses are 0..1.
 
     Attributes:
-        name: of the joint.
-        model_lower, model_upper: range of the model's torque.
-        file_lower, file_upper: range of the file's torque before its clip.
-        clip_lower, clip_upper: the file's limits.
-        clipped: share of poses at which the clip is active: there the file's torque is a constant.
+        name: Name of the joint.
+        model_lower, model_upper: Range of the model's torque.
+        file_lower, file_upper: Range of the file's torque before clipping.
+        clip_lower, clip_upper: Torque limits of the file.
+        clipped: Share of poses at which the torque of the file is at a limit and therefore constant.
         opposed: share of poses at which file (clipped) and model push opposite ways, both by more than a tenth of the
             model's largest torque.
         runaway: share of poses at which the file (unclipped) lies outside the model's range widened by half of it on
             both sides: a torque that the model has nowhere on this joint. Not of the last joint, which no file has.
-        polynomial: largest |torque| of the file's polynomial in the joint's own position, constant left out.
+        polynomial: Largest |torque| of the file's polynomial in the joint position, without the constant.
         rms_inside, rms_outside: RMS of file (clipped) less model inside and outside of the sweep that the file says
             its data are from; if it does not say, all poses are outside. NaN where there are no such poses.
     """
@@ -68,11 +68,11 @@ class JointComparison:
 
 @dataclass(frozen=True, eq=False)
 class CompensationComparison:
-    """A file and a model at the same random poses of the joint box.
+    """Comparison of a file and a model at the same random poses of the joint box.
 
     Attributes:
-        file, model: what was compared.
-        joints: one a joint.
+        file, model: File and model that are compared.
+        joints: One comparison per joint.
         q: (m, 7) poses [rad], inside the joint box and the coupled limits.
         model_torque, file_torque, clipped_torque: (m, 7) [N m] at rest; `file_torque` before the clip.
         clipped, opposed, runaway: (m, 7) True where `JointComparison` counts the pose.
@@ -115,10 +115,10 @@ class CompensationComparison:
 
 
 def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) -> CompensationComparison:
-    """Compares at random poses, uniform in the joint box and inside the coupled limits.
+    """Compares file and model at random poses, uniform in the joint box and inside the coupled limits.
 
     Raises:
-        ModelError: the model is not of an MTM, or the file is named as one of another arm of this project.
+        ModelError: The model is not of an MTM, or the name in the file is that of another arm of this project.
     """
     arm = model.arm
     if arm.joint_names != MTM_JOINTS:

@@ -41,16 +41,16 @@ _PARAMETERS = within(-1e4, 1e4, "N m")
 
 @dataclass(frozen=True, eq=False)
 class GravityCompensationFile:
-    """What the file holds; `export.dvrk_mtm_gravity_compensation` has the controller's formula.
+    """Content of the file. `export.dvrk_mtm_gravity_compensation` has the controller's formula.
 
     Attributes:
-        positive, negative: (40,) parameters for positive and negative joint velocity.
-        torque_lower, torque_upper: (7,) clip of the torque [N m].
-        dead_band: (7,) speed [rad/s] up to which positive and negative count alike.
-        saturation: (7,) speed [rad/s] from which they differ by the full `friction_ratio`.
-        friction_ratio: (7,) share 0..1 of the friction that is compensated in motion.
-        sweep: (2, 7) lower and upper joint positions [rad] between which the file's data were collected, if it says so.
-        arm_name: the arm that the file states (ARM_NAME), or else that its file name contains; "" if neither names one.
+        positive, negative: Parameters (40,) for positive and negative joint velocity.
+        torque_lower, torque_upper: Limits (7,) of the torque [N m].
+        dead_band: Speeds (7,) [rad/s] up to which both parameters have equal weight.
+        saturation: Speeds (7,) [rad/s] from which the weights differ by the full `friction_ratio`.
+        friction_ratio: Share (7,), 0..1, of the friction that is compensated in motion.
+        sweep: Lower and upper joint positions (2, 7) [rad] of the data of the file, if the file states them.
+        arm_name: Name of the arm in the file (ARM_NAME), otherwise in the file name. Empty if neither has one.
     """
 
     positive: NDArray[np.float64] = field(metadata=_PARAMETERS)
@@ -64,10 +64,10 @@ class GravityCompensationFile:
     arm_name: str = ""
 
     def check(self) -> None:
-        """What the controller does not check before it commands motors: lengths, finite numbers, order.
+        """Checks lengths, finite numbers and order, which the controller does not check before it commands motors.
 
         Raises:
-            ModelError: names the file's field, and what is allowed.
+            ModelError: A field is invalid. The message contains its name and the accepted values.
         """
         for name, key in _KEYS.items():
             length = _LENGTHS.get(name, NUM_JOINTS)
@@ -87,7 +87,7 @@ class GravityCompensationFile:
         """Reads a file of the controller.
 
         Raises:
-            ModelError: no such file, not JSON, another version, or a field that is missing or wrong.
+            ModelError: The file is missing, is not JSON, has another version, or a field is missing or invalid.
         """
         content = read_json_input(path, ModelError)
         controller = content.get(_CONTROLLER) if isinstance(content, dict) else None

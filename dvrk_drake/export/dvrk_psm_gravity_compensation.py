@@ -28,9 +28,9 @@ from dvrk_drake.models.plant import shared_plant
 
 ARM_JOINTS = ("yaw", "pitch", "insertion")
 NAMES = ("yaw", "intermediate yaw", "pitch 1", "pitch 2", "pitch 3", "insertion 1", "insertion 2")
-#: Positions of the chain's joints from yaw, pitch and insertion.
+#: Matrix from yaw, pitch and insertion to the joint positions of the chain.
 CHAIN_FROM_ARM = np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, -1, 0], [0, 1, 0], [0, 0, 0.5], [0, 0, 0.5]])
-#: Torques of yaw, pitch and insertion from those of the chain's joints.
+#: Matrix from the joint torques of the chain to those of yaw, pitch and insertion.
 ARM_FROM_CHAIN = np.array([[1, 0, 0, 0, 0, 0, 0], [0, 0, 1, -1, 1, 0, 0], [0, 0, 0, 0, 0, 0, 1]])
 PRISMATIC = np.array([False] * 5 + [True] * 2)
 #: Link of the chain -> bodies of the arm whose mass it gets.
@@ -50,9 +50,9 @@ class KinematicCompensation:
     """Modified DH, X_(i-1)i = Rx(alpha) Tx(A) Rz(theta) Tz(D), and the mass of each of the seven links.
 
     Attributes:
-        alpha, A, theta, D: (7,) at zero joint positions [rad, m].
-        mass: (7,) [kg].
-        center: (7, 3) centre of mass in the link's DH frame [m].
+        alpha, A, theta, D: DH parameters (7,) at zero joint positions [rad, m].
+        mass: Masses (7,) [kg].
+        center: Centres of mass (7, 3) in the DH frames of the links [m].
         error: (3,) largest difference from the model over the joint box, instrument straight [N m, N m, N].
         wrist: (3,) largest torque that the instrument's own joints add or take, which the file knows nothing of.
     """
@@ -88,7 +88,7 @@ class KinematicCompensation:
 
 
 def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> KinematicCompensation:
-    """The controller's file that says what the model says of yaw, pitch and insertion, the instrument straight.
+    """Converts gravity on yaw, pitch and insertion, with a straight instrument, to the controller's file.
 
     Raises:
         ModelError: not the model of a PSM, a counterweight that outweighs all that the insertion carries, or an error
@@ -137,7 +137,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
 
 
 def _left_out(model: IdentifiedModel, q: NDArray[np.float64]) -> str:
-    """The model's effects on yaw, pitch and insertion at rest, with the largest torque of each at poses q (m, n)."""
+    """Lists the effects on yaw, pitch and insertion at rest, with the largest torque of each at poses q (m, n)."""
     gravity = len(model.base_parameters)
     tau = np.abs(model.static_model.regressor(q)[:, :3, gravity:] * model.theta[gravity:]).max(axis=(0, 1))
     said = [f"{ActuatorEffect.of(e)} {t:.2g}" for e, t in zip(model.holding_effects, tau, strict=True) if t > 0]
@@ -170,7 +170,7 @@ def _frames(
     D: NDArray[np.float64],
     q: ArrayLike,
 ) -> NDArray[np.float64]:
-    """X_0i (7, 4, 4) at yaw, pitch and insertion q (3,)."""
+    """Returns the poses X_0i (7, 4, 4) of the link frames at yaw, pitch and insertion q (3,)."""
     chain = CHAIN_FROM_ARM @ np.asarray(q, dtype=np.float64)
     X, frames = np.eye(4), []
     for i in range(len(NAMES)):

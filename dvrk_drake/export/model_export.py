@@ -69,7 +69,7 @@ def prepare_export(
     dead_band: Sequence[float] | None = None,
     saturation: Sequence[float] | None = None,
 ) -> ModelExport:
-    """Computes what `export_model` writes; arguments and errors as there."""
+    """Computes the content of the file of `export_model`, which documents arguments and errors."""
     origin = origin or f"a model of {model.arm.name}"
     if format in ("sdf", "urdf"):
         return ModelExport(model, format, origin, bodies=model_bodies(model))
@@ -103,27 +103,27 @@ def export_model(
     saturation: Sequence[float] | None = None,
     overwrite: bool = False,
 ) -> ModelExport:
-    """Writes a model for other programs: what `dvrk-drake export` does.
+    """Writes a model for other programs, like `dvrk-drake export`.
 
     Args:
-        model: from `identify`, `IdentifiedModel.load`, or `IdentifiedModel.from_arm`.
-        path: the file to write. Meshes of an SDF or URDF are copied into a folder <name>_meshes beside it.
+        model: Model from `identify`, `IdentifiedModel.load`, or `IdentifiedModel.from_arm`.
+        path: Path of the file. Meshes of an SDF or URDF are copied into a folder <name>_meshes beside it.
         format: "sdf", "urdf", or a file of the dVRK's controller: "dvrk-gc", the gravity compensation of an MTM, or
             "dvrk-kinematic-gc", that of a PSM. By default what the path ends in: .sdf or .urdf.
-        origin: where the model is from, for the file.
+        origin: Source of the model, written to the file.
         tolerance: error [N m; N] that is accepted where a file of the dVRK cannot state what the model states. Default:
             1e-6.
         friction: for "dvrk-gc": compensate the dry friction of the model's dynamics, or these (7,) values [N m].
         friction_ratio, dead_band, saturation: for "dvrk-gc": (7,) shares of it to compensate [1], and speeds between
             which the compensation rises [rad/s]. Default: as in files in use.
-        overwrite: replace an existing file.
+        overwrite: Replaces an existing file.
 
     Returns:
         What was written: `bodies` with what an SDF or URDF cannot state as `bodies.left_out`, or `compensation`.
 
     Raises:
-        ModelError: an unknown format, or a model that the format cannot state.
-        DvrkDrakeError: the file exists, or cannot be written.
+        ModelError: The format is unknown or cannot represent the model.
+        DvrkDrakeError: The file exists or cannot be written.
 
     Example:
         >>> import dvrk_drake as dvrk

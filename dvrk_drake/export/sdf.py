@@ -25,11 +25,11 @@ _UNCHANGED = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class LinkChange:
-    """What an export changes at one link.
+    """Change of the inertia of one link by an export.
 
     Attributes:
-        link: name of the link.
-        before, after: the two inertias, about the link's origin.
+        link: Name of the link.
+        before, after: Inertias about the link's origin.
     """
 
     link: str
@@ -38,10 +38,10 @@ class LinkChange:
 
 
 def changed_links(arm: Arm, links: Sequence[LinkInertia]) -> list[LinkChange]:
-    """The links whose parameters are not those of the arm's SDF.
+    """Returns the links whose parameters differ from those of the arm's SDF.
 
     Raises:
-        ModelError: a link that the arm does not have, or twice the same.
+        ModelError: A link does not belong to the arm or is given twice.
     """
     before = {inertia.link: inertia for inertia in link_inertias(arm)}
     names = [inertia.link for inertia in links]
@@ -56,16 +56,16 @@ def changed_links(arm: Arm, links: Sequence[LinkInertia]) -> list[LinkChange]:
 def with_inertias(
     arm: Arm, links: Sequence[LinkInertia], rotor_inertias: Mapping[str, float] | None = None
 ) -> ElementTree.Element:
-    """The arm's SDF, instrument included, as one model with the inertias of `links`; the other links keep theirs.
+    """Returns the arm's SDF with instrument as one model with the inertias of `links`. Other links are unchanged.
 
     Args:
-        arm: the arm.
-        links: any of its moving links.
-        rotor_inertias: joint -> what its own motor adds to its inertia, seen at the joint [kg m^2; kg if prismatic],
-            for joints that one motor alone drives. Gear ratios stay.
+        arm: Arm whose SDF is changed.
+        links: Inertias of any of its moving links.
+        rotor_inertias: Rotor inertia by joint, as seen at the joint [kg m^2; kg if prismatic], for joints that are
+            driven by one motor alone. Gear ratios are unchanged.
 
     Raises:
-        ModelError: a link that the arm does not have, an inertia that no body has, or a negative rotor inertia.
+        ModelError: A link does not belong to the arm, an inertia is not physical, or a rotor inertia is negative.
     """
     root = compose_sdf(arm.sdf, arm.mirrored_links)
     elements = {link.get("name"): link for link in root.iterfind("model/link")}
@@ -124,10 +124,10 @@ def to_text(root: ElementTree.Element, comment: str = "") -> str:
 
 
 def inertial_element(inertia: LinkInertia) -> ElementTree.Element:
-    """`<inertial>`: mass, centre of mass, and rotational inertia about it in the link's axes, in full precision.
+    """Returns `<inertial>` with mass, centre of mass, and inertia about it in the link's axes, in full precision.
 
     Raises:
-        ModelError: no body has this inertia.
+        ModelError: The inertia is not physical.
     """
     if not np.linalg.eigvalsh(inertia.pseudo_inertia()).min() > 0:
         raise ModelError(f"{inertia.link}: no body has this inertia: its pseudo-inertia must be positive definite")

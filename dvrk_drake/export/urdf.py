@@ -29,15 +29,15 @@ def write_urdf(
 ) -> None:
     """Writes the URDF at once or not at all, and copies of the meshes into the folder <name>_meshes beside it.
 
-    Joints of the linkage become mimic joints, which URDF has; pins of closed loops it has not, so the linkage is held
-    by the mimics alone. A capsule becomes a cylinder and two spheres, all that URDF knows. Rotor inertias, gear ratios,
-    named frames and collision filters are written as Drake's extensions, which other readers skip.
+    Joints of the linkage become mimic joints. URDF has no closed loops, so only the mimic joints constrain the linkage.
+    A capsule becomes a cylinder and two spheres because URDF has no capsules. Rotor inertias, gear ratios, named frames
+    and collision filters are written as Drake's extensions, which other readers ignore.
 
     Args:
         arm, links, path, origin, rotor_inertias: as of `sdf_export.write_sdf`.
 
     Raises:
-        ModelError: an inertia that no body has, or something in the SDF that URDF cannot say.
+        ModelError: An inertia is not physical, or URDF cannot represent a part of the SDF.
         DvrkDrakeError: a file cannot be written.
     """
     target = Path(path)
@@ -50,7 +50,7 @@ def write_urdf(
 
 
 def to_urdf(root: ElementTree.Element, arm: Arm) -> ElementTree.Element:
-    """`<robot>` of a composed SDF model.
+    """Converts a composed SDF model to `<robot>`.
 
     Raises:
         ModelError: a joint with a frame of its own, or a shape that URDF does not have.
