@@ -1,4 +1,4 @@
-"""The ramp from the measured effort to the wanted one."""
+"""Ramp from the measured to the desired effort."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_ramp_starts_when_enabled_and_restarts():
     enabled.FixValue(context, [1.0])
     simulator.AdvanceTo(0.1005)
     np.testing.assert_allclose(output.Eval(context), measured + 0.5 * (wanted - measured), atol=1e-9)
-    # What is measured meanwhile does not matter.
+    # Later measurements have no effect.
     ramp.GetInputPort("effort_measured").FixValue(context, [7.0, 7.0])
     simulator.AdvanceTo(0.3005)
     np.testing.assert_allclose(output.Eval(context), wanted, atol=1e-9)

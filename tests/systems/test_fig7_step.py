@@ -1,4 +1,4 @@
-"""The paper's simulation (Fig. 7), which never settled there: to zero from another start."""
+"""Simulation of the paper's Fig. 7, which did not settle there: motion to zero from another start."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ def scaled_model(factor):
 
 
 def simulate(q0, q_desired, duration, gravity_factor=1.0):
-    """Times (m,), errors q - q_d (m, n) and efforts (m, n), every millisecond, with default gains."""
+    """Returns times (m,), errors q - q_d (m, n) and efforts (m, n), every millisecond, with default gains."""
     builder = DiagramBuilder()
     station = builder.AddSystem(ArmStation(ARM))
     controller = builder.AddSystem(GravityPidController(scaled_model(gravity_factor)))
@@ -51,7 +51,7 @@ def test_every_joint_settles(gravity_factor):
     worst = np.abs(error[late]).max(axis=0)
     assert np.all(worst < 1e-3), f"largest error after 3 s [mrad]: {1e3 * worst}"
 
-    # No oscillation: what is left after 3 s changes direction at most twice, counted above 1 urad.
+    # No oscillation: the error after 3 s changes direction at most twice, counted above 1 urad.
     for j, name in enumerate(ARM.joint_names):
         rate = np.diff(error[late, j][::10])
         direction = np.sign(rate[np.abs(rate) > 1e-6])
@@ -76,7 +76,7 @@ def test_small_steps_overshoot_little(j):
 
 
 def test_steady_state_without_integral_is_the_gravity_error_over_kp():
-    # What the integral is for: without it, at rest, Kp e = (true - modelled) gravity at that pose.
+    # Without the integral, at rest, Kp e = (true - modelled) gravity at that pose.
     gains = dataclasses.replace(ARM.gains, ki=[0.0] * 7)
     model = scaled_model(0.8)
     builder = DiagramBuilder()

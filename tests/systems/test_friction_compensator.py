@@ -1,4 +1,4 @@
-"""Friction compensation: the same elements as the identified friction, passive, and no creep."""
+"""Friction compensation: same elements as the identified friction, passivity, no creep."""
 
 import dataclasses
 
@@ -35,16 +35,16 @@ SIZES = np.array([0.09, 0.12, 0.11, 0.06, 0.008, 0.005, 0.001])
 COEFFICIENTS = np.concatenate([np.repeat(SIZES, 2) / 2, SIZES / 3, SIZES / 2, [0.03]])
 FRICTION = Friction.of(ARM, EFFECTS, COEFFICIENTS)
 NO_EFFORT = np.zeros(7)
-ROUNDING = 1e-9  # of ratios, which a linear program finds
+ROUNDING = 1e-9  # of ratios from a linear program
 
 
 def holding_friction(friction):
-    """(n,) friction that holds each joint at rest if it alone moves [N m, N]."""
+    """Returns the static friction (n,) of each joint if only this joint moves [N m, N]."""
     return np.abs(friction.rows[friction.holds]).T @ friction.coefficients[friction.holds]
 
 
 def motion(seed, steps=6000, period=1e-3):
-    """Random motion of a hand: q and v (steps, 7), with stretches of fine trembling, where presliding matters most."""
+    """Returns a random motion of a hand: q and v (steps, 7), with small vibrations, where presliding dominates."""
     generator = np.random.default_rng(seed)
     t = period * np.arange(steps)
     q, v = np.zeros((steps, 7)), np.zeros((steps, 7))
@@ -58,7 +58,7 @@ def motion(seed, steps=6000, period=1e-3):
 
 
 def friction_of_arm(q, v):
-    """(m, n) efforts that the arm's own friction takes, by the columns that the identification uses."""
+    """Returns the efforts (m, n) of the arm's own friction from the columns of the identification."""
     rows = ARM.effect_coordinates
     a, a_dot = ARM.transmission.position(q), ARM.transmission.velocity(v)
     efforts = np.zeros(a.shape)
@@ -69,7 +69,7 @@ def friction_of_arm(q, v):
 
 
 class Compensator:
-    """The system by itself, stepped by hand."""
+    """The system alone, stepped manually."""
 
     def __init__(self, **options):
         self.system = FrictionCompensator(FRICTION, **options)
@@ -97,7 +97,7 @@ def test_without_widening_it_is_a_share_of_friction():
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("delay", [0, 2])
 def test_compensated_friction_is_passive(seed, delay):
-    """Of friction and compensation together, in any motion, also two periods late, in counts, and noisy."""
+    """Friction plus compensation is passive in any motion, also with delay, quantization and noise."""
     q, v = motion(seed)
     generator = np.random.default_rng(seed)
     seen_q = 5e-6 * np.round(q / 5e-6)
@@ -108,7 +108,7 @@ def test_compensated_friction_is_passive(seed, delay):
     dq = np.diff(q, axis=0)
     taken = friction_of_arm(q, v)
     energy = np.cumsum(np.einsum("mi,mi->m", (taken - given)[1:], dq))
-    # What the compensation's elements can store, and so give back once: ratio c d / 2, d wider by a half.
+    # Energy that the compensation's elements can store and return once: ratio c d / 2 with a widening of 1.5.
     stored = sum(
         MAX_HYSTERESIS_RATIO * c * 1.5 * e.scale / 2
         for e, c in zip(EFFECTS, COEFFICIENTS, strict=True)
@@ -146,7 +146,7 @@ def test_creeping_joints_keep_all_friction():
     ratios = safe_ratios(FRICTION, 0.6, error)
     touches = FRICTION.rows[:, 5] != 0
     np.testing.assert_allclose(ratios, np.where(touches, 0.0, 0.6), atol=ROUNDING)
-    error[5], error[1], error[2] = 0.0, 0.1, 0.1  # each alone could be held, not both with opposite signs
+    error[5], error[1], error[2] = 0.0, 0.1, 0.1  # each one could be held alone, but not both with opposite signs
     assert np.all(holding_friction(FRICTION) > error)
     ratios = safe_ratios(FRICTION, 0.6, error)
     touches = np.any(FRICTION.rows[:, 1:4] != 0, axis=1)
@@ -259,7 +259,7 @@ def test_push_decays_with_less_friction_and_delay(seed):
 
 
 def released(ratio, error, holding_error, seconds=1.5):
-    """(7,) how far each joint of an arm with real friction, encoders and delays moves under compensation [rad]."""
+    """Returns the motion (7,) of each joint with friction, encoders and delays under compensation [rad]."""
     station = ArmStation(ARM, effects=ARM.effects.without("cables").without("springs"))
     friction = FrictionCompensator(Friction.of_arm(ARM), ratio=ratio, holding_error=holding_error)
     builder = DiagramBuilder()
@@ -282,4 +282,4 @@ def test_released_arm_stays_with_gravity_error():
     assert np.any(released(MAX_RATIO, more, np.zeros(7)) > 0.1)
     assert np.all(
         released(MAX_RATIO, more, np.abs(more)) < 0.04
-    )  # as without any: the fine friction cannot hold as much
+    )  # as without compensation: the fine friction cannot hold as much

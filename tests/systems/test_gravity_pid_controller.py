@@ -1,4 +1,4 @@
-"""The control law against its own equation, and what it does when something is wrong."""
+"""Control law compared with its equation, and behaviour with invalid inputs."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ POSES = ARM.sample_poses(5, np.random.default_rng(0))
 
 
 class Bench:
-    """A controller alone; `step` is one update, as the Simulator or a message loop makes it."""
+    """Controller alone. `step` is one update, as in the Simulator or a message loop."""
 
     def __init__(self, desired=None, **arguments):
         self.controller = GravityPidController(arguments.pop("model", MODEL), **arguments)
@@ -97,14 +97,14 @@ def test_damped_mode_only_adds_damping():
     bench = Bench(gains=GAINS, effort_limits=UNLIMITED, mode="damped")
     bench.initialize(POSES[0])
     v = np.linspace(-1, 1, N)
-    for q in POSES:  # however far from where it began
+    for q in POSES:  # at any distance from the start
         np.testing.assert_allclose(bench.step(q, v), MODEL.holding_torque(q) - np.multiply(GAINS.kd, v), atol=1e-12)
     np.testing.assert_allclose(bench.step(q, np.full(N, np.nan)), MODEL.holding_torque(q), atol=1e-12)
 
 
 @pytest.mark.parametrize("j", range(N))
 def test_damping_acts_only_on_its_joint(j):
-    # The paper's node fed positions into the damping of joints 5-7: large positions must leave it untouched.
+    # The paper's node used positions in the damping of joints 5-7: large positions must not affect it.
     q = POSES[2] + 1.0
     bench = Bench(np.concatenate([q, np.zeros(N)]), gains=GAINS, effort_limits=UNLIMITED)
     still = bench.initialize(q)
@@ -127,13 +127,13 @@ def test_integrator_does_not_wind_up():
     q = np.zeros(N)
     bench = Bench(np.concatenate([q + 0.5, np.zeros(N)]), gains=gains, effort_limits=limits)
     bench.initialize(q)
-    for _ in range(1000):  # 100 / s * 0.5 rad * 1 s = 50 N m, were it not for the limit
+    for _ in range(1000):  # 100 / s * 0.5 rad * 1 s = 50 N m without the limit
         bench.step(q)
-    # Past the goal the command comes back at once: at most the limit was stored.
+    # Beyond the goal the command reverses immediately, because at most the limit was stored.
     effort = bench.step(q + 0.5)
     gravity = MODEL.holding_torque(q + 0.5)
     assert np.all(effort - gravity <= 2.0 - 0.5 * 1.0 - MODEL.holding_torque(q) + 1e-9)
-    # And it unwinds when the error changes sign.
+    # It decreases when the error changes sign.
     assert np.all(bench.step(q + 0.6) < effort - gravity + MODEL.holding_torque(q + 0.6))
 
 
@@ -142,7 +142,7 @@ def test_integrator_stops_while_error_is_large():
     q = np.zeros(N)
     bench = Bench(np.concatenate([q + 0.5, np.zeros(N)]), gains=gains, effort_limits=np.full(N, 2.0))
     bench.initialize(q)
-    # Braking hard keeps the command inside the limit, but Kp e = 5 N m alone is beyond it.
+    # Damping keeps the command inside the limit, but Kp e = 5 N m alone is beyond it.
     for _ in range(100):
         bench.step(q)
     np.testing.assert_allclose(bench.step(q + 0.5), MODEL.holding_torque(q + 0.5), atol=1e-12)
@@ -179,7 +179,7 @@ def test_gains_belong_to_the_context():
     bench.controller.SetGains(bench.context, weak)
     assert bench.controller.GetGains(bench.context) == weak
     assert bench.controller.GetGains(other) == GAINS
-    # Ki = 0 empties the integrator: nothing but gravity and Kp e is left.
+    # Ki = 0 resets the integrator: only gravity and Kp e remain.
     expected = MODEL.holding_torque(POSES[1]) + 0.1 * (POSES[0] - POSES[1])
     np.testing.assert_allclose(bench.step(POSES[1], np.ones(N)), expected, atol=1e-12)
 
@@ -203,7 +203,7 @@ def test_fault_outputs_gravity_of_last_finite_pose(bad, where):
     np.testing.assert_allclose(bench.step(q, v), MODEL.holding_torque(last), atol=1e-12)
     np.testing.assert_allclose(bench.output("gravity_effort"), MODEL.holding_torque(last), atol=1e-12)
     assert bench.output("fault") == [1.0]
-    # It resumes by itself, with an empty integrator.
+    # It resumes automatically with the integrator at zero.
     bench.controller.GetInputPort("desired_state").FixValue(bench.context, desired)
     e = 0.1
     expected = MODEL.holding_torque(POSES[0]) + e * np.array(GAINS.kp) + e * 1e-3 * np.array(GAINS.ki)
@@ -248,7 +248,7 @@ def test_simulator_holds_the_output_between_updates():
     context = controller.GetMyContextFromRoot(simulator.get_context())
     port = controller.GetOutputPort("effort")
     without_integral = MODEL.holding_torque(POSES[0]) + 1e-3 * np.array(GAINS.kp)
-    np.testing.assert_allclose(port.Eval(context), without_integral, atol=1e-12)  # right from the start
+    np.testing.assert_allclose(port.Eval(context), without_integral, atol=1e-12)  # from the start
     simulator.AdvanceTo(0.055)  # updates at 0, 0.01, .. 0.05: six
     expected = without_integral + 6 * 0.01 * 1e-3 * np.array(GAINS.ki)
     np.testing.assert_allclose(port.Eval(context), expected, atol=1e-12)

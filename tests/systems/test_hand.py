@@ -1,4 +1,4 @@
-"""A hand as spring and damper: its law, its limits, and that it shakes nothing."""
+"""Hand as spring and damper: force law, limits and stability."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def moved(X, rpy, p):
 
 
 def held_arm(grip, X_offset, duration):
-    """A weightless arm that a hand pulls by `X_offset`; grip pose where it wants it and where it is, largest speed."""
+    """Returns desired and reached pose and largest speed of a weightless arm that a hand pulls by `X_offset`."""
     arm = ARM.with_gravity([0, 0, 0])
     builder = DiagramBuilder()
     station = builder.AddSystem(ArmStation(arm))
@@ -69,7 +69,7 @@ def test_frame_pose_and_jacobian_match_drake():
 
 
 def test_mass_matrix_matches_kinetic_energy():
-    # The PSM's counterweight and linkage move along: its joints' inertia is that of all that they move.
+    # The joint inertia of the PSM includes its counterweight and linkage.
     psm = load_arm("psm")
     plant = make_arm_plant(psm)
     context = plant.CreateDefaultContext()
@@ -134,7 +134,7 @@ def test_no_force_without_finite_desired_pose():
 
 @pytest.mark.parametrize("firmer", [1.0, 1e3])
 def test_hand_moves_handle_to_pose_with_any_stiffness(firmer):
-    # 600 kN/m and 2 kN m/rad on a wrist of 1e-5 kg m^2: an explicit spring would throw it away in one step.
+    # 600 kN/m and 2 kN m/rad on a wrist of 1e-5 kg m^2: an explicit spring would be unstable.
     grip = Grip(600.0 * firmer, 25.0 * firmer, 2.0 * firmer, 0.03 * firmer)
     wanted, X, V = held_arm(grip, ([0.1, -0.1, 0.2], [0.02, -0.02, 0.03]), 2.0)
     assert np.linalg.norm(X.translation() - wanted.translation()) < 1e-3

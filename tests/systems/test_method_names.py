@@ -1,16 +1,16 @@
-"""Public methods of Systems are named as Drake's, `SetGains`; those of all other classes as Python's, `load_arm`."""
+"""Public methods of Systems have Drake-style names (`SetGains`), other classes Python-style names (`load_arm`)."""
 
 import ast
 
 from repository import ROOT
 
 SYSTEMS = {"LeafSystem", "Diagram"}
-#: Overrides of Drake's names.
+#: Methods that override those of Drake.
 OF_DRAKE = {"Serialize", "Deserialize"}
 
 
 def public_methods():
-    """(where, whether the class is a System, name) of each public method that is no property."""
+    """Returns (location, flag of a System, name) of each public method that is not a property."""
     for path in sorted((ROOT / "dvrk_drake").rglob("*.py")):
         if "lcmtypes" in path.parts:
             continue

@@ -1,4 +1,4 @@
-"""Arms that are mounted otherwise: gravity comes from another side of the base."""
+"""Arms in other mountings: gravity has another direction in the base frame."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 
 def drift(arm, mounted, model):
-    """How far [rad, m] each joint of the mounted arm moves in half a second under the model's gravity compensation."""
+    """Returns the motion [rad, m] of each joint in 0.5 s under the model's gravity compensation."""
     name = arm.name.lower()
     builder = DiagramBuilder()
     station = builder.AddSystem(ArmStation(arm, plant_arm=mounted, closure="ball"))

@@ -1,4 +1,4 @@
-"""The PSM with its loops pinned against the same PSM as a tree with couplings: one mechanism, two descriptions."""
+"""Comparison of two models of the PSM: closed loops with pins, and a tree with couplings."""
 
 import numpy as np
 import pytest
@@ -16,12 +16,12 @@ from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 ARM = load_arm("psm")
 N = ARM.num_joints
-#: On no loop: each follows one joint by its cable, in both descriptions: dependent joint -> (leader, multiplier).
+#: Joints outside of loops, coupled by a cable in both models: dependent joint -> (leader, multiplier).
 CABLES = {"counterweight": ("insertion", 1.0), "finger_1": ("jaw", -0.5)}
 
 
 def box_poses(count=30):
-    """Corners of the first three joints' box, then random poses of the whole box."""
+    """Returns the corners of the first three joints' ranges, then random poses in all ranges."""
     poses = ARM.sample_poses(count, np.random.default_rng(0))
     ranges = zip(ARM.position_lower[:3], ARM.position_upper[:3], strict=True)
     corners = np.array(np.meshgrid(*ranges)).reshape(3, -1).T
@@ -30,7 +30,7 @@ def box_poses(count=30):
 
 
 def gaps(plant, context):
-    """Distances [m]: the largest between two points that a pin holds together, and of the RCM from where it belongs."""
+    """Returns the largest distance [m] between pinned points, and that of the RCM from its nominal position."""
     pins = []
     for loop in ARM.loop_closures:
         A, B = plant.GetFrameByName(loop.frame_a), plant.GetFrameByName(loop.frame_b)
@@ -40,7 +40,7 @@ def gaps(plant, context):
 
 
 def constraint_jacobian(plant, context):
-    """(k, nq) exact Jacobian of everything that ties the pinned plant's joints together: pins and cables."""
+    """Returns the exact Jacobian (k, nq) of all constraints of the pinned plant: pins and cables."""
     world, nothing = plant.world_frame(), np.zeros((3, 1))
     rows = []
     for loop in ARM.loop_closures:
@@ -59,7 +59,7 @@ def constraint_jacobian(plant, context):
 
 
 def allowed_motion(plant, context):
-    """(nq, n) motion of all joints for motion of the independent ones, by the constraints alone."""
+    """Returns the matrix (nq, n) from independent to all joint velocities, from the constraints alone."""
     J = constraint_jacobian(plant, context)
     independent = [plant.GetJointByName(name).position_start() for name in ARM.joint_names]
     dependent = [i for i in range(plant.num_positions()) if i not in independent]
@@ -72,7 +72,7 @@ def allowed_motion(plant, context):
 
 def test_only_loop_joints_lose_couplings():
     tree, pinned = make_arm_plant(ARM), make_arm_plant(ARM, closure="ball")
-    # Six joints follow others; those of two loops are four. Each loop gets a pin and a bar's length.
+    # Six joints are dependent, four of them in two loops. Each loop gets a pin and a bar length.
     assert tree.num_constraints() == 6
     assert pinned.num_constraints() == len(CABLES) + 2 * len(ARM.loop_closures)
 
@@ -95,7 +95,7 @@ def test_pins_and_couplings_give_the_same_dynamics():
 
 @pytest.mark.parametrize("q", ARM.sample_poses(3, np.random.default_rng(1), margin=0.25))
 def test_same_torques_give_the_same_motion(q):
-    """Holding torque and more, different at every joint, for half a second without control: about 1 rad/s."""
+    """Gravity torque plus a different torque per joint for 0.5 s without control: about 1 rad/s."""
     phase = np.arange(N)
     push = 0.05 * np.array([2.0, 2.0, 6.0, 0.003, 0.006, 0.015, 0.004])
     runs = {}
@@ -115,14 +115,14 @@ def test_same_torques_give_the_same_motion(q):
     moved = np.abs(runs["mimic"][:, :N] - q).max(axis=0)
     assert np.all(moved > [0.02, 0.02, 0.004, 0.02, 0.02, 0.02, 0.02])
     difference = np.abs(runs["ball"] - runs["mimic"]).max(axis=0)
-    # Both hold their constraints to some 1e-8: what was measured is 2e-7 rad and 1.3e-6 rad/s.
+    # Both satisfy their constraints to about 1e-8. Measured: 2e-7 rad and 1.3e-6 rad/s.
     assert np.all(difference[:N] < 1e-6)
     assert np.all(difference[N:] < 5e-6)
 
 
 def test_closure_and_remote_centre_during_motion():
-    """All corners of yaw, pitch and insertion under control, as fast as 1.6 rad/s, with the loops pinned."""
-    # A little inside, where the controller does not push against the stops.
+    """Controlled motion with pinned loops to all corners of yaw, pitch and insertion, at up to 1.6 rad/s."""
+    # Slightly inside the limits, so that the controller does not push against the stops.
     center, half = (ARM.position_lower + ARM.position_upper) / 2, (ARM.position_upper - ARM.position_lower) / 2
     corners = [(-1, -1, -1), (1, -1, 1), (1, 1, -1), (-1, 1, 1), (-1, -1, 1), (1, 1, 1), (1, -1, -1), (-1, 1, -1)]
     signs = np.array([[*corner, *(corner[::-1]), corner[0]] for corner in corners], float)
@@ -158,7 +158,7 @@ def test_closure_and_remote_centre_during_motion():
 
 @pytest.mark.parametrize("closure", ["mimic", "ball"])
 def test_held_poses_keep_the_remote_centre(closure):
-    """Statically: a released arm under exact gravity compensation, half a second at each pose."""
+    """A released arm under exact gravity compensation, 0.5 s at each pose."""
     builder = DiagramBuilder()
     station = builder.AddSystem(ArmStation(ARM, closure=closure))
     controller = builder.AddSystem(GravityPidController(IdentifiedModel.from_arm(ARM), mode="gravity"))
@@ -180,7 +180,7 @@ def test_held_poses_keep_the_remote_centre(closure):
 @pytest.mark.parametrize("closure", ["mimic", "ball"])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_full_effort_at_stops_keeps_linkage_closed(closure, sign):
-    """A stop acts on the leading joint; what follows it, the counterweight above all, must stop as well."""
+    """A stop acts on the leading joint. Dependent bodies, above all the counterweight, must stop as well."""
     station = ArmStation(ARM, closure=closure)
     simulator = Simulator(station)
     context = simulator.get_mutable_context()

@@ -1,4 +1,4 @@
-"""The PSM under GravityPidController with its default gains, loops pinned: holds, steps, and does not wind up."""
+"""PSM with pinned loops under GravityPidController with default gains: hold, steps, anti-windup."""
 
 import dataclasses
 
@@ -28,7 +28,7 @@ def scaled_model(factor):
 
 
 class Bench:
-    """The closed loop, run again and again from the start."""
+    """Closed loop that is run repeatedly from the start."""
 
     def __init__(self, gravity_factor=1.0, inertia_factor=1.0):
         builder = DiagramBuilder()
@@ -52,7 +52,7 @@ class Bench:
         self.station.SetLinkInertias(self.context, heavier)
 
     def run(self, q0, q_desired, duration):
-        """Times (m,), positions (m, n) and efforts (m, n), every millisecond."""
+        """Returns times (m,), positions (m, n) and efforts (m, n), every millisecond."""
         logs = [log.FindMutableLog(self.root) for log in (self.positions, self.efforts)]
         for log in logs:
             log.Clear()
@@ -66,7 +66,7 @@ class Bench:
 
 
 def step_poses():
-    """Home, two opposite corners of the box and one between, 2 % of the range inside the limits; a random pose."""
+    """Poses: home, three corners 2 % of the range inside the limits, and a random pose."""
     margin = 0.02 * (ARM.position_upper - ARM.position_lower)
     lower, upper = ARM.position_lower + margin, ARM.position_upper - margin
     mixed = np.where([False, True, False, False, True, True, False], lower, upper)
@@ -85,7 +85,7 @@ def check_steps(bench, poses, largest_overshoot):
             assert overshoot < largest_overshoot, f"{name} overshoots by {100 * overshoot:.1f} % from {q0}"
             late = np.abs(error[t >= 1.0]).max(axis=0)
             assert np.all(late < SETTLED), f"{name} stepped from {q0}; largest errors after 1 s: {late}"
-            # No steady error: what is left keeps shrinking to nothing, on every joint.
+            # No steady-state error: the error of every joint converges to zero.
             assert np.all(np.abs(error[-1]) < 0.2 * SETTLED)
 
 
@@ -96,16 +96,16 @@ def test_step_of_each_joint_settles_within_a_second(gravity_factor, poses):
 
 
 def test_step_settles_with_three_times_the_inertia():
-    """A real arm has up to twice the inertia of the SDF; here three times, and the gravity model has an error of 20 %."""
+    """A real arm has up to twice the inertia of the SDF. Here it is three times, with 20 % gravity error."""
     bench = Bench(gravity_factor=0.8 * 3, inertia_factor=3)
-    # Its weight is beyond the effort limits in some of the box: poses where the motors have something left.
+    # Gravity exceeds the effort limits in part of the range, so poses with reserve are used.
     poses = ARM.sample_poses(200, np.random.default_rng(5), margin=0.1)
     light = np.all(np.abs(3 * NOMINAL.holding_torque(poses)) < 0.6 * ARM.effort_limits, axis=1)
     check_steps(bench, poses[light][:2], 0.15)
 
 
 def test_saturating_step_does_not_wind_up():
-    """2.3 rad and 0.18 m at once: nobody should command it, the motors are at their limits and brake late."""
+    """A step of 2.3 rad and 0.18 m, unusual in practice: the motors saturate and brake late."""
     center, half = (ARM.position_lower + ARM.position_upper) / 2, (ARM.position_upper - ARM.position_lower) / 2
     start, goal = center - 0.95 * half, center + 0.5 * half
     bench = Bench()

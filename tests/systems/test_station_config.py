@@ -1,4 +1,4 @@
-"""Stations from files: Drake's own loader and schemas, the same ports in simulation and on hardware."""
+"""Station files: Drake's loader and schemas, same ports in simulation and on hardware."""
 
 import re
 

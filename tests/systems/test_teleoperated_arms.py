@@ -1,4 +1,4 @@
-"""A simulated master that leads a simulated PSM."""
+"""Simulated teleoperation of a PSM by a master."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def arms():
 
 
 def run(arms, duration=2.5):
-    """The handle is pulled and turned by a person, then held; the state of all at the end, and the poses."""
+    """Returns the final states and poses after a hand moves, rotates and then holds the handle."""
     simulator = Simulator(arms)
     context = simulator.get_mutable_context()
     arms.SetPositions(context, START_MASTER, START_FOLLOWER)
@@ -43,7 +43,7 @@ def run(arms, duration=2.5):
 
 def test_simulated_follower_follows_the_hand(arms):
     _, (G0, G), (T0, T), target = run(arms)
-    # The hand gets the gravity-compensated master to where it wants it, so it carries no weight.
+    # The hand moves the gravity-compensated master to the desired pose without its weight.
     assert np.linalg.norm(G.translation() - target.translation()) < 1e-4
     way = SCALE * (G.translation() - G0.translation())
     assert np.linalg.norm(way) > 0.02

@@ -1,4 +1,4 @@
-"""A master that leads a PSM: the law, the clutch, limits and faults."""
+"""Teleoperation of a PSM: control law, clutch, limits and faults."""
 
 import numpy as np
 import pytest
@@ -96,7 +96,7 @@ def test_tip_returns_from_limits_with_the_master(turn):
     assert np.all(way <= PSM.position_upper + 1e-12)
     touched = np.isclose(away, PSM.position_upper, atol=1e-9) | np.isclose(away, PSM.position_lower, atol=1e-9)
     assert touched.any()
-    # The pose of the tip: a roll may be another turn.
+    # The pose of the tip is compared, since a roll may differ by a full turn.
     np.testing.assert_allclose(tip(back[-1]).GetAsMatrix4(), tip(q_start).GetAsMatrix4(), atol=1e-9)
 
 
@@ -157,7 +157,7 @@ def test_blocked_follower_is_held():
         q, _ = loop.step(follower=Q_F, master_position=Q_M + s * np.array([0.6, 0, 0, 0, 0, 0, 0]))
     assert loop.flag("fault") == 1.0
     assert 0 < np.max(np.abs(q - Q_F) / SPEED) < MAX_LAG + 2 * PERIOD
-    # Letting the clutch go takes it where it is: nothing pushes any more.
+    # Opening the clutch sets the command to the measured position, so no effort remains.
     q, _ = loop.step(follower=Q_F, engaged=0.0)
     np.testing.assert_array_equal(q, Q_F)
     assert loop.flag("fault") == 0.0

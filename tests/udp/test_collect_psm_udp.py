@@ -1,4 +1,4 @@
-"""A collection of a PSM from both sides, with real processes over real UDP multicast in a network of their own.
+"""Collection of PSM poses from both sides, with real processes and UDP multicast in a separate network.
 
 This file starts itself again inside a network namespace. Processes are forked from one that has compiled everything.
 """

@@ -1,4 +1,4 @@
-"""From poses to a compensated arm, with real processes over real UDP multicast in a network of their own.
+"""From poses to a compensated arm, with real processes and UDP multicast in a separate network.
 
 This file starts itself again inside a network namespace. Processes are forked from one that has compiled everything.
 """
@@ -18,7 +18,7 @@ from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.pose_file import load_poses
 from dvrk_drake.recordings.recording import read_recording
 
-#: As few as identification takes.
+#: Smallest number of poses for an identification.
 POSES = 8
 #: Time until the arm releases a silent sender: the expiry and a margin [s]; earlier, another one is refused.
 FORGOTTEN = 0.6
@@ -31,7 +31,7 @@ def test_in_a_network_of_its_own(request):
 
 @pytest.fixture(scope="module")
 def observer():
-    """What a running arm says."""
+    """Returns the output of a running arm."""
     observer = Observer("mtml")
     process = dvrk_drake("arm", "--arm", "mtml", "--realtime", "--driver", PATIENT_DRIVER)
     observer.until(lambda status: True, "first status", process=process)

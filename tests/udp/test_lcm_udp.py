@@ -1,4 +1,4 @@
-"""An arm process and its controllers over real UDP multicast, in a network of their own.
+"""Arm process and its controllers over real UDP multicast in a separate network.
 
 Run by itself, this file starts itself again inside a network namespace; the tests of that run are the real ones.
 Processes are forked from one that has compiled everything; where a test starts them by their command line, it says so.
@@ -29,9 +29,9 @@ from dvrk_drake.processes.pace import Pace, make_realtime
 from dvrk_drake.systems.lcm.dvrk_command import draw_id
 
 OTHER_URL = "udpm://239.255.76.67:7668?ttl=0"
-#: Of tests that publish garbage, which observers do not read.
+#: Options of tests that publish invalid messages, which observers do not read.
 THIRD_URL = "udpm://239.255.76.67:7669?ttl=0"
-#: Options of a patient arm, and its expiry [s] and a little: time until it releases a silent sender.
+#: Options of a patient arm, and its expiry [s] and a little: so long it remembers a sender that is silent.
 PATIENT, FORGOTTEN = ("--driver", PATIENT_DRIVER), 0.6
 #: Speed at which logs are played: the network loses nothing when a busy computer delays the player.
 SLOWLY = 0.2
@@ -56,7 +56,7 @@ def running_arm(request):
 
 @pytest.fixture(autouse=True)
 def end_observers():
-    """Ends the observers of a test, which would read the messages of all later tests."""
+    """Stops the observers of a test, which would otherwise read the messages of later tests."""
     before = set(Observer.running)
     yield
     for observer in Observer.running - before:
@@ -65,22 +65,22 @@ def end_observers():
 
 @pytest.fixture
 def arm(running_arm):
-    """A running arm that holds and has no sender: its name, its process, its output."""
+    """Running arm in HOLD without a sender: its name, process and output."""
     name, process, observer = running_arm
     observer.during(FORGOTTEN)
-    if observer.last.guard_state != Status.STATE_HOLD:  # a test before failed
+    if observer.last.guard_state != Status.STATE_HOLD:  # an earlier test failed
         reset(name, observer)
     return name, process, observer
 
 
 def drift(*statuses):
-    """The farthest from the position of the first status [rad, m]."""
+    """Returns the largest distance from the position of the first status [rad, m]."""
     positions = np.array([status.position for status in statuses])
     return np.abs(positions - positions[0]).max()
 
 
 def send(network, status, sequence, sender_id, **fields):
-    """A HOLD command that answers `status`, with other fields as given."""
+    """Returns a HOLD command that answers `status`, with other fields as given."""
     n, command = status.num_joints, Command()
     command.utime, command.sequence, command.sender_id = time.monotonic_ns() // 1000, sequence, sender_id
     command.session_id, command.status_utime = status.session_id, status.utime
@@ -92,11 +92,11 @@ def send(network, status, sequence, sender_id, **fields):
 
 
 def reset(name, observer):
-    """Clears a fault: HOLD, HOLD, HOLD with the request; again, as a person would, if one of them came too late."""
+    """Clears a fault by HOLD, HOLD, HOLD with the request. Repeats this if one of them was late."""
     network = lcm.LCM()
 
     def is_cleared():
-        observer.during(FORGOTTEN)  # earlier senders have expired by then
+        observer.during(FORGOTTEN)  # earlier senders are silent by then
         sender_id = draw_id()
         for k, asks in enumerate((False, False, True)):
             send(network, observer.last, k, sender_id, reset_fault=asks)
@@ -128,7 +128,7 @@ def test_command_and_status_round_trip(arm):
 @watchdog
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_arm_holds_after_controller_is_killed(name, tmp_path):
-    """With the expiry that a real arm has, by the arm's clock and, where scheduling is real-time, by the wall clock."""
+    """Expiry of a real arm by the arm's clock and, with real-time scheduling, by the wall clock."""
     (tmp_path / "driver.yaml").write_text("guard: {resume_automatically: true}\n")
     observer = Observer(name, OTHER_URL)
     arm = start_arm(name, "--lcm-url", OTHER_URL, "--driver", tmp_path / "driver.yaml")
@@ -169,7 +169,7 @@ def stop(process, seconds):
 
 
 def waits_for_an_operator(status):
-    """Also where the guard noticed the stall first by its own period."""
+    """Accepts that the guard detected the stall first by its own period."""
     return holds(status) and not status.fault_code and bool(status.fault_text)
 
 
@@ -187,7 +187,7 @@ def test_arm_holds_after_stall_until_operator_resumes(stalled, seconds):
         begun = observer.until(takes_efforts, "start of the controller", process=controller)
         stop(arm if stalled == "arm" else controller, seconds)
         held = observer.until(waits_for_an_operator, "hold", begun, arm)
-        # The controller goes on as if nothing had happened.
+        # The controller continues unchanged.
         observer.until(
             lambda status: status.refusal_code == Status.REFUSAL_RESUME and status.num_refused > 300,
             "refusals",
@@ -254,7 +254,7 @@ def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     efforts = np.array([status.effort_commanded for status in acting])
     assert np.all(np.abs(np.diff(efforts, axis=0)) < 0.01 * steps * load_arm(name).effort_limits)
     held = observer.received[observer.until(holds, "hold", begun)]
-    assert held.num_expired == expired  # it was commanded to hold
+    assert held.num_expired == expired  # it received HOLD and no command expired
     assert drift(*observer.during(0.1)) < 1e-3
     assert "holds by itself" in said
     assert "effort; " in said and " Hz, round trip " in said
@@ -325,7 +325,7 @@ def test_invalid_messages_neither_stop_nor_move_the_arm(arm):
         if k % 20 == 0:
             # No faster than the arm reads on a busy machine: what the system drops says nothing about the arm.
             wait_until(lambda k=k: k <= unaccepted(observer.last) - before + 100, "refusals", process)
-    # UDP may lose a few.
+    # UDP may lose a few messages.
     observer.until(lambda status: unaccepted(status) - before > 9_000, "refusals", first, process)
     received = observer.received[first:]
     check_clock(received)
@@ -353,7 +353,7 @@ def test_controller_clock_jump_leads_to_hold_and_restart(arm):
 
 
 class Logged:
-    """What lcm-logger writes of the commands while the block runs, for lcm-logplayer."""
+    """Records the commands with lcm-logger while the block runs, for lcm-logplayer."""
 
     def __init__(self, path, url):
         self.path, self.url = path, url
@@ -410,7 +410,7 @@ def test_replayed_commands_of_a_log_are_refused(arm, tmp_path):
 @watchdog
 @inside
 def test_restarted_arm_ignores_run_and_log(tmp_path):
-    """A watchdog test, since `run` ends where the computer stops the arm's guard for 40 ms."""
+    """A watchdog test, since `run` ends if the computer stops the arm's guard for 40 ms."""
     observer, on_other = Observer("mtml", OTHER_URL), ("--lcm-url", OTHER_URL)
     arm = start_arm("mtml", *PATIENT, *on_other)
     observer.until(lambda status: True, "first status", process=arm)
@@ -440,12 +440,12 @@ def test_restarted_arm_ignores_run_and_log(tmp_path):
 
 
 class ScriptedArm:
-    """An arm that sends the statuses of the test, and receives every command."""
+    """Arm that sends given statuses and receives every command."""
 
     def __init__(self, url):
         self.commands, self.lcm, self.pace = [], lcm.LCM(url), Pace(1e-3)
         self.lcm.subscribe("DVRK_COMMAND_MTML", lambda _, data: self.commands.append(Command.decode(data)))
-        self.foreign = list  # what others publish after each status
+        self.foreign = list  # messages of other processes after each status
         self.held = IdentifiedModel.from_arm(load_arm("mtml")).holding_torque(POSES["mtml"])
         self.status = status = Status()
         status.arm_name, status.num_joints, status.session_id, status.utime = "MTML", 7, draw_id(), 10**15
@@ -455,7 +455,7 @@ class ScriptedArm:
         status.effort_measured = status.effort_commanded = self.held.tolist()
 
     def say_until(self, condition, what, process=None):
-        """Statuses, a millisecond apart, until the condition holds."""
+        """Sends statuses, a millisecond apart, until the condition holds."""
 
         def says():
             self.say()
@@ -464,7 +464,7 @@ class ScriptedArm:
         wait_until(says, what, process)
 
     def say(self, count=1):
-        """So many statuses, a millisecond apart."""
+        """Sends that many statuses, a millisecond apart."""
         for _ in range(count):
             self.pace.wait()
             self.status.utime, self.status.sequence = self.status.utime + 1000, self.status.sequence + 1
@@ -482,7 +482,7 @@ def test_run_ignores_foreign_statuses_and_ends_on_silence(ends):
     session = arm.status.session_id
 
     def foreign():
-        """Corrupted and spoofed copies of the status, with another pose."""
+        """Sends corrupted and spoofed copies of the status with another pose."""
         data = arm.status.encode()
         yield data[:-60]
         yield os.urandom(300)
@@ -543,7 +543,7 @@ def test_of_two_controllers_the_first_stays_in_command(arm):
 @watchdog
 @inside
 def test_key_protects_from_flood_of_foreign_commands(tmp_path):
-    """Good commands of a stranger, as fast as a process can publish them.
+    """Good commands of an unknown sender, as fast as a process can publish them.
 
     The rate is compared with that of a peer, a process with the same period and scheduling that reads no messages:
     where the machine stands still, both do. Without real-time scheduling a flood takes computing time from all

@@ -30,7 +30,7 @@ def test_in_a_network_of_its_own(request):
 
 
 def start_records(paths, *options, arms=("mtml", "mtml")):
-    """Recorders that listen already; started together, as each waits only 10 s for a status."""
+    """Starts recorders and waits until they listen. They start together, as each waits only 10 s for a status."""
     command = [sys.executable, "-m", "dvrk_drake.cli", "record"]
     started = [
         (start(*command, "--arm", arm, "--output", path, *options), arm) for path, arm in zip(paths, arms, strict=False)
@@ -45,7 +45,7 @@ def start_logger(path):
     process, publisher = start(str(TOOLS / "lcm-logger"), "--quiet", str(path)), lcm.LCM()
 
     def listens():
-        publisher.publish("BEGIN", b"")  # it flushes ten times a second
+        publisher.publish("BEGIN", b"")  # it flushes ten times per second
         return path.exists() and path.stat().st_size
 
     wait_until(listens, "start of the logger", process)
@@ -53,7 +53,7 @@ def start_logger(path):
 
 
 def by_utime(path):
-    """{utime: measurements} of a recorded file, CSV or log."""
+    """Returns {utime: measurements} of a recorded file, CSV or log."""
     if path.suffix == ".csv":
         table = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True))
         return {int(row["utime"]): [row[name] for name in COLUMNS] for row in table}
@@ -63,7 +63,7 @@ def by_utime(path):
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory):
-    """A log of two seconds at 1 kHz, to be played by lcm-logplayer."""
+    """Writes a log of two seconds at 1 kHz for lcm-logplayer."""
     path = tmp_path_factory.mktemp("played") / "played.log"
     path.write_bytes(log_bytes(statuses(2000)))
     return path
@@ -78,19 +78,19 @@ def rows_in(path):
 
 
 def has_status(path):
-    """Whether a log has a whole status: another one begins."""
+    """Returns whether a log has a complete status, i.e. another one begins."""
     return path.exists() and path.read_bytes().count(b"DVRK_STATUS_MTML") > 1
 
 
 def wait_for(mark, *paths):
-    """Waits until what was sent last is in the files: a channel, or the utime of a status."""
+    """Waits until the last message is in the files: a channel, or the utime of a status."""
     marks = {".csv": str(mark).encode()}
     binary = mark.encode() if isinstance(mark, str) else mark.to_bytes(8, "big")
     wait_until(lambda: all(marks.get(path.suffix, binary) in path.read_bytes() for path in paths), f"{mark} in {paths}")
 
 
 def end_logger(logger, path):
-    """Ends it when it has written all that came before."""
+    """Stops it when it has written all earlier messages."""
     publisher = lcm.LCM()
 
     def is_done():
@@ -105,7 +105,7 @@ def end_logger(logger, path):
 @inside
 def test_log_and_recording_of_live_arm_agree(tmp_path):
     pose, driver = ["0.1", "0.4", "-0.25", "0.6", "0.9", "0.1", "0.5"], tmp_path / "driver.yaml"
-    # The network's memory holds half a second then, and a busy computer loses nothing.
+    # The network buffer then holds half a second, so a busy computer loses nothing.
     driver.write_text("status_period: 0.005\n")
     command = ["arm", "--arm", "mtml", "--realtime", "--driver", str(driver), "--pose", *pose]
     arm = start(sys.executable, "-m", "dvrk_drake.cli", *command)
@@ -161,14 +161,14 @@ def missing_at_first(path):
 
 @inside
 def test_killed_record_or_logger_leaves_readable_file(tmp_path, played):
-    """At whatever moment: when the first file has so many of 2000 rows."""
+    """Kills it when the first file has that many of 2000 rows."""
     original = by_utime(played)
     for count in (1, 100, 300, 600):
         paths = [tmp_path / f"{count}{name}" for name in (".csv", ".log", "logger.log")]
         processes = [start_logger(paths[2]), *start_records(paths[:2])]
         player = start(str(TOOLS / "lcm-logplayer"), str(played))
         wait_until(lambda count=count, path=paths[0]: rows_in(path) >= count, f"{count} rows", processes[1])
-        # lcm-logger flushes ten times a second.
+        # lcm-logger flushes ten times per second.
         read = paths if count > 1 else paths[:2]
         wait_until(lambda read=read: all(map(has_status, read[1:])), "a whole status")
         before = [path.read_bytes() for path in read]

@@ -46,7 +46,7 @@ def test_effort_plus_gravity_compensation_stays_limited():
 
 
 def pushed(name, push, seconds):
-    """Returns the largest excess of a limit [guard's margins] under efforts that ramp to `push` in 0.2 s; last status."""
+    """Returns the largest excess of a limit [guard's margins] for efforts that ramp to `push` in 0.2 s; last status."""
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, name, SOON, modify_plant=without_stops)
     A, lower, upper = arm.arm.limit_matrix()
