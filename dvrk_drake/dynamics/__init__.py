@@ -1,1 +1,1 @@
-"""An arm's equations: symbolic gravity, base parameters, joint effects, identified models."""
+"""Equations of motion of an arm: symbolic gravity, base parameters, joint effects, identified models."""

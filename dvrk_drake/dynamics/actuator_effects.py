@@ -1,10 +1,9 @@
-"""Torques of friction, cables and springs in the drive: each a named model, linear in one coefficient.
+"""Models of friction, cable and spring torques in the drive, each linear in one coefficient.
 
-An effect acts along a coordinate x of the drive (see `Arm.effect_coordinates`): an actuator, a joint that actuators
-share, or a place where parts rub. The effort that the motors must add is coefficient * shape(x, v, state), pulled
-back to the actuators. A shape is written once: one of position alone as an expression, which serves the torque that
-holds an arm as well as its motion; one of velocity or with memory as a step, which a batch runs over a motion, a
-simulation in time.
+An effect acts along a coordinate x of the drive (see `Arm.effect_coordinates`): an actuator, a joint moved by several
+actuators, or a location of friction. The motors must add the effort coefficient * shape(x, v, state), pulled back to
+the actuators. A position-dependent shape is an expression, used for holding torques and motions. A shape with velocity
+or memory is a step function, used for batches and for simulation.
 """
 
 from __future__ import annotations
@@ -31,14 +30,14 @@ class EffectKind:
     """One kind of effect.
 
     Attributes:
-        unit: of the coefficient, of a coordinate that turns (N for N m and m for rad of one that slides).
-        scale: what `ActuatorEffect.scale` is of this kind; "" if it has none.
-        dissipative: it takes energy in all motions, so its coefficient is not negative.
-        revolute: only of a coordinate that turns.
-        loaded: its shape is times the load that the coordinate carries [N m, N].
-        code: what the compiled step calls it, if it depends on velocity or has a state.
-        of_position: (f, x, scale) -> the shape, if position is all that it depends on; such effects act at rest too. f
-            has the functions sin, cos, Min and Max, of numbers or of symbols.
+        unit: Unit of the coefficient for a revolute coordinate (N for N m and m for rad if prismatic).
+        scale: Meaning of `ActuatorEffect.scale` for this kind; "" if it has none.
+        dissipative: True if it dissipates energy in all motions, so its coefficient must not be negative.
+        revolute: True if it is allowed for revolute coordinates only.
+        loaded: True if its shape is multiplied by the load of the coordinate [N m, N].
+        code: Code of the kind in `effect_step`, if it depends on velocity or has a state.
+        of_position: Function (f, x, scale) -> shape for a kind that depends on position only. Such effects also act at
+            rest. f provides sin, cos, Min and Max for numbers or symbols.
     """
 
     unit: str
@@ -79,7 +78,7 @@ POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.of_po
 
 @numba.njit(cache=True)
 def effect_step(code: int, z: float, dx: float, v: float, scale: float) -> tuple[float, float]:
-    """The next state and the shape of the kind with this code, compiled; NaN for a kind of position alone."""
+    """Returns the next state and the shape for a kind's code; NaN for a kind that depends on position only."""
     if code == 1:
         return z, v
     if code == 2:
@@ -127,7 +126,7 @@ class ActuatorEffect:
 
     @property
     def dissipative(self) -> bool:
-        """Whether its coefficient must not be negative."""
+        """True if the coefficient must not be negative."""
         return EFFECT_KINDS[self.kind].dissipative
 
     def of_position(self, x: sympy.Expr) -> sympy.Expr:
@@ -143,7 +142,7 @@ class ActuatorEffect:
         return shape(functions, x, scale)
 
     def step(self, state: float, dx: float, x: float, v: float, load: float = 0.0) -> tuple[float, float]:
-        """The next state, and the shape there: for a simulation.
+        """Returns the next state and its shape, for a simulation.
 
         Args:
             state: dimensionless, 0 at the start; only the kinds of presliding have one.
@@ -190,7 +189,7 @@ def distinct_coordinates(arm: Arm) -> list[str]:
 
 
 def slides(arm: Arm, coordinate: str) -> bool:
-    """Whether a coordinate is a length [m] rather than an angle: of the actuator or joint that slides itself."""
+    """Returns whether a coordinate is a length [m], which is the case for prismatic actuators and joints."""
     return any(p and coordinate.endswith(f".{n}") for p, n in zip(arm.prismatic, arm.joint_names, strict=True))
 
 
@@ -210,12 +209,12 @@ def spring_over(coordinate: str, x: NDArray[np.float64]) -> ActuatorEffect:
 
 
 def effect_fault(arm: Arm, effect: ActuatorEffect, kinds: Collection[str] = EFFECT_KINDS) -> str:
-    """Why an arm cannot have this effect, with what it can have; "" if it can.
+    """Returns why an effect is not valid for an arm, with the allowed values; "" if it is valid.
 
     Args:
-        arm: whose effect it shall be.
-        effect: of any coordinate and kind.
-        kinds: that are allowed here.
+        arm: Arm of the effect.
+        effect: Effect to check.
+        kinds: Allowed kinds.
     """
     coordinates = arm.effect_coordinates
     if effect.coordinate not in coordinates:

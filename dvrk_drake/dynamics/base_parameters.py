@@ -1,4 +1,4 @@
-"""Base parameters: the combinations of link parameters that a regressor can tell apart, readably named."""
+"""Computes base parameters, the identifiable combinations of link parameters, with readable names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class StandardParameter:
-    """One inertial parameter of one link, as the field writes it.
+    """One inertial parameter of one link, in the usual notation.
 
     `label` is the link as the field counts it ("2", or a name such as "crank"). `axis` is "" for the mass m [kg], "x",
     "y", "z" for a first moment m c [kg m], "xx", "yy", "zz", "xy", "xz", "yz" for a moment or product of inertia
@@ -33,12 +33,12 @@ class StandardParameter:
 
     @property
     def is_inertia(self) -> bool:
-        """A second moment of mass, of a link or of a rotor."""
+        """True for a second moment of mass of a link or a rotor."""
         return self.axis == "a" or len(self.axis) == 2
 
     @property
     def unit(self) -> str:
-        """In SI."""
+        """SI unit of the parameter."""
         if self.is_inertia:
             return "kg" if self.slides else "kg m^2"
         return "kg m" if self.axis else "kg"
@@ -46,7 +46,7 @@ class StandardParameter:
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """beta = combination phi, and Y_base = the columns `columns` of the regressor of phi.
+    """Base parameters beta = combination phi; Y_base consists of the columns `columns` of the regressor of phi.
 
     Attributes:
         columns: (b,) index of the standard parameter whose column stands for each base parameter.
@@ -64,7 +64,7 @@ class BaseParameters:
 def independent_columns(
     regressor: NDArray[np.float64], tolerance: float = 1e-9
 ) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
-    """Independent columns of a regressor (rows, p), and B (b, p) with regressor = regressor[:, columns] B.
+    """Returns independent columns of a regressor (rows, p), and B (b, p) with regressor = regressor[:, columns] B.
 
     Args:
         regressor: stacked over random states; rows must be well over p.

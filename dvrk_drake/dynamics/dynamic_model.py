@@ -1,4 +1,4 @@
-"""An identified arm's efforts in motion: its links, rotors and the effects in its drive."""
+"""Efforts of an identified arm in motion, from its links, rotors and drive effects."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from dvrk_drake.models.schema_fault import number_fault
 def effect_shapes(
     regressor: DynamicRegressor, effects: Sequence[ActuatorEffect], q: ArrayLike, v: ArrayLike
 ) -> Iterator[NDArray[np.float64]]:
-    """(m,) shape of each effect along its coordinate x = h a, from state 0.
+    """Yields the shape (m,) of each effect along its coordinate x = h a, starting from state 0.
 
     The load of a coordinate is the effort f along it that bears the arm's weight as the SDF states it: of the efforts
     tau of the actuators at rest the part h f, f = h tau / h h.
@@ -47,32 +47,32 @@ def effect_shapes(
 
 
 def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.float64]:
-    """(m, n) efforts of the actuators [N m, N] that bear the arm's weight at poses q (m, n), as the SDF states it."""
+    """Returns the actuator efforts (m, n) [N m, N] that compensate gravity at poses q (m, n), for the SDF's links."""
     rest = np.zeros_like(q, dtype=np.float64)
     return regressor.arm.transmission.inverse.pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
 
 
-#: An actuator that needs no more than this at so many poses bears no weight [N m, N].
+#: An actuator with a gravity effort up to MIN_WEIGHT [N m, N] at WEIGHING_POSES random poses carries no weight.
 MIN_WEIGHT, WEIGHING_POSES = 1e-9, 20
 
 
 class DynamicModel:
-    """tau_actuator = J'^-1 Y(q, v, vd) phi + sum of effects, of one arm.
+    """Dynamic model of one arm: tau_actuator = J'^-1 Y(q, v, vd) phi + sum of effects.
 
     Attributes:
-        arm: whose model it is, mounted as the section says.
-        section: the numbers.
-        regressor: of the rigid bodies.
-        parameters: (p,) phi, for `regressor`.
-        effects: in the order of `coefficients`.
-        coefficients: (e,).
+        arm: Arm of the model, with the gravity vector of the section.
+        section: Parameters of the model.
+        regressor: Regressor of the rigid-body dynamics.
+        parameters: Parameters phi (p,) of `regressor`.
+        effects: Effects in the order of `coefficients`.
+        coefficients: Coefficients (e,) of the effects.
     """
 
     def __init__(self, arm: Arm, section: DynamicSection) -> None:
-        """Puts the numbers together.
+        """Creates the model from a section of a model file.
 
         Raises:
-            ModelError: they are not of this arm.
+            ModelError: The section does not match the arm.
         """
         self.arm = arm.with_gravity(section.gravity)
         self.section = section
@@ -86,17 +86,16 @@ class DynamicModel:
 
     @cached_property
     def links(self) -> tuple[LinkInertia, ...]:
-        """The identified links, to be written into a plant or an SDF."""
+        """Identified links, for use in a plant or an SDF."""
         return tuple(LinkInertia(link.link, np.array(link.parameters)) for link in self.section.links)
 
     @cached_property
     def holding_effects(self) -> tuple[int, ...]:
-        """Which effects act at rest as they do in motion.
+        """Indices of the effects that act at rest as they do in motion.
 
-        Those of position alone, but for the offset of an actuator that bears weight: weight that is not modelled quite
-        right looks like one, and so does friction that differs by direction (the -0.22 N m at the shoulder of the
-        public MTM are not there at rest; the -0.07 N m at its outer yaw are). Where the coordinate has a cable's
-        cosine, the offset is part of that curve, and stays.
+        These are the position-dependent effects, except the offset of an actuator that carries weight. Such an offset
+        can be an error of the gravity model or direction-dependent friction, which are not present at rest. If the
+        coordinate also has a cable cosine, the offset is part of that curve and is included.
         """
         arm = self.arm.with_gravity(self.section.gravity_expected or self.section.gravity)
         poses = arm.sample_poses(WEIGHING_POSES, np.random.default_rng(0))
@@ -110,12 +109,12 @@ class DynamicModel:
         )
 
     def rigid_body_effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
-        """(m, n) efforts of the actuators [N m, N] without effects, from motions (m, n) of the joints."""
+        """Returns the actuator efforts (m, n) [N m, N] without effects for a joint motion (m, n)."""
         tau = self.regressor.torque(q, v, vd, self.parameters)
         return self.arm.transmission.inverse.pull_back_effort(tau)
 
     def effect_effort(self, q: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
-        """(m, n) efforts of the actuators [N m, N] against the effects, over an evenly sampled motion of the joints."""
+        """Returns the actuator efforts (m, n) [N m, N] due to effects for an evenly sampled joint motion."""
         rows = self.arm.effect_coordinates
         tau = np.zeros(np.shape(q))
         shapes = effect_shapes(self.regressor, self.effects, q, v)
@@ -124,19 +123,19 @@ class DynamicModel:
         return tau
 
     def effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
-        """(m, n) efforts of the actuators [N m, N] over an evenly sampled motion of the joints (m, n).
+        """Returns the actuator efforts (m, n) [N m, N] for an evenly sampled joint motion (m, n).
 
-        Effects with memory start at rest with the first sample; sample at 400 Hz or more, or fine ones are missed.
+        Effects with memory start from state 0 at the first sample. Effects with a small travel require 400 Hz or more.
         """
         return self.rigid_body_effort(q, v, vd) + self.effect_effort(q, v)
 
     def mass_matrix(self, q: ArrayLike) -> NDArray[np.float64]:
-        """M (m, n, n) of the joints, rotors included, at poses q (m, n)."""
+        """Returns the mass matrix M (m, n, n) of the joints, including rotors, at poses q (m, n)."""
         return self.regressor.mass_matrix(q, self.parameters)
 
 
 def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
-    """Raises ModelError unless the section fits the arm, has bodies that can exist, and settings for every actuator."""
+    """Raises ModelError unless the section matches the arm and its links are physically consistent."""
     arm = regressor.arm
     if fault := number_fault(section):
         raise ModelError(f"dynamics.{fault}")

@@ -263,7 +263,7 @@ def _regressor_at_random_states(model: DynamicRegressor) -> NDArray[np.float64]:
 def _hinge_axes(
     plant: MultibodyPlant, model: DynamicRegressor, frames: list[tuple[str, RigidTransform]]
 ) -> dict[str, int]:
-    """Returns label -> index (0, 1, 2) of the axis of frame F that is parallel to the joint axis, for revolute joints."""
+    """Returns label -> index (0, 1, 2) of the axis of frame F parallel to the joint axis, for revolute joints."""
     axes = {}
     for link, (label, X_LF) in zip(model.links, frames, strict=True):
         joints = (plant.get_joint(i) for i in plant.GetJointIndices())

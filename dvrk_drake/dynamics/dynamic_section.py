@@ -1,4 +1,4 @@
-"""What a model file holds of an arm's full dynamics."""
+"""Section of a model file with an arm's full dynamics."""
 
 # No postponed annotations here: yaml_load_typed reads the types at run time.
 from dataclasses import dataclass, field
@@ -7,24 +7,27 @@ from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.schema_fault import formerly, within
 
-#: What a fit finds: beyond the largest arm by orders of magnitude, as parameters that a recording does not tell are
-#: found anywhere, and their standard errors are larger still.
+#: Allowed range of estimates. It is wide because parameters that a recording does not identify can have any value.
 ESTIMATES = within(-1e5, 1e5, "kg, kg m or kg m^2")
 STANDARD_ERRORS = within(0.0, 1e9)
 RMS_EFFORTS = within(0.0, 1e6, "N m or N")
-#: Of numbers that rounding may put beyond 0 or 1.
+#: Range from 0 to 1 with a tolerance for rounding.
 SHARES = within(-1e-6, 1.0 + 1e-6)
 _CUT_OFFS = within(0.01, 1e5, "Hz")
 
 
 @dataclass
 class LinkEstimate:
-    """The ten inertial parameters of a link about its origin in its frame of the SDF, see `LinkInertia`.
+    """Ten inertial parameters of a link about its origin in its SDF frame, see `LinkInertia`.
 
-    `least_eigenvalue` is that of its pseudo-inertia: positive for every body that can exist. `standard_errors` are of
-    the parameters, of one by one: base parameters are known far better. `mass_identifiability` is the share of the prior's
-    variance of the mass that the motion took away, 0..1: near 0 the mass is the SDF's. `bounds` says which bounds of
-    `consistent_parameters` it lies at.
+    Attributes:
+        link: Name of the link.
+        parameters: Estimated inertial parameters (10,).
+        least_eigenvalue: Smallest eigenvalue of the pseudo-inertia. It is positive for a physically consistent link.
+        standard_errors: Standard errors (10,) of the individual parameters. Base parameters have smaller ones.
+        mass_identifiability: Relative reduction of the prior variance of the mass by the motion, 0 to 1. Near 0, the
+            mass is that of the SDF.
+        bounds: Descriptions of the bounds of `consistent_parameters` that the link has reached.
     """
 
     link: str = ""
@@ -39,7 +42,7 @@ class LinkEstimate:
 class MotionParameterEstimate:
     """A base parameter of the full dynamics, see `derive_base_parameters`.
 
-    `identifiability` is the share of the prior's variance that the motion took away, 0..1.
+    `identifiability` is the relative reduction of the prior variance by the motion, 0 to 1.
     """
 
     name: str = ""
@@ -51,7 +54,7 @@ class MotionParameterEstimate:
 
 @dataclass
 class CorrelatedEstimates:
-    """Two base parameters, or a base parameter and an effect, that the motion hardly tells apart."""
+    """Two base parameters, or a base parameter and an effect, that are not identifiable separately."""
 
     first: str = ""
     second: str = ""
@@ -60,7 +63,7 @@ class CorrelatedEstimates:
 
 @dataclass
 class RotorEstimate:
-    """Inertia of a motor's rotor at its actuator [kg m^2; kg of a prismatic one]."""
+    """Inertia of a motor's rotor in actuator coordinates [kg m^2; kg for a prismatic actuator]."""
 
     actuator: str = ""
     value: float = field(default=0.0, metadata=within(0.0, 1e4, "kg m^2 or kg"))
@@ -69,11 +72,11 @@ class RotorEstimate:
 
 @dataclass
 class ActuatorStatistics:
-    """How the effort of one actuator was fitted, behind the low-pass: RMS in N m (N of one that slides).
+    """Statistics of the fit of one actuator's effort after low-pass filtering: RMS in N m (N if prismatic).
 
-    `rms_cross_validation`: of phases of the motion (or stretches, if it does not repeat) predicted by what the others
-    alone give, the choice of effects and the direction of gravity included.
-    `rms_repeatability`: by which the arm does not repeat its efforts from period to period; 0 where it is unknown.
+    `rms_cross_validation` is the prediction error on held-out phases of the motion, or on held-out segments if the
+    motion is not periodic. Effects and gravity direction are estimated anew without the held-out part.
+    `rms_repeatability` is the variation of the effort between periods, 0 if unknown.
     """
 
     name: str = ""
@@ -85,7 +88,7 @@ class ActuatorStatistics:
 
 @dataclass
 class SignalSettings:
-    """How signals were treated: cut-offs of zero-phase low-passes [Hz], delays of the efforts [s], per actuator."""
+    """Signal processing settings: cut-offs of the zero-phase low-pass filters [Hz] and delays of the efforts [s]."""
 
     position_cut_off: float = field(default=50.0, metadata=_CUT_OFFS)
     acceleration_cut_off: list[float] = field(default_factory=list, metadata=_CUT_OFFS)
@@ -95,11 +98,11 @@ class SignalSettings:
 
 @dataclass
 class DynamicSection:
-    """tau_actuator = J'^-1 Y(q, v, vd) phi + effects: an arm's identified dynamics.
+    """Identified dynamics of an arm: tau_actuator = J'^-1 Y(q, v, vd) phi + effects.
 
-    `gravity` [m/s^2] is gravity in the base frame as the motion shows it, the model's; `gravity_expected` is what it
-    was taken for before, from which it differs where the base was not quite level. `base_parameters` are what a motion
-    can tell of links and rotors, `correlations` which of them this one did not tell apart.
+    `gravity` [m/s^2] is the gravity vector in the base frame as estimated from the motion. `gravity_expected` is the
+    vector assumed before identification; the two differ if the base was tilted. `base_parameters` are the identifiable
+    combinations of link and rotor parameters. `correlations` lists pairs that are not identifiable separately.
     """
 
     gravity: list[float] = field(default_factory=list, metadata=GRAVITIES)

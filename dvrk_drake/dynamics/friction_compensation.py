@@ -1,4 +1,4 @@
-"""How much of an arm's friction a controller may take away without moving the arm by itself."""
+"""Computes how much friction a controller can compensate without causing the arm to move by itself."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ WRONG_AT_MOST = 2.0
 
 @dataclass(frozen=True)
 class Friction:
-    """The friction in an arm's drive, as identified: effects that only take energy.
+    """Friction in the drive of an arm, as a sum of dissipative effects.
 
     Attributes:
-        arm: in whose drive it is.
-        effects: each dissipative, see `EFFECT_KINDS`.
-        coefficients: (k,) one for each effect, not negative, in the unit of its kind.
+        arm: Arm of the friction.
+        effects: Dissipative effects, see `EFFECT_KINDS`.
+        coefficients: Nonnegative coefficients (k,) of the effects, in the units of their kinds.
     """
 
     arm: Arm
@@ -83,10 +83,10 @@ class Friction:
 
     @classmethod
     def of_model(cls, model: IdentifiedModel) -> Friction:
-        """What a model that was identified from a motion says.
+        """Returns the friction of a model that was identified from a motion.
 
         Raises:
-            ModelError: it was identified from poses.
+            ModelError: The model was identified from poses.
         """
         if model.dynamics is None:
             raise ModelError(
@@ -113,10 +113,10 @@ class Friction:
 
 
 def check_ratios(ratio: float, hysteresis_ratio: float = 0.0) -> None:
-    """Whether these shares may be asked for.
+    """Checks the requested compensation ratios.
 
     Raises:
-        ControllerError: one is below 0, or above `MAX_RATIO` or `MAX_HYSTERESIS_RATIO`.
+        ControllerError: A ratio is below 0, or above `MAX_RATIO` or `MAX_HYSTERESIS_RATIO`.
     """
     for name, share, largest in (
         ("friction ratio", ratio, MAX_RATIO),

@@ -1,4 +1,4 @@
-"""The parameters of an arm's links that gravity tells, and their base set, by numbers alone."""
+"""Computes the base parameters of an arm's gravity torque numerically."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from dvrk_drake.models.plant import set_arm_positions, shared_plant, tree_select
 
 @dataclass(frozen=True, eq=False)
 class GravityParameters:
-    """tau = Y(q) beta holds the arm against gravity: the base parameters beta of its links.
+    """Base parameters beta of the links, with the holding torque tau = Y(q) beta.
 
     Attributes:
         arm: whose links these are.
@@ -41,12 +41,12 @@ class GravityParameters:
 
     @property
     def standard_values(self) -> NDArray[np.float64]:
-        """(p,) of the SDF [kg, kg m]."""
+        """Standard parameters (p,) of the SDF [kg, kg m]."""
         return self.to_standard @ np.concatenate([link.parameters for link in link_inertias(self.arm)])
 
     @property
     def base_values(self) -> NDArray[np.float64]:
-        """(b,) base parameters of the SDF, in `base.units`."""
+        """Base parameters (b,) of the SDF, in `base.units`."""
         return self.base.combination @ self.standard_values
 
     def combination_of(self, links: Sequence[str]) -> NDArray[np.float64]:
@@ -58,7 +58,7 @@ class GravityParameters:
 
 @cache
 def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> GravityParameters:
-    """Finds the base parameters of an arm's gravity torque.
+    """Returns the base parameters of an arm's gravity torque.
 
     Args:
         arm: the arm; its gravity vector sets the mounting.
@@ -172,12 +172,12 @@ def labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[Rigid
 
 
 def arm_instance(plant: MultibodyPlant) -> ModelInstanceIndex:
-    """The model instance of the arm in a plant that holds one."""
+    """Returns the model instance of the arm in a plant with one arm."""
     return plant.GetBodyByName("base_link").model_instance()
 
 
 def exact_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """R with the entries that are 0 or +-1 but for the rounding of their angles made exactly that."""
+    """Returns R with elements within rounding error of 0 or +-1 replaced by the exact values."""
     return np.where(np.abs(R - np.round(R)) < 1e-12, np.round(R), R)
 
 

@@ -1,4 +1,4 @@
-"""The ten inertial parameters of a link, in which all equations of motion are linear."""
+"""Inertial parameters of links and rotors, in which the equations of motion are linear."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class LinkInertia:
 
 
 def link_inertias(arm: Arm) -> tuple[LinkInertia, ...]:
-    """Every link of the arm that can move, linkage and instrument included, as its SDF has them."""
+    """Returns all moving links of the arm, including linkage and instrument, with the inertias of the SDF."""
     return tuple(
         LinkInertia.from_spatial_inertia(body.name(), body.default_spatial_inertia())
         for body in moving_bodies(shared_plant(arm))
@@ -71,7 +71,7 @@ def link_inertias(arm: Arm) -> tuple[LinkInertia, ...]:
 
 
 def moving_bodies(plant: MultibodyPlant) -> Iterator[RigidBody]:
-    """The bodies of a finalized plant that are not anchored to the world, in the order of the SDF."""
+    """Returns the bodies of a finalized plant that are not anchored to the world, in the order of the SDF."""
     bodies = (
         plant.get_body(index) for index in plant.GetBodyIndices(plant.GetBodyByName("base_link").model_instance())
     )
@@ -129,7 +129,7 @@ class RotorInertia:
 
     @property
     def name(self) -> str:
-        """Such as "rotor.wrist_yaw", "rotor.wrist_pitch*wrist_yaw"."""
+        """Name of the parameter, such as "rotor.wrist_yaw", "rotor.wrist_pitch*wrist_yaw"."""
         a, b = self.actuators
         return f"rotor.{a}" if a == b else f"rotor.{a}*{b}"
 

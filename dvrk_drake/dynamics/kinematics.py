@@ -16,7 +16,7 @@ from dvrk_drake.models.plant import set_arm_positions, shared_plant, tree_select
 
 
 def handle_frame(arm: Arm) -> str:
-    """Name of the frame that a hand takes an arm at: the last of its DH frames, dh_7 of an MTM, dh_6 of a PSM.
+    """Returns the name of the handle's frame, the last DH frame: dh_7 for an MTM, dh_6 for a PSM.
 
     Raises:
         ArmError: the SDF has no frame dh_0, dh_1, ...
@@ -34,10 +34,10 @@ class ArmFrame:
     """
 
     def __init__(self, arm: Arm, frame_name: str) -> None:
-        """Of the frame that the arm's SDF names so, e.g. "dh_7".
+        """Creates the kinematics of a frame of the SDF, e.g. "dh_7".
 
         Raises:
-            ArmError: the SDF has no such frame.
+            ArmError: The SDF has no such frame.
         """
         self._arm = arm
         self._plant = shared_plant(arm)
@@ -51,12 +51,12 @@ class ArmFrame:
         self._G[tree_selector(self._plant, arm)] = arm.linkage.matrix
 
     def pose(self, q: ArrayLike) -> RigidTransform:
-        """X_BF."""
+        """Returns the pose X_BF."""
         self._set(q)
         return self._frame.CalcPoseInWorld(self._context)
 
     def jacobian(self, q: ArrayLike) -> NDArray[np.float64]:
-        """J (6, n) with V_BF = J v: angular velocity [rad/s], then that of F's origin [m/s], in B."""
+        """Returns J (6, n) with V_BF = J v: angular velocity [rad/s], then velocity of F's origin [m/s], in B."""
         self._set(q)
         world = self._plant.world_frame()
         J = self._plant.CalcJacobianSpatialVelocity(
@@ -74,7 +74,7 @@ class ArmFrame:
 
 
 def _frame_names(plant: MultibodyPlant) -> list[str]:
-    """Of the frames that the SDF names beside its links."""
+    """Returns the names of the DH frames in the SDF."""
     frames = (plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames()))
     return [frame.name() for frame in frames if frame.name().startswith("dh_")]
 
@@ -92,7 +92,7 @@ class PsmInverseKinematics:
     """
 
     def __init__(self, arm: Arm, frame_name: str = "dh_6", min_depth: float = 1e-3) -> None:
-        """For `arm`, and the frame of its wrist yaw link that is placed.
+        """Creates the inverse kinematics of `arm` for a frame on its wrist yaw link.
 
         Args:
             arm: a PSM.
@@ -116,7 +116,7 @@ class PsmInverseKinematics:
         self._min_depth = min_depth
         frame = ArmFrame(arm, frame_name)
         self._X_LF = plant.GetFrameByName(frame_name).GetFixedPoseInBodyFrame()
-        # The formulas take the axes for granted: try them.
+        # The formulas assume certain joint axes. Verify them at one pose.
         q = np.clip(
             [0.3, -0.2, 0.1, 0.5, -0.4, 0.6, *np.zeros(arm.num_joints - 6)], arm.position_lower, arm.position_upper
         )

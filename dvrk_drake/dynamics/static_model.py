@@ -1,4 +1,4 @@
-"""The torque that holds an arm, tau = feedforward_scale o (Y(q) beta + effects(q)): compiled, for any arm and choice of effects."""
+"""Compiled holding torque of an arm with any choice of effects, before scaling: tau = Y(q) beta + effects(q)."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ from dvrk_drake.models.arm import Arm
 
 @dataclass(frozen=True, eq=False)
 class StaticModel:
-    """Regressor and torque of one structure (arm and effects); the parameters stay arguments.
+    """Regressor and torque of one model structure (arm and effects), as functions of the parameters.
 
-    Parameters theta are the b base parameters [kg m, kg], then one coefficient per effect, in the
-    unit of its kind. Each function is compiled when it is first asked for: a controller needs no regressor, and
-    identification no torque.
+    The parameters theta are the b base parameters [kg m, kg], then one coefficient per effect in the unit of its kind.
+    Each function is compiled at its first use, because a controller needs no regressor and identification no torque.
 
     Attributes:
-        gravity: the symbolic derivation.
-        effects: of kinds in `POSITION_KINDS`, in the order of theta.
+        gravity: Symbolic gravity torque.
+        effects: Effects with kinds in `POSITION_KINDS`, in the order of theta.
     """
 
     gravity: SymbolicGravity
@@ -59,19 +58,19 @@ class StaticModel:
         return len(self.gravity.base.names) + len(self.effects)
 
     def regressor(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Y with tau = Y theta: (n, p) for one pose q (n,), (m, n, p) for m poses (m, n)."""
+        """Returns Y with tau = Y theta: (n, p) for one pose q (n,), (m, n, p) for m poses (m, n)."""
         q = np.asarray(q, dtype=np.float64)
         return self._regressor_batch(q) if q.ndim == 2 else self._regressor_batch(q[None])[0]
 
     def torque(self, q: ArrayLike, theta: ArrayLike) -> NDArray[np.float64]:
-        """Holding torque [N m or N]: (n,) for one pose q (n,), (m, n) for m poses (m, n)."""
+        """Returns the holding torque [N m or N]: (n,) for one pose q (n,), (m, n) for m poses (m, n)."""
         q = np.asarray(q, dtype=np.float64)
         theta = np.ascontiguousarray(theta, dtype=np.float64)
         return self._torque_batch(q, theta) if q.ndim == 2 else self._torque_batch(q[None], theta)[0]
 
 
 def symbolic_regressor(gravity: SymbolicGravity, effects: tuple[ActuatorEffect, ...]) -> sympy.Matrix:
-    """The regressor (n, b + e) as sympy, with the number of |gravity| put in."""
+    """Returns the regressor (n, b + e) as a sympy matrix, with the numeric value of |gravity|."""
     of_links = sympy.Matrix(gravity.regressor).subs(GRAVITY, sympy.Float(gravity.gravity_magnitude))
     return sympy.Matrix.hstack(of_links, *_effect_columns(gravity.arm, gravity.q, effects))
 
@@ -89,21 +88,22 @@ def _effect_columns(
 
 
 def _number(x: float) -> sympy.Expr:
-    # Exact where it is whole: 1.0 x is a multiplication, x is none.
+    # Integers are exact, so that 1.0 x is simplified to x.
     return sympy.Integer(round(x)) if abs(x - round(x)) < 1e-12 else sympy.Float(x)
 
 
 @cache
 def compile_static_model(arm: Arm, effects: tuple[ActuatorEffect, ...] = ()) -> StaticModel:
-    """The one model of this structure: derived the first time, within two seconds; compiled where it is used."""
+    """Returns the cached model of this structure. It is derived at the first call and compiled at its first use."""
     return StaticModel(derive_gravity(arm), effects)
 
 
 @cache
 def compile_effect_torque(arm: Arm, effects: tuple[ActuatorEffect, ...]) -> Callable[..., None]:
-    """Compiled f(q, coefficients, out), float64 C-contiguous (n,), (e,), (n,): what motors need to hold the effects.
+    """Compiles f(q, coefficients, out), the joint torque that compensates the effects at rest.
 
-    They are of kinds in `POSITION_KINDS`; [rad, m], units of the kinds, [N m, N].
+    The arguments are C-contiguous float64 arrays (n,) [rad, m], (e,) [units of the kinds] and (n,) [N m, N]. The kinds
+    of the effects must be in `POSITION_KINDS`.
     """
     q = sympy.symbols(f"q1:{arm.num_joints + 1}", real=True)
     coefficients = sympy.symbols(f"c0:{len(effects)}")

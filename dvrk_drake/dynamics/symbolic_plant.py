@@ -1,4 +1,4 @@
-"""An arm's plant in symbols: its frames and potential energy as functions of the independent joints."""
+"""Symbolic plant of an arm: its frames and potential energy as functions of the independent joints."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dvrk_drake.models.plant import shared_plant, tree_selector
 
 
 class SymbolicPlant:
-    """`MultibodyPlant.ToSymbolic()` with the linkage put in: every position is a function of q1..qn.
+    """`MultibodyPlant.ToSymbolic()` with the linkage substituted: every position is a function of q1..qn.
 
     Attributes:
         arm: the arm.

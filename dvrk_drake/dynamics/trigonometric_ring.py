@@ -1,4 +1,4 @@
-"""Polynomials in the sines and cosines of angles: what the poses of a tree of links are made of."""
+"""Polynomials in sines and cosines of angles, which represent the poses of a tree of links."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class TrigonometricRing:
         return _without_rounding(polynomial)
 
     def derivative(self, polynomial: Polynomial, q: sympy.Symbol) -> Polynomial:
-        """By a position."""
+        """Returns the derivative with respect to a position."""
         result: Polynomial = {}
         for monomial, coefficient in polynomial.items():
             for index, power in Counter(monomial).items():
@@ -66,7 +66,7 @@ class TrigonometricRing:
         return result
 
     def shortest(self, polynomial: Polynomial) -> Polynomial:
-        """The same with the angles of parallel joints added up.
+        """Returns an equal polynomial with the angles of parallel joints combined.
 
         For a pair (a, b) of the ring's sums products such as sin a cos b + cos a sin b become sin(a + b) where that is
         shorter; cos^2 is eliminated, so that what is identically zero becomes 0. Coefficients of rounding's size are
