@@ -177,7 +177,7 @@ def waits_for_an_operator(status):
 @pytest.mark.parametrize("seconds", [0.05, 0.2, 1.0])
 @pytest.mark.parametrize("stalled", ["arm", "controller"])
 def test_arm_holds_after_stall_until_operator_resumes(stalled, seconds):
-    """By signals, with the expiry that a real arm has. One of 20 ms may last longer: its test has a simulated clock.
+    """Stalls by signals, with the expiry of a real arm. The test of 20 ms stalls uses a simulated clock.
 
     A busy computer may stop one of them before the test does: that has the same end.
     """
