@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem, residuals
-from dvrk_drake.analysis.dynamic.effect_selection import MIN_CORRELATION, select_effects
+from dvrk_drake.analysis.dynamic.effect_selection import NUM_HELD_OUT_FOLDS, select_effects
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.analysis.signals.repetition import FOLDS, period_of
 from dvrk_drake.models.arm import load_arm
@@ -36,16 +36,16 @@ def main() -> None:
     problem = motion_problem(grid, tau, period_of(grid))
     squares = np.zeros(arm.num_joints)
     print("error of the actuators' efforts [%], mean last")
-    for first in range(0, FOLDS, MIN_CORRELATION):
-        left_out = (problem.fold >= first) & (problem.fold < first + MIN_CORRELATION)
+    for first in range(0, FOLDS, NUM_HELD_OUT_FOLDS):
+        left_out = (problem.fold >= first) & (problem.fold < first + NUM_HELD_OUT_FOLDS)
         before = (problem.fold == (first - 1) % FOLDS) & problem.edge[:, 1]
-        after = (problem.fold == (first + MIN_CORRELATION) % FOLDS) & problem.edge[:, 0]
+        after = (problem.fold == (first + NUM_HELD_OUT_FOLDS) % FOLDS) & problem.edge[:, 0]
         choice = select_effects(problem.subset(~(left_out | before | after)))
         fit = choice.problem.consistent(choice.chosen, choice.weights)
         part = replace(problem.subset(left_out), tilt=choice.problem.tilt)
         errors = np.sum(residuals(part, choice.chosen, fit) ** 2, axis=0)
         squares += errors
-        show(f"phases {first}-{first + MIN_CORRELATION - 1} of {FOLDS}", errors, np.sum(part.columns.tau**2, axis=0))
+        show(f"phases {first}-{first + NUM_HELD_OUT_FOLDS - 1} of {FOLDS}", errors, np.sum(part.columns.tau**2, axis=0))
     show("all of them", squares, np.sum(problem.columns.tau**2, axis=0))
 
 

@@ -73,7 +73,7 @@ def _motion(motion: str, source: str) -> tuple[Finding, ...]:
     if not motion:
         return ()
     what = f"the arm moves in this recording ({motion})"
-    advice = "the model holds poses, and knows nothing of inertia and of moving friction"
+    advice = "the model is static: it has no inertia and no friction of motion"
     return (Finding("warning", "motion", source, what, advice),)
 
 

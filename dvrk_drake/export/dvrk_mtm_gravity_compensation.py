@@ -168,7 +168,7 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
         ModelError: The model has no dynamics.
     """
     if model.dynamics is None:
-        raise ModelError("the model has no dynamics, so it knows no friction; give it with --coulomb")
+        raise ModelError("the model has no dynamics, so it has no friction; give it with --coulomb")
     arm = model.arm
     friction = np.zeros(arm.num_joints)
     for effect in model.dynamics.effects:
@@ -258,12 +258,12 @@ def _refuse_errors(
     lean = float(np.rad2deg(np.arccos(np.clip(-down[2] / np.linalg.norm(down), -1.0, 1.0))))
     limits = ["a last link balanced about its roll axis"]
     if lean > 0.05:
-        limits.append(f"an upright base, which here leans by {lean:.1f} deg")
+        limits.append(f"an upright base, here tilted by {lean:.1f} deg")
     if np.any((model.feedforward_scale != 0) & (model.feedforward_scale != 1)):
         limits.append("no feedforward scale below 1")
     reasons = {
-        f"gravity {gravity_off.max():.2g} (the file knows {', '.join(limits)})": gravity_off.max(),
-        f"effects {effects_off.max():.2g} (it knows polynomials of order 4 in a joint's own position, nothing at "
+        f"gravity {gravity_off.max():.2g} (the file supports {', '.join(limits)})": gravity_off.max(),
+        f"effects {effects_off.max():.2g} (it supports polynomials of order 4 in a joint's own position, nothing at "
         "joint 7)": effects_off.max(),
     }
     raise ModelError(
@@ -307,5 +307,5 @@ def _torque_limits(
 
 def _seven(name: str, values: tuple[float, ...]) -> NDArray[np.float64]:
     if len(values) != NUM_JOINTS or not np.all(np.isfinite(values)) or min(values) < 0:
-        raise ModelError(f"{name} must be {NUM_JOINTS} numbers of 0 or more, one a joint")
+        raise ModelError(f"{name} must be {NUM_JOINTS} numbers of 0 or more, one per joint")
     return np.array(values, dtype=np.float64)

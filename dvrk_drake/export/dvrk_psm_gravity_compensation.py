@@ -54,7 +54,7 @@ class KinematicCompensation:
         mass: Masses (7,) [kg].
         center: Centres of mass (7, 3) in the DH frames of the links [m].
         error: (3,) largest difference from the model over the joint box, instrument straight [N m, N m, N].
-        wrist: (3,) largest torque that the instrument's own joints add or take, which the file knows nothing of.
+        wrist: (3,) largest torque that the instrument's own joints add or take, which the file cannot represent.
     """
 
     alpha: NDArray[np.float64]
@@ -127,7 +127,7 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
         off = ", ".join(f"{name} {e:.2g}" for name, e in zip(ARM_JOINTS, error, strict=True) if e > tolerance)
         raise ModelError(
             f"the controller's file cannot hold this model: over the joint box it would be off by up to {off} "
-            "(N m; N on insertion). It knows gravity only, and no feedforward scale below 1; left out: "
+            "(N m; N on insertion). It has gravity only, and no feedforward scale below 1; left out: "
             f"{_left_out(model, straight)}. To accept it, repeat the command with "
             f"--gc-tolerance {round_up(error.max()):g}"
         )

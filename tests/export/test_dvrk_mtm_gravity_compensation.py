@@ -29,7 +29,7 @@ from dvrk_drake.reports.figures.export import plot_compensation
 
 pytestmark = pytest.mark.slow
 
-#: Gravity [m/s^2] of an arm whose base is tilted by 2.3 degrees.
+#: Gravity [m/s^2] of an arm whose tilted by 2.3 degrees.
 TILTED = [0.01, -0.39, -9.80]
 
 
@@ -195,12 +195,12 @@ def test_what_the_file_cannot_hold_is_refused_and_named():
         compensation_from_model(eccentric)
     with pytest.raises(ModelError, match=r"masses are estimates of the SDF.*dvrk-drake identify") as refusal:
         compensation_from_model(eccentric)
-    assert "leans" not in str(refusal.value) and "feedforward_scale" not in str(refusal.value)
+    assert "tilted" not in str(refusal.value) and "feedforward_scale" not in str(refusal.value)
     # The line names a tolerance that is enough.
     compensation_from_model(eccentric, CompensationOptions(tolerance=0.0025))
     spring = balanced()
     spring.effects = [DriveEffect("joint.wrist_pitch", "cable sine", 1.0, 0.05)]
-    with pytest.raises(ModelError, match=r"up to wrist_pitch 0\.0\d+ N m\. Of that: effects 0\.0\d+ \(it knows"):
+    with pytest.raises(ModelError, match=r"up to wrist_pitch 0\.0\d+ N m\. Of that: effects 0\.0\d+ \(it supports"):
         compensation_from_model(spring)
     # A quartic over +-2.44 rad misses 0.05 sin(q) by a few hundredths of it, not more.
     compensation_from_model(spring, CompensationOptions(tolerance=0.05 * 0.08))
@@ -238,7 +238,7 @@ def test_a_leaning_base_is_refused_by_default_and_held_as_well_as_the_file_can(t
     model.save(given)
     assert main(["export", "--model", str(given), "--dvrk-gc", str(out)]) == 2
     error = refusal(capsys.readouterr().err)
-    assert "leans by 2.3 deg" in error and not out.exists()
+    assert "tilted by 2.3 deg" in error and not out.exists()
     # The line names the option that accepts it, and the file is then as close as the line says.
     tolerance = error.split("--gc-tolerance ")[1]
     assert main(["export", "--model", str(given), "--dvrk-gc", str(out), "--gc-tolerance", tolerance]) == 0

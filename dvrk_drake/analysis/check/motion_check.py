@@ -141,7 +141,7 @@ def _gap_findings(recording: Recording, gaps: NDArray[np.int_]) -> list[Finding]
     intervals = np.diff(np.asarray(recording.t))
     largest = int(gaps[np.argmax(intervals[gaps])])
     what = f"{len(gaps)} gaps, the largest {intervals[largest]:.3g} s before {recording.where(largest + 1)}"
-    advice = "nobody knows what the arm did meanwhile: split it there; signals are checked in the longest piece"
+    advice = "the motion in the gap is unknown: split the recording there; signals are checked in the longest piece"
     return [Finding("warning", "gaps", "t", what, advice, size=float(intervals[largest]))]
 
 
@@ -192,7 +192,7 @@ def _together(signals: MotionSignals, moving: NDArray[np.bool_], names: tuple[st
     for a, b in np.argwhere(np.triu(correlation, 1) > MIN_CORRELATION):
         i, j = int(index[a]), int(index[b])
         what = f"move together (correlation of their speeds {correlation[a, b]:.3f})"
-        advice = "their inertia and friction cannot be told apart; move them independently"
+        advice = "their inertia and friction are not identifiable separately; move them independently"
         size = float(correlation[a, b])
         findings.append(Finding("warning", "move together", f"{names[i]}, {names[j]}", what, advice, (i, j), size))
     return findings

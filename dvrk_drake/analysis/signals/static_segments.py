@@ -213,8 +213,8 @@ def _parts_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Ar
 
 #: Note on models that are identified from low-speed segments.
 LOW_SPEED_NOTE = (
-    "where a joint is slow is taken for a pose of it; friction stays in its torque, and other joints may move: trust "
-    "the ten-fold errors, and another day's recording, not the fit"
+    "low-speed segments are treated as static poses; their torques contain friction, and other joints may move: judge "
+    "the model by its cross-validated errors and by another recording, not by the errors of the fit"
 )
 
 

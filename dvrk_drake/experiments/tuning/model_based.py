@@ -28,7 +28,7 @@ GRAVITY_ERROR, INTEGRAL_SHARE = 0.2, 0.15
 #: Candidate frequencies in descending order [rad/s].
 FREQUENCIES = np.geomspace(300.0, 1.0, 400)
 #: Number of poses for the mass matrix, and number of these at which the stability of all joints together is checked.
-POSES, MIN_CORRELATION = 200, 20
+POSES, NUM_STABILITY_POSES = 200, 20
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def design_arm(arm: Arm) -> ArmDesign:
     slowed = np.ones(arm.num_joints)
     harder = Sampling(sampling.period, sampling.ticks + 1, sampling.cut_off)
     viscous = [fact.viscous for fact in facts]
-    loops = [SampledLoop(0.8 * M, harder, viscous) for M in masses[:: POSES // MIN_CORRELATION]]
+    loops = [SampledLoop(0.8 * M, harder, viscous) for M in masses[:: POSES // NUM_STABILITY_POSES]]
     while np.min(slowed) > 0.1:
         gains = rounded_gains((joint.kp, joint.kd, joint.ki) for joint in joints)
         growth, shares = max((loop.least_damped_mode(gains) for loop in loops), key=lambda mode: mode[0])
