@@ -26,7 +26,7 @@ HOLDING_SPEED = 0.25
 MAX_RATIO = 0.6
 #: The same of hysteresis that springs back, which is a part of it.
 MAX_HYSTERESIS_RATIO = 0.9
-#: How many times as wrong as on average over its own recording a model is anywhere: rarely more on simulated arms.
+#: Assumed ratio of a model's maximum holding error to its leave-one-out RMS error; rarely exceeded on simulated arms.
 WRONG_AT_MOST = 2.0
 
 
@@ -71,10 +71,12 @@ class Friction:
 
     @classmethod
     def of_arm(cls, arm: Arm) -> Friction:
-        """What the arm's files state, without what falls with speed: compensated, it would push an arm that slides.
+        """Returns the friction of the arm's files, without effects that decrease with speed.
+
+        Compensation of such effects would accelerate a moving arm.
 
         Raises:
-            ControllerError: they state none.
+            ControllerError: The files contain no friction.
         """
         effects = [effect for effect in arm.effects.friction if not effect.fall_speed]
         if not effects:
@@ -129,7 +131,7 @@ def check_ratios(ratio: float, hysteresis_ratio: float = 0.0) -> None:
 def safe_ratios(
     friction: Friction, ratio: float, holding_error: ArrayLike, hysteresis_ratio: float = 0.0
 ) -> NDArray[np.float64]:
-    """The share of each effect that may be compensated: at most `ratio`, and never so much that the arm creeps.
+    """Returns the ratio of each effect that can be compensated without creep, at most `ratio`.
 
     What remains of the friction that holds the arm at rest must hold whatever the gravity compensation may be wrong by:
     for every torque e in the box |e_i| <= holding_error_i there must be forces f_k along the coordinates with
@@ -200,8 +202,8 @@ def _largest(
 
 
 def holding_error(model: IdentifiedModel) -> NDArray[np.float64]:
-    """(n,) by which the model's gravity torque may be wrong [N m, N]: `WRONG_AT_MOST` times that at left-out poses.
+    """Returns the assumed error (n,) of the model's gravity torque [N m, N].
 
-    Zero for a model that was not identified from poses.
+    It is `WRONG_AT_MOST` times the leave-one-out RMS error, and zero for a model that was not identified from poses.
     """
     return WRONG_AT_MOST * np.array([joint.rms_leave_one_out_included for joint in model.joints])
