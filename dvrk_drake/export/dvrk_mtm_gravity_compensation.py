@@ -190,9 +190,9 @@ def _gravity_torque(model: IdentifiedModel, q: NDArray[np.float64]) -> NDArray[n
 
 
 def _gravity_parameters(model: IdentifiedModel, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(40,) the ten columns of gravity, fitted over whole turns of all joints: there they are well apart.
+    """Returns the parameters (40,), with the ten gravity columns fitted over full turns of all joints.
 
-    Then the polynomials nearest, over the joint box, to what these leave: little but for a base that leans.
+    The residual, which is small unless the base is tilted, is approximated by polynomials over the joint box.
     """
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (400, NUM_JOINTS))
     R = controller_regressor(q)[:, :, :NUM_GRAVITY]

@@ -73,11 +73,12 @@ class CompensationComparison:
     Attributes:
         file, model: File and model that are compared.
         joints: One comparison per joint.
-        q: (m, 7) poses [rad], inside the joint box and the coupled limits.
-        model_torque, file_torque, clipped_torque: (m, 7) [N m] at rest; `file_torque` before the clip.
-        clipped, opposed, runaway: (m, 7) True where `JointComparison` counts the pose.
-        in_sweep: (m,) True where all of the first six joints are inside the file's sweep.
-        other_side: the mirror image of the model fits the file clearly better: the file is one of the other side's arm.
+        q: Poses (m, 7) [rad], inside the joint box and the coupled limits.
+        model_torque, file_torque, clipped_torque: Torques (m, 7) [N m] at rest. `file_torque` is before clipping.
+        clipped, opposed, runaway: Masks (m, 7), True for poses that are counted in `JointComparison`.
+        in_sweep: Mask (m,), True where all of the first six joints are inside the file's sweep.
+        other_side: True if the mirror image of the model fits the file clearly better. The file is then of an arm of
+            the other side.
     """
 
     file: GravityCompensationFile

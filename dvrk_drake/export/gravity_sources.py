@@ -54,7 +54,10 @@ def to_latex(gravity: SymbolicGravity, frame_poses: Mapping[str, sympy.Matrix]) 
 
 
 def to_python(gravity: SymbolicGravity) -> str:
-    """Returns a Python module with `gravity_torque(q, g, beta, out)` and `gravity_regressor(q, g, out)`."""
+    """Returns a Python module with `gravity_torque(q, g, beta, out)` and `gravity_regressor(q, g, out)`.
+
+    The module has no dependencies.
+    """
     torque, regressor, arguments, beta_argument = _functions(gravity)
     names = "".join(f"    ({value!r}, {name!r}),\n" for name, value in _named_values(gravity))
     return (
@@ -70,7 +73,10 @@ def to_python(gravity: SymbolicGravity) -> str:
 
 
 def to_c(gravity: SymbolicGravity) -> str:
-    """Returns C99 source of `<arm>_gravity_torque(q, g, beta, out)` and `<arm>_gravity_regressor(q, g, out)`."""
+    """Returns C99 source of `<arm>_gravity_torque(q, g, beta, out)` and `<arm>_gravity_regressor(q, g, out)`.
+
+    The output is row-major.
+    """
     torque, regressor, arguments, beta_argument = _functions(gravity)
     prefix = gravity.arm.name.lower()
     table = "\n".join(f" *   beta[{i}] = {v!r}: {name}" for i, (name, v) in enumerate(_named_values(gravity)))

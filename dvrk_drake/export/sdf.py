@@ -19,7 +19,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import MAX_BINARY, atomic_write, open_input, read_json_input
 from dvrk_drake.models.sdf_model import DRAKE, PACKAGE_URL, compose_sdf, local_path
 
-#: Relative change below which a link keeps its text: what converting an inertia back and forth rounds off.
+#: Relative change of rounding errors, below which the text of a link is kept.
 _UNCHANGED = 1e-12
 
 
@@ -163,13 +163,13 @@ def _add(parent: ElementTree.Element, tag: str, text: str) -> None:
 
 
 def _numbers(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
-    """In full precision; what is rounding beside the largest of them is 0."""
+    """Formats numbers in full precision. Rounding errors relative to the largest number become 0."""
     least = 1e-15 * max(abs(x) for x in values)
     return [repr(float(x)) if abs(x) > least else "0" for x in values]
 
 
 def _same(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
-    """Each of mass, first moments and inertia against its own size."""
+    """Compares mass, first moments and inertia, each relative to its own size."""
     parts = (slice(0, 1), slice(1, 4), slice(4, 10))
     return all(np.abs(a[p] - b[p]).max() <= _UNCHANGED * np.abs(a[p]).max() for p in parts)
 
@@ -183,7 +183,7 @@ def mesh_folder(model_path: Path) -> str:
 
 
 def refuse_existing_meshes(model_path: str | Path, overwrite: bool) -> None:
-    """Raises DvrkDrakeError if the folder for a model's meshes holds files, unless they may be replaced."""
+    """Raises DvrkDrakeError if the folder for a model's meshes contains files, unless they may be replaced."""
     folder = Path(model_path).with_name(mesh_folder(Path(model_path)))
     if not overwrite and folder.is_dir() and any(folder.iterdir()):
         raise DvrkDrakeError(

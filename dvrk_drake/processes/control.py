@@ -29,7 +29,7 @@ from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandSender
 #: Time without a status after which an arm is considered absent, and the longer time for its first status [s].
 _SILENCE, _FIRST_WAIT = 1.0, 10.0
 
-#: Longest period of the measurements [us]. With its own gains a PSM becomes unstable at 7 ms and an MTM at 10 ms.
+#: Longest period of the measurements [us]. With its own gains a PSM oscillates at 7 ms and an MTM at 10 ms.
 _MAX_PERIOD = 5000
 
 #: Length of the queue of statuses, beyond which new ones are dropped. Number of statuses that are processed at once, so
