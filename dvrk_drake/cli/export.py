@@ -59,8 +59,8 @@ def export(
         friction: Also compensate the Coulomb friction of the model. Requires a model identified from a motion.
         coulomb: Coulomb friction of each joint [N m], instead of --friction.
         friction_ratio: Share of the friction to compensate, 0 to 1, per joint. Without it: as in dVRK files in use.
-        dead_band: Speed of each joint [rad/s] below which friction is not compensated. Without it: as in dVRK files in use.
-        saturation: Speed of each joint [rad/s] above which friction is fully compensated. Without it: as in dVRK files in use.
+        dead_band: Joint speed [rad/s] below which friction is not compensated. Without it: as in files in use.
+        saturation: Joint speed [rad/s] above which friction is fully compensated. Without it: as in files in use.
     """
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.export.model_export import prepare_export

@@ -86,7 +86,7 @@ def convert(
         input_format: Format of the recording. Without it: detected.
         coordinates: Coordinates of q and tau, required for a CSV with a header. All other formats define them.
         variable: Variable of the .mat file, required if several variables fit.
-        rate: Sampling rate [Hz] of a CSV without time stamps. Without it: 200 for WPI; no times for a CSV with a header.
+        rate: Sampling rate [Hz] of a CSV without time stamps. Without it: 200 for WPI; no times with a header.
         arm: CSV, WPI: convert actuator to joint coordinates of this arm. LCM log: arm to read.
         skip_invalid: Skip and count rows that contain an empty cell, NaN or an infinite value.
     """

@@ -147,8 +147,8 @@ def tune(
     The new gains are compared with the default gains of the arm.
 
     Args:
-        method: paper: raise Kp until the arm oscillates, then set Kv and Ki. model: compute gains from inertia, friction
-            and delay.
+        method: paper: raise Kp until the arm oscillates, then set Kv and Ki. model: compute gains from inertia,
+            friction and delay.
         output: File for the gains. With both methods, the better gains are written.
     """
     from dvrk_drake.experiments.tuning.tuning import Method, tune_arm
