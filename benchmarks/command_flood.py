@@ -62,7 +62,7 @@ def answer_to(status: lcmt_dvrk_status, effort: list[float]) -> lcmt_dvrk_comman
 
 
 def control(file: Path | None) -> None:
-    """Holds the pose at which it first receives a status of the arm, until it is ended; signs with the key in `file`."""
+    """Holds the pose of the first received status until the process ends; signs with the key in `file`."""
     key = MessageKey.load(file) if file else None
     make_realtime()
     network, held = lcm.LCM(), []

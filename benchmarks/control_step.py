@@ -70,7 +70,7 @@ def serial_plant(arm: Arm) -> MultibodyPlant:
 
 
 def tree_state_order(station: ArmStation, plant: MultibodyPlant) -> bool:
-    """Whether the station's plant and the controller's have their joints in the same order."""
+    """Returns whether the station's plant and the controller's have their joints in the same order."""
     return np.array_equal(tree_selector(station.plant, station.arm), tree_selector(plant, station.arm))
 
 

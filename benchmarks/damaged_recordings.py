@@ -1,4 +1,4 @@
-"""What `identify` does with damaged recordings: `python benchmarks/damaged_recordings.py FOLDER [NAME ...]`.
+"""Outcomes of `identify` on damaged recordings: `python benchmarks/damaged_recordings.py FOLDER [NAME ...]`.
 
 Every damage is made on its own in mtm_one.csv (MTMR) and psm_one.csv (PSM) of FOLDER, see docs/public_recordings.md, or
 in the NAMEd motions. Without a refusal or a warning, the model is identified from it and compared with the undamaged

@@ -1,4 +1,4 @@
-"""How often the 95 % intervals of `identify` hold the truth, and how often it chooses an effect that is not there.
+"""Coverage of the 95 % intervals of `identify`, and share of selected effects that are not in the arm.
 
     python benchmarks/interval_coverage.py [--recordings 30] [--poses 40] [--noise 0.02]
 

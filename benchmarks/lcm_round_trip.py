@@ -2,10 +2,9 @@
 
     python benchmarks/lcm_round_trip.py [--seconds 60]
 
-The time is taken from when a status goes out to when the command that answers it is received, in the process of the arm.
-That is one of two: "standing", a bridge that sends the messages of a driver at 1 kHz and has no physics in its loop: it
-shows what the controller needs; and "simulated", `dvrk-drake arm`, which receives an answer when it has computed its next
-state, in which the answer then acts.
+The time is measured in the process of the arm, from sending a status to receiving the command that answers it. There are two
+arms. "standing" is a bridge that sends the messages of a driver at 1 kHz without physics: it shows the time of the controller.
+"simulated" is `dvrk-drake arm`, which receives an answer when it has computed its next state.
 
 Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo that decodes a status and encodes a
 command and does nothing else. Each is measured quiet, with `dvrk-drake view --live` and a client of its page, and with
@@ -96,7 +95,7 @@ class StandingArm:
 
     @property
     def acts(self) -> bool:
-        """Whether commands act."""
+        """Returns whether commands act."""
         return self.sender_id != 0
 
     def run(self, stopped: Callable[[], bool]) -> None:
@@ -131,7 +130,7 @@ class TimedSimulatedArm(SimulatedArm):
 
     @property
     def acts(self) -> bool:
-        """Whether commands act; an echo asks for none."""
+        """Returns whether commands act; an echo asks for none."""
         return self.guard.state == lcmt_dvrk_status.STATE_EFFORT or bool(self.times.back)
 
     def hear(self, channel: str, data: bytes) -> None:

@@ -1,4 +1,4 @@
-"""How often the 95 % intervals of a motion's `identify` hold the truth of simulated arms, given the right effects.
+"""Coverage of the 95 % intervals of `identify` on motions of simulated arms, with the right effects.
 
     python benchmarks/motion_coverage.py [--arms 16] [--noise 0.05] [--spread 0.15]
 

@@ -1,4 +1,4 @@
-"""How often the 95 % intervals of `payload` hold the truth, on simulated arms whose drives changed between two days.
+"""Coverage of the 95 % intervals of `payload` on simulated arms whose drives changed between two days.
 
     python benchmarks/payload_coverage.py [--seeds 40]
 

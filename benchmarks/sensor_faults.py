@@ -1,4 +1,4 @@
-"""How soon the guard detects wrong sensor data, and what the arm does until then and afterwards.
+"""Time until the guard detects wrong sensor data, and motion of the arm before and after the detection.
 
     python benchmarks/sensor_faults.py [--arms mtml psm] [--uses effort position hold] [--processes 2]
 

@@ -1,4 +1,4 @@
-"""What each effect of a real arm costs: time of a simulated step, as a ratio to the arm without effects.
+"""Time of a simulated step with each effect, as a ratio to the arm without effects.
 
     python benchmarks/simulated_effects.py [--arm NAME] [--closure mimic|ball] [--repetitions N] [--json FILE]
 
@@ -9,7 +9,8 @@ that can have one has one that gives STRETCH under the motor's largest effort. R
 busy machine slows all rows alike; times are CPU time of this process, the least over the repetitions. `real time` is
 simulated time over CPU time.
 
-A third of a step is Drake's allocations: set LD_PRELOAD or GLIBC_TUNABLES for a faster allocator, see docs/simulated_effects.md.
+A third of a step is memory allocation in Drake. A faster allocator is selected by LD_PRELOAD or GLIBC_TUNABLES, see
+docs/simulated_effects.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How much faster a study is on more workers, and that its results are the same bytes.
+"""Speed-up of a study by more workers; checks that the results are identical.
 
     python benchmarks/study_speed_up.py [STUDY.yaml] [--workers 1 2] [--set duration=11]
 

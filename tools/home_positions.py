@@ -1,4 +1,4 @@
-"""Where the links and frames of an SDF stand at home, in millimetres."""
+"""Positions of the links and frames of an SDF at home, in millimetres."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path

@@ -242,6 +242,6 @@ LINKS: tuple[Callable[[Lengths], Body], ...] = (
 
 
 def bodies(sdf: Path) -> dict[str, Callable[[], Body]]:
-    """What makes each link's body, by the link's name."""
+    """Returns the function that makes each link's body, by the link's name."""
     lengths = Lengths.read(sdf)
     return {link.__name__: partial(link, lengths) for link in LINKS}

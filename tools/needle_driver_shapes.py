@@ -77,7 +77,7 @@ def finger_2_link(_: float) -> Body:
 
 
 def bodies(sdf: Path) -> dict[str, Callable[[], Body]]:
-    """What makes each link's body, by the link's name."""
+    """Returns the function that makes each link's body, by the link's name."""
     where = home_positions(sdf)
     pitch, yaw = where["wrist_pitch_link"][2], where["wrist_yaw_link"][2]
     return {

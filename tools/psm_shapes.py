@@ -215,6 +215,6 @@ def body_of(link: Callable[[Where], Body], where: Where) -> Body:
 
 
 def bodies(sdf: Path) -> dict[str, Callable[[], Body]]:
-    """What makes each link's body, by the link's name."""
+    """Returns the function that makes each link's body, by the link's name."""
     where = home_positions(sdf)
     return {link.__name__: partial(body_of, link, where) for link in LINKS}

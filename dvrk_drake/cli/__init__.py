@@ -1,6 +1,6 @@
-"""The command line. Bad input gives one line on stderr and exit code 2.
+"""Command line of dvrk_drake. Bad input gives one line on stderr and exit code 2.
 
-Nothing is imported here that takes time, so that Ctrl-C ends the program in order as early as possible.
+This module imports nothing slow, so that Ctrl-C ends the program in order as early as possible.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command; returns the exit code: 0, or 2 for bad input.
+    """Runs one command and returns the exit code: 0, or 2 for bad input.
 
-    Without `arguments` those of the process are taken, and its handling of Ctrl-C.
+    Without `arguments`, the function uses the arguments of the process and installs a handler for Ctrl-C.
     """
     if arguments is None:
         signal.signal(signal.SIGINT, leave)
@@ -27,6 +27,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def leave(*_: object) -> None:
-    """Handles a signal by ending the process at once: where nothing is half-written."""
+    """Signal handler that ends the process at once. It is installed only while no file is partly written."""
     os.write(2, b"dvrk-drake: interrupted\n")
     os._exit(130)

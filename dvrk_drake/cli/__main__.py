@@ -1,4 +1,4 @@
-"""`python -m dvrk_drake.cli`, the same as `dvrk-drake`."""
+"""Entry point of `python -m dvrk_drake.cli`, which is equivalent to `dvrk-drake`."""
 
 import sys
 

@@ -1,7 +1,8 @@
-"""The application behind the command line: groups of commands, and the options that several commands share.
+"""Command-line application: groups of commands, and options that several commands share.
 
-One thing has one name in all commands. What a command reads (recordings, scenarios, studies) is positional. Everything
-else is an option: --arm, --model, --output (a file), --folder, --plots (a folder), --json, --overwrite, --verbose.
+An option has the same name in all commands. Input files (recordings, scenarios, studies) are positional arguments.
+All other arguments are options: --arm, --model, --output (a file), --folder, --plots (a folder), --json, --overwrite,
+--verbose.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ app.register_install_completion_command(
 
 
 def _complete_arm(_: Any) -> list[str]:
-    # As `known_arms`, whose module imports drake: --help and completion do not.
+    # Equivalent to `known_arms`, but without importing Drake, so that --help and shell completion stay fast.
     arms = Path(__file__).parents[1] / "models/arms"
     return sorted(path.stem for path in arms.glob("*.yaml"))
 
@@ -43,7 +44,7 @@ def _check_seconds(_: object, value: float | None) -> None:
 
 
 def whole_number(_: object, tokens: Sequence[Token]) -> int:
-    """Converts a text to an integer. Cyclopts' own conversion rounds 1.5."""
+    """Converts a string to an integer. The conversion of cyclopts would round 1.5."""
     try:
         return int(tokens[0].value)
     except ValueError:
@@ -56,7 +57,7 @@ def _check_seed(_: object, value: int) -> None:
 
 
 def one_of(title: str, least: int = 1) -> Group:
-    """A group of options of which a user gives `least`, 0 or 1, up to one."""
+    """Returns a group of mutually exclusive options, of which at least `least` (0 or 1) is given."""
 
     def check(arguments: ArgumentCollection) -> None:
         if not least <= sum(argument.has_tokens for argument in arguments) <= 1:

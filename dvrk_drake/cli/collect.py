@@ -1,4 +1,4 @@
-"""The commands that record an arm over LCM: record, collect."""
+"""Commands that record an arm over LCM: record and collect."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def record(
 ) -> None:
     """Record an arm over LCM.
 
-    Whatever ends it, the file is whole up to its last row.
+    The file is complete up to its last row, even after Ctrl-C or an error.
 
     Args:
-        output: A new file: .csv, or .log for an LCM log.
-        duration: From the first status. Without it: to Ctrl-C.
+        output: New file to write: .csv, or .log for an LCM log.
+        duration: Duration [s], counted from the first status message. Without it: until Ctrl-C.
     """
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
@@ -73,16 +73,16 @@ def collect(
 ) -> None:
     """Collect poses and holding torques over LCM.
 
-    After an interruption the same command continues.
+    Run the same command again to continue after an interruption.
 
     Args:
-        poses: File of the poses.
-        output: Visit the poses, and add a row for each to this file.
-        teach: Add poses to the file that you show by hand, with Enter.
+        poses: File of the poses, read or written.
+        output: Move the arm to each pose, and append one row per pose to this file.
+        teach: Move the arm by hand, and add the current pose to the file with Enter.
         random: Add N random poses to the file.
-        at_rest: With --teach: also take poses at which the arm rests for a second.
-        both_sides: Measure each pose approached from below and from above, and average: this cancels dry friction.
-        traverse_time: Time to cross a joint's range [s].
+        at_rest: With --teach: also add each pose at which the arm rests for one second.
+        both_sides: Approach each pose from below and from above, and average the torques. This cancels dry friction.
+        traverse_time: Time to move a joint over its full range [s].
     """
     check_output(poses, overwrite=True)
     if random is not None:
@@ -104,7 +104,7 @@ def _add_random_poses(name: str, path: str, count: int, seed: int) -> None:
         raise CollectionError(f"--random must be 1 pose or more; got {count}")
     arm = load_arm(name)
     poses = load_poses_if_any(path, arm)
-    # Near its limits an arm's guard pushes back, and there is no room to come from both sides.
+    # Near a joint limit the guard adds a restoring effort, and there is no room to approach a pose from both sides.
     added = arm.sample_poses(count, np.random.default_rng([seed, len(poses)]), margin=0.1)
     poses = np.vstack([poses, added])
     save_poses(poses, arm, path)
@@ -119,7 +119,7 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
     from dvrk_drake.processes.teacher import EnterKey, Teacher
     from dvrk_drake.recordings.pose_file import load_poses_if_any
 
-    load_poses_if_any(poses, load_arm(controlled.arm))  # refused before the arm is asked
+    load_poses_if_any(poses, load_arm(controlled.arm))  # reject a bad file before connecting to the arm
     with interrupt_ends_process():
         controller, link, _ = ready_controller(controlled, "gravity")
         stopped = stop_on_signals()
@@ -188,7 +188,7 @@ def _visit(
 
 
 def _reporter(line: LiveLine) -> Callable[[str], None]:
-    """Prints lines of which the live one is no part."""
+    """Returns a function that prints lines above the live line."""
 
     def report(text: str) -> None:
         line.clear()

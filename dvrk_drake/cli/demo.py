@@ -1,4 +1,4 @@
-"""The commands `demo`, `teleop` and `reproduce`: experiments on simulated arms."""
+"""Commands that run experiments on simulated arms: demo, teleop and reproduce."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def demo(
     """Simulate an arm, identify it, compensate it and hold it.
 
     Args:
-        arm: The arm to simulate.
+        arm: Arm to simulate.
     """
     from dvrk_drake.experiments.demo.demo import run_demo
     from dvrk_drake.reports.demo import print_demo
@@ -51,12 +51,12 @@ def teleop(
     port: Port = None,
     verbose: Verbose = False,
 ) -> None:
-    """Simulate a master arm that leads a PSM.
+    """Simulate a master arm that controls a PSM.
 
-    Your hand is on sliders in a browser, or a recorded hand is played.
+    Move the master with sliders in a browser, or play a recorded hand motion.
 
     Args:
-        output: Play a hand, write the scene as a page, and say how well the PSM followed.
+        output: Play the recorded hand motion, write the scene to this page, and print the tracking error of the PSM.
     """
     from dvrk_drake.experiments.demo.teleoperation import play_teleoperation, run_live_teleoperation, start_scene
     from dvrk_drake.models.files import atomic_write
@@ -93,14 +93,15 @@ def reproduce(
     seed: Seed = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Redo the figures and tables of the paper.
+    """Reproduce the figures and tables of the paper.
 
-    The page has the published numbers beside ours.
+    The page shows the published numbers beside the reproduced ones.
 
     Args:
-        what: What to redo.
+        what: Table, figure or experiment to reproduce.
         data: Folder with the paper's recording mtm_2015_good72.csv (docs/reproduction.md). Without it:
-            $DVRK_DRAKE_SHARED/data/mtm_static. Without that, Fig. 4 is left out, and the others have another arm.
+            $DVRK_DRAKE_SHARED/data/mtm_static. If that is missing too, Fig. 4 is omitted and the other figures use a
+            different simulated arm.
     """
     from dvrk_drake.experiments.reproduction.published import PaperRecordings
     from dvrk_drake.reports.reproduction.run import NAMES
@@ -109,7 +110,7 @@ def reproduce(
     quiet_drake()
     recordings = PaperRecordings.find(data)
     if what == "fig4":
-        _ = recordings.poses  # refuses before a folder is made
+        _ = recordings.poses  # reject missing recordings before creating a folder
     output = new_folder(folder, overwrite=overwrite)
     names = NAMES if what == "all" else (what,)
     with Steps(*names) as steps:

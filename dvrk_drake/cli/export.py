@@ -1,4 +1,4 @@
-"""The commands that hand a model to other programs, and judge what the dVRK's controller has installed."""
+"""Commands that export a model for other programs, and compare it with gravity-compensation files of the dVRK."""
 
 from __future__ import annotations
 
@@ -46,21 +46,21 @@ def export(
 ) -> None:
     """Write a model as SDF, URDF or files of the dVRK.
 
-    Several files can be written at once.
+    One call can write several files.
 
     Args:
-        sdf: The arm with the model's inertias, meshes in a folder beside it.
-        urdf: The same as URDF, the linkage as mimic joints.
-        dvrk_gc: The controller's gravity compensation of an MTM. With --arm, whose masses are estimates, only with
-            --gc-tolerance: identify your arm first.
-        dvrk_kinematic_gc: The controller's gravity compensation of a PSM.
-        diff: Print what differs from the arm's own SDF, line by line.
-        gc_tolerance: Accepted error [N m] where the file cannot hold what the model says. Without it: 1e-6.
-        friction: Compensate the dry friction of the model's dynamics.
-        coulomb: Dry friction of the joints [N m], instead of --friction.
-        friction_ratio: Share 0..1 of the friction to compensate. Without it: as in files in use.
-        dead_band: Speeds [rad/s] up to which friction is not compensated. Without it: as in files in use.
-        saturation: Speeds [rad/s] from which friction is compensated in full. Without it: as in files in use.
+        sdf: SDF file to write, with the inertias of the model. Meshes are written to a folder beside it.
+        urdf: URDF file to write, as for --sdf. The linkage is written as mimic joints.
+        dvrk_gc: Gravity-compensation file of the dVRK controller for an MTM. With --arm, whose masses are estimates, it
+            requires --gc-tolerance. Identify your arm first.
+        dvrk_kinematic_gc: Gravity-compensation file of the dVRK controller for a PSM.
+        diff: Print the differences from the arm's own SDF, line by line.
+        gc_tolerance: Largest accepted difference between the file and the model [N m]. Without it: 1e-6.
+        friction: Also compensate the Coulomb friction of the model. Requires a model identified from a motion.
+        coulomb: Coulomb friction of each joint [N m], instead of --friction.
+        friction_ratio: Share of the friction to compensate, 0 to 1, per joint. Without it: as in dVRK files in use.
+        dead_band: Joint speed [rad/s] below which friction is not compensated. Without it: as in files in use.
+        saturation: Joint speed [rad/s] above which friction is fully compensated. Without it: as in files in use.
     """
     from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.export.model_export import prepare_export
@@ -91,14 +91,14 @@ def export(
         "dead_band": dead_band,
         "saturation": saturation,
     }
-    # All are computed before the first is written: one that is refused leaves no other behind.
+    # All files are computed before the first is written, so that an error leaves no partial output.
     origin = model or arm or ""
     with Steps(f"exporting {loaded.arm.name}"):
         exports = {format: prepare_export(loaded, format, origin=origin, **settings) for format in outputs}
     for format, path in outputs.items():
         exports[format].write(path)
     for format, path in outputs.items():
-        if format != "urdf" or "sdf" not in outputs:  # they state the same
+        if format != "urdf" or "sdf" not in outputs:  # both formats contain the same model
             print_export(make_console(), path, exports[format], verbose=verbose)
     for format, path in outputs.items():
         print_written(path)
@@ -123,10 +123,10 @@ def compare_gc(
 ) -> None:
     """Compare a gravity-compensation file of the dVRK with a model.
 
-    The comparison is at rest, over the whole joint box.
+    The comparison covers static poses over the full range of all joints.
 
     Args:
-        file: The gc-*.json of the dVRK's controller.
+        file: Gravity-compensation file (gc-*.json) of the dVRK controller.
     """
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile

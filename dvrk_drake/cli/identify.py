@@ -1,4 +1,4 @@
-"""The commands that identify models from recordings and test them."""
+"""Commands that identify models from recordings and validate them."""
 
 from __future__ import annotations
 
@@ -58,10 +58,10 @@ def identify(
 ) -> None:
     """Identify a model from a recording.
 
-    A motion gives the full dynamics, static poses give the gravity torque.
+    A recorded motion gives the full dynamics. Static poses give the gravity torque.
 
     Args:
-        method: For poses: robust, or the least squares of the paper.
+        method: Method for static poses: robust, or the least squares of the paper.
     """
     from dvrk_drake.reports.identification import print_identification
     from dvrk_drake.reports.terminal_tables import make_console
@@ -73,7 +73,7 @@ def identify(
         read = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
         print_notes(recording, read.notes)
         result = dvrk.identify(read, recorded_arm, method=method, low_speed_segments=low_speed_segments, progress=steps)
-    # Before anything is printed: the reader of the output may close it (head).
+    # Save before printing: the reader of the output may close the pipe (head).
     result.save(output, overwrite=True)
     if folder is not None:
         from dvrk_drake.reports.figures.identification import plot_identification
@@ -92,7 +92,7 @@ def identify(
 def _model_and_recording(
     model: str, recording: str, coordinates: Literal["joint", "actuator"], steps: Steps
 ) -> tuple[dvrk.IdentifiedModel, dvrk.Recording]:
-    """Reads a model and a recording of its arm, and prints the notes on the recording."""
+    """Loads a model and a recording of its arm, and prints the notes on the recording."""
     loaded = dvrk.IdentifiedModel.load(model)
     read = dvrk.read_recording(recording, loaded.arm, coordinates, progress=steps)
     print_notes(recording, read.notes)
@@ -117,8 +117,8 @@ def validate(
     """Compare a model with another recording.
 
     Args:
-        require: Exit code 2 unless every joint that the model commands has this verdict or a better one.
-        save: Add the verdicts to the model file, where run looks for them.
+        require: Return exit code 2 unless every joint with feedforward has at least this verdict.
+        save: Store the verdicts in the model file. The command run checks them.
     """
     from dvrk_drake.reports.identification import print_validation
     from dvrk_drake.reports.terminal_tables import make_console
@@ -136,7 +136,7 @@ def validate(
                 saved = loaded.validation.recording
                 raise ModelError(f"{model}: has verdicts from {saved} already; replace them with --overwrite")
         validation = dvrk.validate(loaded, read, low_speed_segments=low_speed_segments, progress=steps)
-    # Before anything is printed: the reader of the output may close it (head).
+    # Save before printing: the reader of the output may close the pipe (head).
     if save:
         validation.save(model, overwrite=True)
     if json is not None:
@@ -173,12 +173,13 @@ def predict(
     coordinates: Coordinates = "joint",
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a model's efforts for a recording.
+    """Write the efforts that a model predicts for a recording.
 
-    Of a motion after the model's low-pass, of poses at rest.
+    For a motion, the predicted efforts are low-pass filtered with the cut-off of the model. For static poses, they are
+    holding efforts.
 
     Args:
-        output: The CSV to write: columns tau1..taun.
+        output: CSV file to write, with columns tau1..taun [N m, N].
     """
     from dvrk_drake.recordings.recording import write_csv
     from dvrk_drake.reports.terminal_tables import make_console
@@ -205,7 +206,8 @@ def recalibrate(
 ) -> None:
     """Refit friction and offsets to a short motion of another day.
 
-    The gain is for motions like that one; at other positions and speeds it can be much smaller (docs/payload.md).
+    The improvement is valid for similar motions. It can be much smaller at other positions and speeds
+    (docs/payload.md).
     """
     from dvrk_drake.reports.identification import print_recalibration
     from dvrk_drake.reports.terminal_tables import make_console
@@ -233,14 +235,14 @@ def payload(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Estimate the mass that an arm carries.
+    """Estimate the mass and centre of mass of a payload.
 
-    It was added between two recordings of one motion.
+    The estimate compares two recordings of one motion, without and with the payload.
 
     Args:
         reference: Recording of the motion without the payload.
-        loaded: Recording of the same motion with it.
-        link: Link of the SDF that carries it, compared with all others. Without it: the one that fits best.
+        loaded: Recording of the same motion with the payload.
+        link: Name of the SDF link that carries the payload. Without it: the link with the best fit.
     """
     from dvrk_drake.reports.payload import print_payload
     from dvrk_drake.reports.terminal_tables import make_console

@@ -1,4 +1,4 @@
-"""The commands that talk LCM."""
+"""Commands that communicate over LCM: arm, key and run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class ControlledArm:
-    """The options of a command that controls an arm over LCM."""
+    """Options shared by the commands that control an arm over LCM."""
 
     arm: Arm
     model: Annotated[
@@ -59,9 +59,9 @@ def arm(
     """Run a simulated arm on LCM, with the safeguards of a driver.
 
     Args:
-        driver: Configuration of the driver, fields as in DvrkDriver.
-        pose: Joint positions [rad, m] at the start. Without it: near zero.
-        meshcat: Show it in a browser.
+        driver: Configuration file of the driver, with the fields of DvrkDriver.
+        pose: Initial joint positions [rad, m]. Without it: near zero.
+        meshcat: Show the arm in a browser.
     """
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
@@ -92,10 +92,10 @@ def arm(
 
 @app.command(group=HARDWARE)
 def key(*, output: Annotated[str, Parameter(metavar="FILE")]) -> None:
-    """Make a key that signs LCM messages.
+    """Create a key that signs LCM messages.
 
     Args:
-        output: A new file, which only its owner may read.
+        output: New key file, readable only by its owner.
     """
     from dvrk_drake.models.lcm_messages import create_key_file
 
@@ -116,11 +116,12 @@ def run(
     """Compensate the gravity of an arm over LCM, or hold it.
 
     Args:
-        mode: gravity: an operator moves the arm freely; damped: the same with damping; hold: at its pose.
-        gains: From tune, for modes hold and damped. Without it: the arm's own.
-        friction_ratio: In mode gravity, the share of the friction to compensate; less where the arm could creep.
-        hysteresis_ratio: In mode gravity, the share of wide hysteresis to compensate: the arm stays where it was led.
-        friction_model: Model of a motion whose friction is compensated. Without it: that of --model.
+        mode: gravity: an operator moves the arm freely. damped: as gravity, with damping. hold: the arm holds its pose.
+        gains: Gains from the command tune, for modes hold and damped. Without it: the default gains of the arm.
+        friction_ratio: Share of the friction to compensate in mode gravity. It is reduced where the arm could creep.
+        hysteresis_ratio: Share of the hysteresis to compensate in mode gravity, so that the arm stays where it is
+            released.
+        friction_model: Model identified from a motion, whose friction is compensated. Without it: the one of --model.
     """
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine, LiveStatus
@@ -147,7 +148,7 @@ def run(
         print(status, flush=True)
 
     try:
-        # A link of its own: what was said while the controller was compiled is past.
+        # Open a new link: messages that arrived while the controller was compiled are out of date.
         control(link(), controller, stopped, show)
     finally:
         line.clear()
@@ -155,10 +156,10 @@ def run(
 
 
 def _gains(path: str, mode: Mode, arm: str) -> Gains:
-    """Loads the file of --gains.
+    """Loads the file given with --gains.
 
     Raises:
-        ControllerError: it is no file of gains, they are not for the arm, or the arm is not to be held.
+        ControllerError: The file contains no gains, the gains are for another arm, or the mode uses no gains.
     """
     from dvrk_drake.errors import ControllerError
     from dvrk_drake.models.arm import load_arm
@@ -175,11 +176,11 @@ def _gains(path: str, mode: Mode, arm: str) -> Gains:
 def _friction_compensator(
     controlled: ControlledArm, mode: Mode, ratio: float, hysteresis_ratio: float, friction_model: str | None
 ) -> FrictionCompensator | None:
-    """Returns what --friction-ratio and --hysteresis-ratio ask for, with a warning where it cannot be had in full.
+    """Returns the compensator for --friction-ratio and --hysteresis-ratio, and warns if a ratio is reduced.
 
     Raises:
-        ControllerError: it asks for what is not safe.
-        ModelError: the model has no friction.
+        ControllerError: A ratio is not safe.
+        ModelError: The model has no friction.
     """
     if ratio == hysteresis_ratio == 0:
         return None
@@ -226,16 +227,21 @@ def ready_controller(
     friction: FrictionCompensator | None = None,
     gains: Gains | None = None,
 ) -> tuple[ArmController, Callable[[], ArmLink], float]:
-    """A controller of an arm that may be controlled, what opens a link to it, and the period of its statuses [s].
+    """Returns a controller for the arm, a function that opens the link to the arm, and the status period [s].
 
-    With `friction` it compensates that as well; `gains` are what it holds with. With --reset a latched fault is said
-    and cleared first, and an arm whose watchdog took over resumes. The link is to the session that was looked at: an
-    arm that is restarted meanwhile is none.
+    With --reset, a latched fault is printed and cleared, and an arm that is held by its watchdog resumes. The link
+    accepts only the session that was checked here, so it rejects an arm that is restarted in the meantime.
+
+    Args:
+        controlled: Options of the command.
+        mode: Control mode.
+        friction: Compensator of friction and hysteresis. None: not compensated.
+        gains: Gains for holding. None: the default gains of the arm.
 
     Raises:
-        ModelError: the model is of another arm.
-        KeyFileError: the key cannot be used.
-        ControllerError: no arm there, or one that may not be controlled now.
+        ModelError: The model belongs to another arm.
+        KeyFileError: The key cannot be used.
+        ControllerError: No arm responds, or the arm cannot be controlled in its present state.
     """
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm import load_arm
@@ -264,7 +270,7 @@ def ready_controller(
 
 
 def model_warning(path: str, model: IdentifiedModel) -> str:
-    """The joints of a model that did not pass validation, or that nothing but cross-validation judged; or ""."""
+    """Returns a warning about joints that failed validation or were only cross-validated, or ""."""
     from dvrk_drake.analysis.verdict import cross_validated_verdicts, unfit
 
     if model.validation is None:

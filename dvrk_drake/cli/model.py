@@ -1,4 +1,4 @@
-"""The commands that show an arm: its equations, its shape."""
+"""Commands that show an arm: its equations and its geometry."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def model(
     """Show base parameters, or write gravity as source code.
 
     Args:
-        format: Print the gravity torque and its regressor as source in this language.
-        output: Write the source to a file instead of standard output.
+        format: Print the gravity torque and its regressor as source code in this language.
+        output: File for the source code. Without it: standard output.
     """
     from dvrk_drake.dynamics.gravity_regressor import derive_gravity
     from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
@@ -69,10 +69,10 @@ def view(
 ) -> None:
     """Show an arm in a browser.
 
-    Its sliders keep the linkage together.
+    The sliders move the joints and keep the linkage closed.
 
     Args:
-        live: Show the pose in the arm's status messages, without sliders.
+        live: Show the pose from the arm's status messages, without sliders.
     """
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.control import ArmLink

@@ -1,6 +1,6 @@
-"""The program behind the command line: parses the arguments and runs a command.
+"""Main program of the command line: parses the arguments and runs a command.
 
-Commands import what they need when they run: drake and numba take seconds, `--help` should not.
+Commands import modules when they run, because Drake and numba take seconds to import and `--help` must be fast.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from dvrk_drake.cli.app import app
 from dvrk_drake.cli.support import folders_only_for_results, import_interruptibly
 from dvrk_drake.errors import DvrkDrakeError
 
-# Matrices are small here: more threads of BLAS only wait for each other, for minutes where the cores are busy. Set
-# before numpy is imported, which the commands do.
+# The matrices are small. With several threads, BLAS threads mostly wait for each other, for minutes on a busy computer.
+# The variable must be set before numpy is imported, which happens in the commands.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-#: Their import adds the commands to the application.
+#: Importing these modules adds their commands to the application.
 COMMANDS = model, recordings, identify, export, simulate, demo, lcm, collect
 
-#: Options that were renamed in version 0.1, by command. "" is an argument that became an option.
+#: Options that were renamed in version 0.1, by command. "" stands for a positional argument that became an option.
 RENAMED = {
     "model": {"": "--arm", "--latex": "--format latex", "--python": "--format python", "--c": "--format c"},
     "view": {"": "--arm"},
@@ -54,7 +54,7 @@ RENAMED = {
 
 
 def run(arguments: Sequence[str] | None) -> int:
-    """Runs one command; returns the exit code. Without `arguments` it takes those of the process, and its Ctrl-C."""
+    """Runs one command and returns the exit code. Without `arguments`, uses the arguments and Ctrl-C of the process."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     try:
         command, bound, _ = app.parse_args(words, print_error=False, exit_on_error=False)
@@ -63,8 +63,8 @@ def run(arguments: Sequence[str] | None) -> int:
         return 2
     try:
         if arguments is None:
-            gc.disable()  # modules stay: a search for garbage among them takes a tenth of the time of an import
-        if command.__module__.startswith("dvrk_drake."):  # not the help or the version
+            gc.disable()  # modules are never freed, and garbage collection takes a tenth of the import time
+        if command.__module__.startswith("dvrk_drake."):  # neither the help nor the version
             import_interruptibly()
         if arguments is None:
             gc.freeze()
@@ -77,10 +77,10 @@ def run(arguments: Sequence[str] | None) -> int:
         print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except BrokenPipeError:
-        # The reader (head, less) has seen enough. As of other programs: a verdict that fails must not pass.
+        # The reader (head, less) closed the pipe. As in other programs, a failed verdict must not return exit code 0.
         sys.stderr.close()
         return 128 + signal.SIGPIPE
-    except OSError as error:  # the disk is full, for example
+    except OSError as error:  # for example a full disk
         print(f"dvrk-drake: error: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -94,7 +94,7 @@ def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
 
 
 def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
-    """Returns the error of the arguments in one line, which names the new option where an old one was given."""
+    """Returns a usage error in one line. For a renamed option, the line contains the new name."""
     name = error.command_chain[0] if error.command_chain else ""
     renamed = RENAMED.get(name, {})
     options = {word.partition("=")[0] for word in words if word.startswith("--")}

@@ -1,4 +1,4 @@
-"""The commands `check` and `convert`, for recordings."""
+"""Commands for recordings: check and convert."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def check(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Say what is wrong with a recording.
+    """Check a recording and report problems.
 
-    The exit code is 2 where no model can be identified from it.
+    The exit code is 2 if no model can be identified from the recording.
 
     Args:
         recording: CSV with header q1..qn, tau1..taun (t, qd1..qdn optional), or an LCM log.
@@ -42,7 +42,7 @@ def check(
     with Steps("reading", "checking the recording") as steps:
         checked = dvrk.read_recording(recording, recorded_arm, coordinates, progress=steps)
         report = dvrk.check(checked, recorded_arm, progress=steps)
-    # Before anything is printed: the reader of the output may close it (head).
+    # Save before printing: the reader of the output may close the pipe (head).
     if json is not None:
         write_json(json, report.as_dict())
     options = arm if coordinates == "joint" else f"{arm} --coordinates {coordinates}"
@@ -78,17 +78,17 @@ def convert(
 ) -> None:
     """Convert a recording to the CSV of this project.
 
-    It reads CSV, LCM logs, .mat files of the JHU-WPI team, and CSV of WPI.
+    Accepted formats are CSV, LCM logs, .mat files of the JHU-WPI team, and CSV files of WPI.
 
     Args:
-        recording: The file to convert.
-        output: The CSV to write.
+        recording: File to convert.
+        output: CSV file to write.
         input_format: Format of the recording. Without it: detected.
-        coordinates: Coordinates of q and tau in a CSV with a header. Needed there; the other formats define it.
-        variable: Variable of the .mat file, where several fit.
-        rate: Samples per second of a CSV without time stamps. Without it: 200 for WPI, no times with a header.
-        arm: CSV, WPI: convert the actuators' coordinates to the joints' of this arm. LCM log: the arm to read.
-        skip_invalid: Leave out and count rows with an empty cell, a NaN or an infinity.
+        coordinates: Coordinates of q and tau, required for a CSV with a header. All other formats define them.
+        variable: Variable of the .mat file, required if several variables fit.
+        rate: Sampling rate [Hz] of a CSV without time stamps. Without it: 200 for WPI; no times with a header.
+        arm: CSV, WPI: convert actuator to joint coordinates of this arm. LCM log: arm to read.
+        skip_invalid: Skip and count rows that contain an empty cell, NaN or an infinite value.
     """
     from dvrk_drake.recordings.conversion import convert as convert_recording
 

@@ -1,4 +1,4 @@
-"""The commands that simulate an arm: simulate, study, tune, transparency."""
+"""Commands that simulate an arm: simulate, study, tune and transparency."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def simulate(
     """Simulate an arm under control and record it.
 
     Args:
-        scenario: A scenario's YAML file: arm, controller, motion, effects.
-        output: Write t, q, qd and tau.
-        meshcat: Show it in a browser, in real time.
+        scenario: YAML file of the scenario: arm, controller, motion, effects.
+        output: File to write, with t [s], q, qd and tau of all joints.
+        meshcat: Show the simulation in a browser, in real time.
     """
     from dvrk_drake.models.arm import known_arms
     from dvrk_drake.reports.simulation import print_simulation
@@ -96,10 +96,10 @@ def study(
     """Simulate a scenario over many poses, seeds and errors.
 
     Args:
-        study: The study's YAML file.
-        output: Results as .csv or .parquet. A file that this study began is continued, not replaced.
-        workers: Processes on this computer. Without it: one per core.
-        scheduler: Dask cluster that runs it, e.g. tcp://host:8786.
+        study: YAML file of the study.
+        output: Results file, .csv or .parquet. An unfinished file of the same study is continued, not replaced.
+        workers: Number of processes on this computer. Without it: one per core.
+        scheduler: Address of a Dask cluster that runs the study, e.g. tcp://host:8786.
     """
     from dvrk_drake.experiments.study.study import dask_executor, run_study, run_study_locally
     from dvrk_drake.experiments.study.study_file import load_study
@@ -144,11 +144,12 @@ def tune(
 ) -> None:
     """Find controller gains on the simulated arm.
 
-    They are compared with the arm's own.
+    The new gains are compared with the default gains of the arm.
 
     Args:
-        method: paper: raise Kp until the arm oscillates, then Kv and Ki; model: from inertia, friction and delay.
-        output: Write the gains that were found; of both methods the better ones.
+        method: paper: raise Kp until the arm oscillates, then set Kv and Ki. model: compute gains from inertia,
+            friction and delay.
+        output: File for the gains. With both methods, the better gains are written.
     """
     from dvrk_drake.experiments.tuning.tuning import Method, tune_arm
     from dvrk_drake.models.arm import load_arm
@@ -194,16 +195,16 @@ def transparency(
     overwrite: Overwrite = False,
     verbose: Verbose = False,
 ) -> None:
-    """Simulate the interaction force between an operator and the handle of an arm.
+    """Simulate the interaction force at the handle of an arm.
 
     Args:
-        path: Recording of the motion to follow. Without it: through random poses.
-        speed: Follow the recording S times as fast.
-        model: Compensate with this model; repeat to compare. Without it: what the arm's SDF states.
-        friction_ratio: Share of the friction to compensate.
-        simulated_effects: Parts of the real arm that the simulation has, as in a scenario. Without it: all.
-        frame: The SDF's frame of the handle. Without it: dh_7 of an MTM, dh_6 of a PSM.
-        output: Write the table.
+        path: Recording of the motion to follow. Without it: a motion through random poses.
+        speed: Speed factor for the recorded motion; 2 is twice as fast.
+        model: Model used for compensation; repeat to compare several. Without it: the model in the arm's SDF.
+        friction_ratio: Share of the friction to compensate, 0 to 1.
+        simulated_effects: Friction, cable and sensor effects to simulate, as in a scenario. Without it: all.
+        frame: SDF frame of the handle. Without it: dh_7 for an MTM, dh_6 for a PSM.
+        output: File for the table.
     """
     from dvrk_drake.experiments.transparency import random_path, recorded_path, simulate_operator
     from dvrk_drake.models.arm import load_arm
@@ -246,11 +247,11 @@ def transparency(
 
 
 def _compensations(arm: dvrk.Arm, paths: list[str], friction_ratio: float) -> list[Compensation]:
-    """Nothing, each model, and each model with friction compensation.
+    """Returns the compensations to compare: none, each model, and each model with friction compensation.
 
     Raises:
-        ModelError: a model that is not of this arm, or two of one name.
-        ControllerError: a friction ratio that is not allowed.
+        ModelError: A model belongs to another arm, or two models have the same name.
+        ControllerError: A friction ratio is not allowed.
     """
     from dvrk_drake.dynamics.friction_compensation import check_ratios
     from dvrk_drake.experiments.transparency import Compensation

@@ -1,4 +1,4 @@
-"""Helpers of all commands: checks of outputs before the work begins, progress, and a clean Ctrl-C."""
+"""Functions that all commands share: checks of output paths before work begins, progress, and handling of Ctrl-C."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ if TYPE_CHECKING:
 
 
 def import_interruptibly() -> None:
-    """Imports what all commands need such that Ctrl-C ends the process at once.
+    """Imports the modules that all commands need, so that Ctrl-C during the import ends the process at once.
 
-    Extension modules turn it into tracebacks. Nothing is half-written at that time. Where signals are not ours
-    (a thread, a test) they are left alone.
+    Without this, extension modules print a traceback. No file is partly written at that time. Signal handlers remain
+    unchanged in a thread or in a test.
     """
-    # Together these import what the others do.
+    # Importing this module also imports the others.
     modules = ("dvrk_drake.reports.identification",)
     if threading.current_thread() is not threading.main_thread() or sys.modules.keys() >= set(modules):
         return
@@ -58,10 +58,11 @@ def import_interruptibly() -> None:
 
 @contextmanager
 def interrupt_ends_process() -> Iterator[None]:
-    """Lets Ctrl-C end the process at once while the block runs, in which nothing is half-written.
+    """Context manager in which Ctrl-C ends the process at once. No file may be partly written in the block.
 
-    As an exception it may be lost: numba's compiler and extension modules call Python where no exception is passed on.
-    A handler that the block installs stays, so that there is no time in between. In a thread this does nothing.
+    A KeyboardInterrupt can be lost, because numba's compiler and extension modules call Python code without propagating
+    exceptions. A handler that the block installs is kept, so that signals are always handled. In a thread, the context
+    manager has no effect.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -75,15 +76,15 @@ def interrupt_ends_process() -> Iterator[None]:
 
 
 def quiet_drake() -> None:
-    """Keeps Drake's remarks (Meshcat's address) off the terminal; its import sets the level, so this comes after."""
+    """Disables Drake's log messages. Drake sets the level on import, so call this afterwards."""
     logging.getLogger("drake").setLevel(logging.WARNING)
 
 
 def load_key(path: str | None) -> MessageKey | None:
-    """Returns the key in the file that --key names, or None.
+    """Returns the key from the file given with --key, or None.
 
     Raises:
-        KeyFileError: it cannot be used.
+        KeyFileError: The key cannot be used.
     """
     from dvrk_drake.models.lcm_messages import MessageKey
 
@@ -91,12 +92,12 @@ def load_key(path: str | None) -> MessageKey | None:
 
 
 def check_output(path: str, *inputs: str, overwrite: bool) -> None:
-    """Refuses, before work begins, an output that cannot be written, is one of the inputs, or exists already.
+    """Checks an output path before work begins. Rejects a path that is not writable, is an input, or exists already.
 
     Args:
-        path: of the output.
-        inputs: paths that are read.
-        overwrite: an existing file is replaced: the user said so, or the command goes on with its own output.
+        path: Path of the output.
+        inputs: Paths of the inputs.
+        overwrite: Accept an existing file, because of --overwrite or because the command continues its own output.
     """
     target = Path(os.path.realpath(path))
     _refuse_twice(path)
@@ -119,27 +120,27 @@ def check_output(path: str, *inputs: str, overwrite: bool) -> None:
 
 
 def _refuse_twice(path: str) -> None:
-    """Refuses a second output of this command with the same name."""
+    """Rejects a second output of this command with the same name."""
     if (target := Path(os.path.realpath(path))) in _outputs:
         raise DvrkDrakeError(f"{path}: is named for two outputs; name another file or folder for one")
     _outputs.add(target)
 
 
-#: Bars on a terminal at most; finished steps give way.
+#: Maximum number of progress bars on a terminal. Finished steps are removed first.
 MAX_BARS = 6
 
 #: Outputs of this command.
 _outputs: set[Path] = set()
-#: Folders that were made, each before the one that it is in.
+#: Folders created by this command, each before its parent.
 _made: list[Path] = []
 
 
 def new_folder(path: str, *, overwrite: bool) -> Path:
-    """Makes the folder at `path`, and refuses one that holds something already.
+    """Creates the folder at `path`, and rejects a folder that is not empty.
 
     Args:
-        path: of the folder.
-        overwrite: files that are there may be replaced: the user said so.
+        path: Path of the folder.
+        overwrite: Accept a folder with files, because of --overwrite.
     """
     _refuse_twice(path)
     folder = Path(path).absolute()
@@ -156,7 +157,7 @@ def new_folder(path: str, *, overwrite: bool) -> Path:
 
 
 def plots_folder(path: str | None, *, overwrite: bool) -> Path | None:
-    """Makes the folder of an option --plots, if given, and imports what draws."""
+    """Creates the folder given with --plots, if any, and imports the plotting modules."""
     if path is None:
         return None
     with interrupt_ends_process():
@@ -165,26 +166,26 @@ def plots_folder(path: str | None, *, overwrite: bool) -> Path | None:
 
 
 def print_written(path: str | Path, what: str = "") -> None:
-    """Prints that a file or folder was written; `what` says more about it."""
+    """Prints the path of a file or folder that was written, followed by the description `what`."""
     print(f"wrote {path}{what and ': '}{what}", flush=True)
 
 
 @contextmanager
 def folders_only_for_results() -> Iterator[None]:
-    """Where the block is left by an error or by Ctrl-C, the folders that it made and that are empty are gone again."""
+    """Context manager that removes empty folders created in the block after an error or Ctrl-C."""
     _made.clear()
     _outputs.clear()
     try:
         yield
     except BaseException:
         for folder in _made:
-            with suppress(OSError):  # what is not empty stays
+            with suppress(OSError):  # folders that are not empty are kept
                 folder.rmdir()
         raise
 
 
 def until_stopped(meshcat: Meshcat, meanwhile: Callable[[], object] = lambda: None) -> None:
-    """Serves a Meshcat page until its Stop button, Escape or Ctrl-C is pressed; calls `meanwhile` all the time."""
+    """Serves a Meshcat page until its Stop button, Escape or Ctrl-C is pressed. Calls `meanwhile` repeatedly."""
     meshcat.AddButton("Stop", "Escape")
     with suppress(KeyboardInterrupt):
         while meshcat.GetButtonClicks("Stop") == 0:
@@ -193,7 +194,7 @@ def until_stopped(meshcat: Meshcat, meanwhile: Callable[[], object] = lambda: No
 
 
 def load_model(model: str | None, arm: str | None) -> IdentifiedModel:
-    """Returns the model of the file --model, or what the SDF of --arm states; one of them is given."""
+    """Returns the model of the file given with --model, or the model in the SDF of --arm."""
     from dvrk_drake.models.arm import known_arms
 
     if model in known_arms():
@@ -205,7 +206,7 @@ def load_model(model: str | None, arm: str | None) -> IdentifiedModel:
 
 
 def print_warnings(console: Console, warnings: Sequence[Finding]) -> None:
-    """Prints one line per warning; those of results that look better than they are go to stderr."""
+    """Prints one line per warning. Warnings about overoptimistic results are printed on stderr."""
     for warning in warnings:
         if warning.kind in ("low-speed segments", "same recording", "other link"):
             print(f"dvrk-drake: {warning}", file=sys.stderr, flush=True)
@@ -214,7 +215,7 @@ def print_warnings(console: Console, warnings: Sequence[Finding]) -> None:
 
 
 def write_json(path: str, content: object) -> None:
-    """Writes the file of an option --json."""
+    """Writes the file given with --json."""
     from dvrk_drake.models.files import atomic_write
 
     with atomic_write(path) as stream:
@@ -223,26 +224,27 @@ def write_json(path: str, content: object) -> None:
 
 
 def print_notes(path: str, notes: Sequence[str]) -> None:
-    """Says on stderr what a user must know of a recording, a line each."""
+    """Prints notes on a recording on stderr, one line per note."""
     for note in notes:
         print(f"dvrk-drake: note: {path}: {note}", file=sys.stderr)
 
 
 def mounted(arm: Arm, gravity: Sequence[float] | None) -> Arm:
-    """The arm as --gravity says that it is mounted."""
+    """Returns the arm with the mounting given with --gravity."""
     if gravity is None:
         return arm
     return arm.with_gravity(gravity)
 
 
 class Steps:
-    """Shows on stderr which step of a command runs: bars with the time left on a terminal, elsewhere a line per step.
+    """Shows the current step of a command on stderr.
 
-    It is a `dvrk_drake.progress.Progress`. A step "fig5: releasing" is a part of the step "fig5".
+    On a terminal it shows bars with the remaining time, otherwise it prints one line per step.
+    The class implements `dvrk_drake.progress.Progress`. A step "fig5: releasing" is part of the step "fig5".
 
     Args:
-        first: name of the step that begins with the block.
-        names: of the other steps.
+        first: Name of the step that begins with the block.
+        names: Names of the other steps.
     """
 
     def __init__(self, first: str, *names: str):
@@ -259,7 +261,7 @@ class Steps:
             console=console,
             transient=True,
             disable=not console.is_terminal,
-            speed_estimate_period=600,  # a run of a study may take a minute
+            speed_estimate_period=600,  # one run of a study may take a minute
         )
 
     def __enter__(self) -> Steps:
@@ -268,11 +270,11 @@ class Steps:
         return self
 
     def __call__(self, step: str, share: float) -> None:
-        """Shows a step and its finished share, 0..1."""
+        """Shows a step and its finished share, 0 to 1."""
         if step not in self._tasks:
             self._begin(step)
         task = next(task for task in self._progress.tasks if task.id == self._tasks[step])
-        if share > task.completed:  # of a step that comes again, the clock goes on
+        if share > task.completed:  # a repeated step keeps its elapsed time
             self._progress.update(task.id, total=1.0, completed=share)
 
     def _begin(self, step: str) -> None:

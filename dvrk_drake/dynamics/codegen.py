@@ -119,7 +119,7 @@ def entry_point(dispatcher: Callable[..., None]) -> Callable[..., None]:
 
 
 def is_scalar(name: str, symbols: Sequence[sympy.Symbol]) -> bool:
-    """Whether an argument is a number: one symbol, of the same name."""
+    """Returns whether an argument is a number: one symbol, of the same name."""
     return len(symbols) == 1 and symbols[0].name == name
 
 

@@ -76,7 +76,9 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
     kept = {label: body for label, body in bodies.items() if label.isdigit() or not serial}
     driven = {plant.GetJointByName(name).child_body().index() for name in arm.joint_names}
     if serial and not driven <= {body.index() for body, _ in kept.values()}:
-        raise ArmError(f"{arm.name} has joints whose links have no number: its links cannot be separated from its linkage")
+        raise ArmError(
+            f"{arm.name} has joints whose links have no number: its links cannot be separated from its linkage"
+        )
     parameters = [StandardParameter(label, axis) for label in kept for axis in ("", "x", "y", "z")]
     lengths = named_lengths(plant, bodies, frames)
     regressor = _regressor_at_random_poses(plant, arm, list(kept.values()))

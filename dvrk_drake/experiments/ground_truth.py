@@ -161,11 +161,11 @@ def paper_arm(recording: Recording, folder: Path) -> GroundTruth:
     effects = dataclasses.replace(arm.effects, cables=laws, springs=[])
     ground_truth_arm = with_links(arm, model_bodies(model).links, folder / "true_mtm.sdf", "the paper's recording")
     origin = (
-        "The ground-truth arm is the paper's MTM as our identification sees it in the paper's 72 poses (gravity, cables, "
-        "springs), with the friction, stops, encoders, motors and delays of `mechanisms/mtm.yaml`, which are "
-        "another MTM's. Joint 6 shows no torque in that recording beyond friction, and joint 7 a constant one, "
-        "which is what its friction leaves, larger towards one side: there the ground-truth arm has less to compensate than "
-        "the real one seems to have had."
+        "The ground-truth arm is the paper's MTM as identified from the paper's 72 poses (gravity, cables, springs), "
+        "with the friction, stops, encoders, motors and delays of `mechanisms/mtm.yaml`, which are those of another "
+        "MTM. In that recording joint 6 has no torque beyond friction, and joint 7 has a constant one, the difference "
+        "of its friction between both directions. There the ground-truth arm needs less compensation than the real "
+        "one probably did."
     )
     return GroundTruth(dataclasses.replace(ground_truth_arm, effects=effects), model, True, origin)
 
@@ -190,8 +190,8 @@ def perturbed_ground_truth(name: str, folder: Path, seed: int) -> GroundTruth:
     laws = [*ground_truth_arm.effects.cables, *ground_truth_arm.effects.springs]
     model = dataclasses.replace(IdentifiedModel.from_arm(ground_truth_arm, laws), arm=arm)
     origin = (
-        f"The ground-truth arm is the SDF's with links that are each up to {100 * SPREAD:.0f} % heavier or lighter (drawn with "
-        f"seed {seed}), and the effects of `mechanisms/`: friction, cables, encoders, motors, delays."
+        f"The ground-truth arm is the SDF's with each link up to {100 * SPREAD:.0f} % heavier or lighter (drawn "
+        f"with seed {seed}), and the effects of `mechanisms/`: friction, cables, encoders, motors, delays."
     )
     return GroundTruth(ground_truth_arm, model, False, origin)
 

@@ -162,7 +162,7 @@ def dry_friction(model: IdentifiedModel) -> tuple[float, ...]:
     """Returns the Coulomb friction [N m] of each joint when it moves alone, from the effects of the model's dynamics.
 
     Smoothed Coulomb terms and presliding elements, which friction is once they slip, add up; along a coordinate of the
-    drive that several joints move, each of them feels its share.
+    drive that several joints move, each of them has its share.
 
     Raises:
         ModelError: The model has no dynamics.

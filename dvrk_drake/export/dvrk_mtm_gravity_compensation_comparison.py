@@ -185,7 +185,7 @@ def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) 
 def _is_of_other_side(
     model: IdentifiedModel, q: NDArray[np.float64], tau_file: NDArray[np.float64], in_sweep: NDArray[np.bool_]
 ) -> bool:
-    """Whether the mirror image of the model fits a file's torque clearly better, where the file has data if it says."""
+    """Returns whether the mirror image of the model fits a file's torque clearly better, where the file has data."""
     if np.count_nonzero(in_sweep) >= _MIN_POSES:
         q, tau_file = q[in_sweep], tau_file[in_sweep]
     own, mirrored = model.holding_torque(q), _MIRROR * model.holding_torque(_MIRROR * q)

@@ -1,4 +1,4 @@
-"""What commands write, and the one line with exit code 2 for bad input."""
+"""Output of the commands, and one line with exit code 2 for bad input."""
 
 import json
 import os
@@ -83,7 +83,7 @@ def test_validate_writes_json(folder, capsys):
 
 
 @pytest.mark.parametrize("coordinates", ["joint", "actuator"])
-def test_predict_writes_one_row_a_row_in_the_recordings_coordinates(folder, tmp_path, coordinates):
+def test_predict_writes_rows_in_the_recordings_coordinates(folder, tmp_path, coordinates):
     arm = load_arm("mtmr")
     q = read_recording(folder / "other.csv").q
     recorded = q if coordinates == "joint" else arm.transmission.position(q)
@@ -286,7 +286,7 @@ def test_all_commands_take_an_arm_file(folder, tmp_path, capsys):
     assert 'unknown coupled limit "parallelogramm"' in fails(capsys, "model", "--arm", tmp_path / "other.yaml")
 
 
-def test_validate_says_that_a_recording_moves_and_writes_null_where_nothing_was_measured(folder, tmp_path, capsys):
+def test_validate_warns_of_a_motion_and_writes_null(folder, tmp_path, capsys):
     recording = read_recording(folder / "other.csv")
     tau = recording.tau.copy()
     tau[:, 6] = 0.0

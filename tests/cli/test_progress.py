@@ -31,7 +31,7 @@ def test_a_part_of_a_step_has_the_number_of_the_step(capsys):
 
 @pytest.fixture
 def terminal(monkeypatch):
-    """What `Steps` draws on a terminal."""
+    """Returns the output of `Steps` on a terminal."""
     screen = io.StringIO()
     monkeypatch.setattr(support, "Console", lambda **_: Console(file=screen, force_terminal=True, width=100))
     return screen

@@ -34,7 +34,7 @@ def test_friction_takes_energy_over_every_closed_path(kind):
     assert np.max(np.abs(column)) <= (np.max(np.abs(V)) if kind == "viscous" else 1.0) + 1e-12
 
 
-def test_a_presliding_element_is_a_spring_until_it_slips_and_remembers():
+def test_a_presliding_element_is_a_spring_until_it_slips():
     d = 0.1
     path = np.concatenate([np.linspace(0, 0.05, 50), np.linspace(0.05, 0.5, 50), np.linspace(0.5, 0.45, 50)])
     shape = ActuatorEffect("actuator.pitch", "presliding", d).column(path, 0 * path)
@@ -43,7 +43,7 @@ def test_a_presliding_element_is_a_spring_until_it_slips_and_remembers():
     np.testing.assert_allclose(shape[100:], 1 - (0.5 - path[100:]) / d, atol=1e-12)
 
 
-def test_friction_under_load_is_coulomb_times_what_the_arm_weighs_there():
+def test_friction_under_load_is_coulomb_times_the_gravity_torque():
     """In the model and in the columns that identify it."""
     arm = load_arm("psm")
     regressor = DynamicRegressor(arm)
@@ -58,7 +58,7 @@ def test_friction_under_load_is_coulomb_times_what_the_arm_weighs_there():
     assert np.ptp(weight[:, 1]) > 0.1
 
 
-def test_effects_do_the_same_work_on_actuators_and_along_their_coordinate():
+def test_effects_do_equal_work_on_actuators_and_coordinates():
     for name in ("mtmr", "psm"):
         arm = load_arm(name)
         rows = arm.effect_coordinates

@@ -29,7 +29,7 @@ def lift(reduced):
 
 @pytest.fixture(scope="module")
 def Y(model):
-    """Of states that the reduction has not seen."""
+    """Returns regressors of states that the reduction did not use."""
     generator = np.random.default_rng(7)
     q = model.arm.sample_poses(300, generator)
     return model.regressor(q, generator.normal(0, 2, q.shape), generator.normal(0, 5, q.shape))

@@ -126,7 +126,7 @@ def test_mass_matrix_is_the_plants(arm):
 
 @pytest.mark.parametrize("count", [0, 1, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 7])
 def test_many_samples_equal_single_ones(arm, count):
-    """Whether the last block is full, has one sample or is missing."""
+    """The last block is full, has one sample or is missing."""
     model = DynamicRegressor(arm)
     motion = random_motion(arm, count)
     Y = model.regressor(*motion)
@@ -135,7 +135,7 @@ def test_many_samples_equal_single_ones(arm, count):
     np.testing.assert_allclose(Y, np.reshape(ones, Y.shape), rtol=0, atol=1e-12 * np.abs(Y).max(initial=0.0))
 
 
-def test_torque_in_chunks_equals_the_regressor_times_the_parameters(arm):
+def test_torque_in_chunks_is_regressor_times_parameters(arm):
     model = DynamicRegressor(arm)
     motion = random_motion(arm, 1500)
     expected = model.regressor(*motion) @ model.values

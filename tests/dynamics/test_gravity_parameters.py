@@ -86,7 +86,7 @@ def test_base_parameters_of_any_links_hold_them(arm):
     np.testing.assert_allclose(Y @ (phi - lift)[:, None], 0, atol=1e-9)
 
 
-def test_columns_of_a_regressor_are_combinations_of_the_independent_ones():
+def test_columns_are_combinations_of_independent_ones():
     generator = np.random.default_rng(7)
     Y = generator.normal(size=(60, 5)) @ generator.normal(size=(5, 11))
     Y[:, 3] = 0.0

@@ -54,7 +54,7 @@ def evaluate(gravity, q):
     return np.array([np.array(function(*pose, 9.81), dtype=float) for pose in q])
 
 
-def test_serial_arm_has_exactly_the_papers_parameters_and_regressor(arm, random_q):
+def test_serial_arm_has_the_papers_parameters_and_regressor(arm, random_q):
     gravity = derive_gravity(arm, "paper", serial=True)
     assert set(gravity.base.names) == PAPER_PARAMETERS
     ours = evaluate(gravity, random_q)
@@ -128,7 +128,7 @@ def test_regressor_times_parameters_is_the_plants_holding_torque(any_arm, random
     assert np.linalg.matrix_rank(stacked) == len(beta)
 
 
-def test_torque_is_the_gradient_of_the_symbolic_potential_and_the_potential_is_the_plants(any_arm, random_q):
+def test_torque_is_the_gradient_of_the_potential(any_arm, random_q):
     arm, gravity = any_arm, derive_gravity(any_arm)
     gradient = sympy.Matrix(gravity.potential).T.jacobian(gravity.q).T
     difference = sympy.lambdify([*gravity.q], (gradient - gravity.regressor).subs(GRAVITY, 9.81), modules="numpy")

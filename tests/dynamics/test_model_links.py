@@ -72,7 +72,7 @@ def test_the_written_arm_moves_as_the_model_says(name, rotors, tmp_path):
 
 
 @pytest.mark.parametrize(("actuator", "link"), [("elbow_pitch", "crank_link"), ("wrist_platform", "motor_4_link")])
-def test_a_motor_that_several_joints_turn_is_a_link_that_turns_with_it(actuator, link, tmp_path):
+def test_a_motor_of_several_joints_is_a_link_of_its_own(actuator, link, tmp_path):
     arm = load_arm("mtml")
     row = arm.transmission.matrix[arm.joint_names.index(actuator)]
     assert np.count_nonzero(row) == 2

@@ -10,7 +10,7 @@ from dvrk_drake.errors import ArmError
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 
 
-def test_inverse_kinematics_is_the_identity_after_forward_kinematics():
+def test_inverse_kinematics_inverts_forward_kinematics():
     inverse = PsmInverseKinematics(PSM)
     lower, upper = PSM.position_lower.copy(), PSM.position_upper
     assert inverse.depth_at_zero == pytest.approx(-0.0156)
@@ -34,7 +34,7 @@ def test_inverse_kinematics_takes_the_nearest_turn_of_the_roll():
         assert inverse.solve(tip(q), q)[3] == pytest.approx(roll, abs=1e-9)
 
 
-def test_inverse_kinematics_has_no_solution_above_the_remote_centre():
+def test_no_solution_above_the_remote_centre():
     inverse = PsmInverseKinematics(PSM)
     X_FT = tip(Q_F)
     up = RigidTransform(X_FT.rotation(), [*X_FT.translation()[:2], 0.1])

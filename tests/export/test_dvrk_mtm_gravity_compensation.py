@@ -127,7 +127,7 @@ def test_the_controller_computes_the_models_torque_from_the_file(name, tmp_path)
     np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-10)
 
 
-def test_our_reading_of_a_file_is_the_controllers_with_velocity_and_clip(tmp_path):
+def test_a_files_torque_is_the_controllers_with_clip(tmp_path):
     generator = np.random.default_rng(4)
     file = GravityCompensationFile(
         positive=generator.normal(0, 0.1, 40),
@@ -159,7 +159,7 @@ def test_friction_is_half_of_what_separates_the_two_directions(tmp_path):
     np.testing.assert_allclose(rest - down, coulomb, atol=1e-12)
 
 
-def test_friction_of_a_models_dynamics_is_what_a_joint_feels_that_moves_alone():
+def test_friction_of_a_motion_model_is_that_of_a_single_joint():
     model = balanced()
     with pytest.raises(ModelError, match="no dynamics"):
         dry_friction(model)
@@ -230,7 +230,7 @@ def test_a_tolerance_that_is_no_number_accepts_nothing(arm, option, tolerance, t
     assert not path.exists()
 
 
-def test_a_leaning_base_is_refused_by_default_and_held_as_well_as_the_file_can(tmp_path, capsys):
+def test_a_tilted_base_is_refused_or_approximated(tmp_path, capsys):
     model = balanced()
     model.arm = model.arm.with_gravity(TILTED)
     model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
@@ -274,7 +274,7 @@ def test_a_broken_file_is_one_line(change, message, tmp_path, capsys):
     assert message in error and str(path) in error
 
 
-def test_a_runaway_polynomial_a_tight_clip_and_a_wrong_sign_are_found(tmp_path):
+def test_comparison_finds_runaway_clip_and_wrong_sign(tmp_path):
     model = balanced()
     file = compensation_from_model(model)
     clean = compare_compensation(file, model)

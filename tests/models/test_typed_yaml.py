@@ -144,7 +144,7 @@ def test_missing_and_binary_files_are_refused(tmp_path):
 
 def test_keys_of_earlier_versions_are_read_with_a_warning(tmp_path):
     (tmp_path / "scenario.yaml").write_text(
-        "arm: mtml\nreal_arm: [stops]\ncontroller: {mode: gravity, knows: [cables]}\n"
+        "arm: mtml\nreal_arm: [stops]\ncontroller: {mode: gravity, knows: [cables]}\n"  # an earlier key
         "effects: [{coordinate: joint.wrist_pitch, kind: offset, value: 0.1}]\n"
     )
     with pytest.warns(FutureWarning) as warned:
@@ -154,7 +154,7 @@ def test_keys_of_earlier_versions_are_read_with_a_warning(tmp_path):
     assert scenario.effects[0].coefficient == 0.1
     assert [str(warning.message).partition(": ")[2] for warning in warned] == [
         'key "real_arm" is now "simulated_effects"',
-        'key "knows" is now "compensated_effects"',
+        'key "knows" is now "compensated_effects"',  # an earlier key
         'key "value" is now "coefficient"',
     ]
 

@@ -166,7 +166,7 @@ def test_an_arm_is_held_at_its_pose_while_the_disk_is_slow(tmp_path):
 
 
 def test_rows_are_written_by_another_thread(tmp_path):
-    """What Python's executor does with it; how long that takes is the disk's, so simulated time has no limit here."""
+    """Writes rows with Python's executor. The disk determines the time, so simulated time has no limit here."""
     collector, controller, sticky = make_quick(tmp_path, writer=None)
     written_by, append = [], collector._output.append
     collector._output.append = lambda *row: (append(*row), written_by.append(threading.get_ident()))
@@ -208,7 +208,7 @@ def lead_until_obeyed(tmp_path):
 
 
 def problem_after(made, pause):
-    """What the collector says if its own clock goes on by `pause` [s] and it then answers as ever."""
+    """Returns the problem that the collector reports if its clock advances by `pause` [s]."""
     collector, controller, arm = made
     start = PERIOD * arm.ticks + pause
     for tick in range(60):  # longer than the expiry

@@ -66,7 +66,7 @@ def after(count, action):
     return step
 
 
-def test_a_fault_is_said_then_cleared_and_a_controller_may_follow():
+def test_a_fault_is_reported_and_cleared():
     link, said = GuardedArm(), []
     link.guard.report_fault("the amplifier is hot")
     with pytest.raises(ControllerError, match=r"has a fault: the amplifier is hot\. Look at the arm, then start again"):
@@ -83,7 +83,7 @@ def test_a_fault_is_said_then_cleared_and_a_controller_may_follow():
     assert period == pytest.approx(1e-3)
 
 
-def test_a_fault_whose_cause_lasts_is_an_error_and_no_fault_needs_no_reset():
+def test_a_lasting_fault_is_an_error():
     link = GuardedArm()
     link.before_step = lambda: link.guard.report_fault("the amplifier is hot")
     with pytest.raises(ControllerError, match="has a fault that stays: the amplifier is hot"):
@@ -102,7 +102,7 @@ LOOK = r"Look at the arm, then start again with --reset"
 
 
 @pytest.mark.parametrize("seconds", [0.02, 0.05, 0.2, 1.0])
-def test_a_controller_that_was_stopped_while_it_acted_ends_and_an_operator_resumes(controller, seconds):
+def test_a_stopped_controller_ends_and_an_operator_resumes(controller, seconds):
     link, said = GuardedArm(), []
     end = link.now() + 2.0
     link.before_step = after(500, lambda: stop_for(link, seconds))
@@ -152,7 +152,9 @@ def test_an_arm_that_tells_nothing_new():
         first_status(link)
 
 
-@pytest.mark.parametrize(("measured", "reported", "refused"), [(1, 1, False), (5, 5, False), (10, 10, True), (10, 1, True)])
+@pytest.mark.parametrize(
+    ("measured", "reported", "refused"), [(1, 1, False), (5, 5, False), (10, 10, True), (10, 1, True)]
+)
 def test_an_arm_that_is_measured_too_seldom_is_refused(measured, reported, refused):
     """A dVRK's 100 Hz, at which the pose hold of `run --mode hold` swings by 0.9 rad; its bridge may tell at 1 kHz."""
     link, count = GuardedArm(), itertools.count()
@@ -235,7 +237,7 @@ def test_run_prints_what_is_new_and_nothing_twice(controller, monkeypatch, capsy
     assert not said.err
 
 
-def test_friction_is_not_compensated_if_nobody_knows_how_wrong_the_weight_may_be(tmp_path, capsys):
+def test_friction_needs_a_bound_on_the_gravity_error(tmp_path, capsys):
     path = str(tmp_path / "model.yaml")
     IdentifiedModel.from_arm(ARM).save(path)
     assert main(["run", "--arm", "mtml", "--model", path, "--friction-ratio", "0.5"]) == 2
@@ -318,7 +320,7 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("foreign", FOREIGN)
-def test_a_foreign_status_is_ignored_and_said_only_when_the_arm_is_silent(foreign):
+def test_a_foreign_status_is_reported_if_the_arm_is_silent(foreign):
     message, said = FOREIGN[foreign]
     linked = Linked()
     assert linked.hear(status_bytes(100), message, status_bytes(101)).sequence == 101
@@ -329,7 +331,7 @@ def test_a_foreign_status_is_ignored_and_said_only_when_the_arm_is_silent(foreig
     assert linked.hear() is None and linked.said.endswith("DVRK_STATUS_MTML")
 
 
-def test_a_session_that_was_looked_at_is_the_one_that_is_controlled():
+def test_the_checked_session_is_controlled():
     first = Status.decode(status_bytes(1))
     linked = Linked(before=first)
     assert linked.hear(status_bytes(1, SESSION + 1)) is None and "MTML was restarted" in linked.said
@@ -368,7 +370,7 @@ def test_with_a_key_statuses_must_be_signed_and_commands_are():
 
 
 @pytest.mark.parametrize("mode", ["spoofed", "restarted"])
-def test_control_goes_on_beside_spoofed_statuses_and_ends_when_the_arm_is_restarted(controller, mode):
+def test_control_ignores_spoofed_statuses_until_a_restart(controller, mode):
     """The first 500 statuses alone, then each between copies of it with other sessions, sequences and times."""
     arm, linked = GuardedArm(), Linked()
     taken = []
@@ -409,7 +411,7 @@ def copy_of(status, **fields):
     return other.encode()
 
 
-def test_an_arm_that_lets_no_command_act_is_given_up_with_the_reason(controller, monkeypatch):
+def test_control_ends_if_no_command_acts(controller, monkeypatch):
     monkeypatch.setattr("dvrk_drake.processes.control._TIMEOUT", 0.3)
     link = GuardedArm()
     link.status.effort_measured = list(2 * LIMIT)  # more than commands may use

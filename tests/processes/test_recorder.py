@@ -1,4 +1,4 @@
-"""What a recorder writes of the messages on an arm's channel, by a clock that the test sets."""
+"""Rows that a recorder writes from the messages of an arm, by a clock that the test sets."""
 
 from types import SimpleNamespace
 
@@ -56,7 +56,7 @@ def test_a_spoofed_status_does_not_end_a_recording(recorder, field):
 
 
 @pytest.mark.parametrize(("silence", "rows"), [(0.9, 20), (1.1, 40)])
-def test_an_arm_that_was_restarted_is_recorded_after_a_second_of_silence(recorder, silence, rows):
+def test_a_restarted_arm_is_recorded_after_a_second(recorder, silence, rows):
     made, messages = recorder(), statuses(40)
     for k, status in enumerate(messages[:20]):
         made.hear(status, 1e-3 * k)

@@ -1,4 +1,4 @@
-"""What the commands print: the answer first, then the next step, then tables of at most 80 columns."""
+"""Output of the commands: the answer first, then the next step, then tables of at most 80 columns."""
 
 import os
 import re

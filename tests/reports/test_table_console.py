@@ -30,7 +30,7 @@ def test_it_fits_and_every_number_is_whole(columns, capsys, monkeypatch):
     assert "m_crank c_crank_y" in name
 
 
-def test_a_terminal_that_is_too_narrow_for_the_numbers_still_gets_them(capsys, monkeypatch):
+def test_a_narrow_terminal_gets_all_numbers(capsys, monkeypatch):
     text = "\n".join(printed(capsys, monkeypatch, 30))
     assert all(cell in text for cell in CELLS[1:])
 

@@ -77,7 +77,9 @@ class Observer:
     def during(self, seconds):
         """Returns the statuses of the next `seconds` of the arm's clock."""
         first, end = len(self.received), self.last.utime + 1e6 * seconds
-        return self.received[first : 1 + self.until(lambda status: status.utime >= end, f"{seconds} s of the arm's clock")]
+        return self.received[
+            first : 1 + self.until(lambda status: status.utime >= end, f"{seconds} s of the arm's clock")
+        ]
 
 
 def check_clock(statuses):

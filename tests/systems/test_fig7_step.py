@@ -75,7 +75,7 @@ def test_small_steps_overshoot_little(j):
         assert np.abs(error[-1]).max() < 1e-3
 
 
-def test_steady_state_without_integral_is_the_gravity_error_over_kp():
+def test_steady_state_error_is_the_gravity_error_over_kp():
     # Without the integral, at rest, Kp e = (true - modelled) gravity at that pose.
     gains = dataclasses.replace(ARM.gains, ki=[0.0] * 7)
     model = scaled_model(0.8)

@@ -28,7 +28,7 @@ def test_tip_follows_handle_scaled_and_rotated(seed):
     np.testing.assert_allclose(turned, R @ wanted @ R.T, atol=1e-9)
 
 
-def test_commanded_velocity_is_the_rate_of_the_commanded_position():
+def test_commanded_velocity_is_the_derivative_of_position():
     loop = Loop()
     before, _ = loop.step(engaged=1.0)
     for s in np.linspace(0, 0.2, 50):

@@ -31,7 +31,7 @@ from dvrk_drake.systems.lcm.dvrk_command import draw_id
 OTHER_URL = "udpm://239.255.76.67:7668?ttl=0"
 #: Options of tests that publish invalid messages, which observers do not read.
 THIRD_URL = "udpm://239.255.76.67:7669?ttl=0"
-#: Options of a patient arm, and its expiry [s] and a little: so long it remembers a sender that is silent.
+#: Options of an arm with long timeouts; its expiry [s] and a margin, after which it releases a silent sender.
 PATIENT, FORGOTTEN = ("--driver", PATIENT_DRIVER), 0.6
 #: Speed at which logs are played: the network loses nothing when a busy computer delays the player.
 SLOWLY = 0.2
@@ -142,7 +142,9 @@ def test_arm_holds_after_controller_is_killed(name, tmp_path):
         controller.send_signal(signal.SIGKILL)
         first = len(observer.received)
         held = observer.until(holds, "hold")
-        last_command = max(k for k in range(held) if observer.received[k].num_accepted < observer.received[held].num_accepted)
+        last_command = max(
+            k for k in range(held) if observer.received[k].num_accepted < observer.received[held].num_accepted
+        )
         worst = drift(*observer.received[first:], *observer.during(2.0))
     finally:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # processes started later would inherit it

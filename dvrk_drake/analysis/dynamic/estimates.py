@@ -249,7 +249,9 @@ class DynamicEstimates:
         identifiable = {estimate.name for estimate in estimates if estimate.identifiability >= MIN_IDENTIFIABILITY}
         pairs = uncertainty.strong_correlations()
         return estimates, [
-            CorrelatedEstimates(pair.first, pair.second, pair.correlation) for pair in pairs if pair.first in identifiable
+            CorrelatedEstimates(pair.first, pair.second, pair.correlation)
+            for pair in pairs
+            if pair.first in identifiable
         ]
 
     def dry_friction(self) -> dict[str, tuple[float, float]]:

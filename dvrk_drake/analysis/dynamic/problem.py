@@ -180,7 +180,10 @@ class DynamicProblem:
         With `tilt_efforts` (t, r, n), the derivatives of the efforts with respect to the tilts, t columns are appended.
         """
         return self._own_columns(
-            i, self.rigid[:, i], chosen, np.empty((0, *self.columns.tau.shape)) if tilt_efforts is None else tilt_efforts
+            i,
+            self.rigid[:, i],
+            chosen,
+            np.empty((0, *self.columns.tau.shape)) if tilt_efforts is None else tilt_efforts,
         )
 
     def to_base(self, num_effects: int) -> NDArray[np.float64]:

@@ -136,7 +136,7 @@ class Drifts:
 
     @property
     def held(self) -> NDArray[np.bool_]:
-        """Whether each joint (cases, n) always stayed within `BAND`."""
+        """Returns whether each joint (cases, n) always stayed within `BAND`."""
         return self.largest <= self.arm.per_joint(*BAND)
 
     @property

@@ -47,7 +47,7 @@ class Measure:
 
     @property
     def is_answer(self) -> bool:
-        """Whether the measure is boolean, not a number."""
+        """Returns whether the measure is boolean, not a number."""
         return isinstance(self.worst, bool)
 
     @property

@@ -30,7 +30,7 @@ class Oscillation:
 
     @property
     def sustained(self) -> bool:
-        """Whether the amplitude does not decay."""
+        """Returns whether the amplitude does not decay."""
         return self.growth >= 1.0
 
 

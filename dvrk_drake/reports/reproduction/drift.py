@@ -71,7 +71,7 @@ def _shares(drifts: Drifts) -> tuple[str, ...]:
 
 
 def torque_table(session: ReproductionSession) -> ResultTable:
-    """How wrong the torques are over the joint box; the truth is known here."""
+    """Returns the torque errors over the joint box, relative to the ground-truth arm."""
     mtm = session.mtm
     q = session.random_poses(PAPER_ARM, 500)
     true = mtm.truth.model.holding_torque(q)
@@ -90,7 +90,7 @@ def torque_table(session: ReproductionSession) -> ResultTable:
 
 
 def rate_table(releases: dict[str, Drifts]) -> ResultTable:
-    """How fast joints drift in the first and the last `RATE_TIME` of releases, by name."""
+    """Returns the drift rates of the joints in the first and the last `RATE_TIME` of releases, by name."""
     window = round(RATE_TIME / SAMPLE_PERIOD)
     rows = []
     for label, drifts in releases.items():
@@ -160,8 +160,8 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
     )
     remarks = (
         mtm.truth.origin,
-        f"**Ours** is identified from {sample_sizes.collected} poses that were collected on that arm, with its friction, noise and "
-        "encoders, each approached from both sides; `identify` made a model of them, which alone carries the arm. "
+        f"**Ours** is identified from {sample_sizes.collected} poses that were collected on that arm, with its "
+        "friction, noise and encoders, each approached from both sides; `identify` made a model of them, which alone carries the arm. "
         f"**The paper's** is {_whose(session)}. Each release starts at rest at a random pose anywhere inside the "
         f"limits, its friction unloaded, and is watched for {sample_sizes.duration:g} s.",
         f"**Ours holds every joint within {1e3 * BAND[0]:.0f} mrad at {share(ours.num_held, len(poses))}** of the "
@@ -205,9 +205,8 @@ def reproduce_figure_6(session: ReproductionSession) -> Section:
         f"{share(paper.num_held, len(few))} of the poses, with ours at {share(ours.num_held, len(few))}. Zeroing "
         "hides wrong torques and adds no right ones: joint 5 still falls where the spring and the weight that it "
         "should balance exceed its friction.",
-        "What differs: of the weight of joints 6 and 7 the ground-truth arm has only what the recording of 72 poses shows, "
-        "which is about what their friction holds, so they drift less here than the team's did. See the ground-truth arm of "
-        "Fig. 5.",
+        "Differences: the gravity torque of joints 6 and 7 is that of the recording of 72 poses, which is about as large "
+        "as their friction. They therefore drift less here than the team's did. See the ground-truth arm of Fig. 5.",
     )
     return Section("fig6", "Fig. 6: drift after release, joints 5-7 zeroed", remarks, (table,), figures)
 

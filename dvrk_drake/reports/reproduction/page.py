@@ -38,7 +38,7 @@ class ResultTable:
 
 @dataclass(frozen=True)
 class Section:
-    """What redoing one of the paper's figures gave.
+    """Result of reproducing one figure of the paper.
 
     Attributes:
         name: as the command line calls it.
@@ -102,7 +102,7 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def _anchor(title: str) -> str:
-    """What Markdown pages make of a heading."""
+    """Returns the anchor of a heading in Markdown."""
     kept = "".join(c for c in title.lower() if c.isalnum() or c in " -_")
     return kept.replace(" ", "-")
 

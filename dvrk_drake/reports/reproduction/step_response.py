@@ -73,7 +73,9 @@ def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION)
     table = ResultTable(
         "fig7", "Largest |q| [rad] in the last 10 s (the published: J2 at 59 s, J6, J7 late)", ("", *_JOINTS), rows
     )
-    shows = "Step to zero: the paper's controller on its arm (above), ours on the ground-truth arm (below); right: close up"
+    shows = (
+        "Step to zero: the paper's controller on its arm (above), ours on the ground-truth arm (below); right: close up"
+    )
     return Section("fig7", "Fig. 7: step to zero", remarks, (table,), {_FILE: shows})
 
 
@@ -84,7 +86,9 @@ def _late(q: NDArray[np.float64], from_time: float | None = None) -> NDArray[np.
 
 def _plot(path: Path, faulty: NDArray[np.float64], ours: NDArray[np.float64]) -> None:
     figure, axes = plt.subplots(2, 2, figsize=(13, 7.5), layout="constrained")
-    for row, (q, label) in enumerate(((faulty, "the paper's controller on its arm"), (ours, "ours on the ground-truth arm"))):
+    for row, (q, label) in enumerate(
+        ((faulty, "the paper's controller on its arm"), (ours, "ours on the ground-truth arm"))
+    ):
         t = PERIOD * np.arange(len(q))
         for column, ax in enumerate(axes[row]):
             for j in range(7):

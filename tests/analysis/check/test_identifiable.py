@@ -75,7 +75,7 @@ def test_few_poses_may_still_validate_a_model():
 
 
 def test_rests_of_a_motion_are_judged_as_poses():
-    """What is identified from a motion with rests are they: a joint's wrong sign shows there."""
+    """The static poses of a motion with pauses are identified: a wrong sign of a joint is detectable there."""
     pose = ARM.sample_poses(12, np.random.default_rng(2), 0.1)
     pose = np.vstack([pose, pose[:1]])  # where it began, as gravity's work wants it
     ways = [np.linspace(a, b, 100, endpoint=False) for a, b in pairwise(pose)]
