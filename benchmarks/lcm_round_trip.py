@@ -2,8 +2,9 @@
 
     python benchmarks/lcm_round_trip.py [--seconds 60]
 
-The time is measured in the process of the arm, from sending a status to receiving the command that answers it. There are two
-arms. "standing" is a bridge that sends the messages of a driver at 1 kHz without physics: it shows the time of the controller.
+The time is measured in the process of the arm, from sending a status to receiving the command that answers it. There
+are two arms. "standing" is a bridge that sends the messages of a driver at 1 kHz without physics, to time the
+controller.
 "simulated" is `dvrk-drake arm`, which receives an answer when it has computed its next state.
 
 Its peers are processes of their own: `dvrk-drake run --mode hold`, and an echo that decodes a status and encodes a

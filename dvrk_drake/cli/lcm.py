@@ -118,9 +118,10 @@ def run(
     Args:
         mode: gravity: an operator moves the arm freely. damped: as gravity, with damping. hold: the arm holds its pose.
         gains: Gains from the command tune, for modes hold and damped. Without it: the default gains of the arm.
-        friction_ratio: Share of the friction to compensate in mode gravity. It is reduced where the arm could creep.
-        hysteresis_ratio: Share of the hysteresis to compensate in mode gravity, so that the arm stays where it is
-            released.
+        friction_ratio: Share of the friction to compensate in mode gravity, 0 to 0.6. It is reduced where the arm could
+            creep.
+        hysteresis_ratio: Share of the wide hysteresis to compensate in mode gravity, 0 to 0.9, so that the arm stays
+            where it is released.
         friction_model: Model identified from a motion, whose friction is compensated. Without it: the one of --model.
     """
     from dvrk_drake.processes.control import control

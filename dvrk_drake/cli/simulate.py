@@ -201,7 +201,7 @@ def transparency(
         path: Recording of the motion to follow. Without it: a motion through random poses.
         speed: Speed factor for the recorded motion; 2 is twice as fast.
         model: Model used for compensation; repeat to compare several. Without it: the model in the arm's SDF.
-        friction_ratio: Share of the friction to compensate, 0 to 1.
+        friction_ratio: Share of the friction to compensate, 0 to 0.6.
         simulated_effects: Friction, cable and sensor effects to simulate, as in a scenario. Without it: all.
         frame: SDF frame of the handle. Without it: dh_7 for an MTM, dh_6 for a PSM.
         output: File for the table.

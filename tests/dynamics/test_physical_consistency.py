@@ -107,7 +107,7 @@ def test_links_of_which_the_rows_say_nothing_stay_the_sdfs(links, boxes, nominal
 
 
 def test_where_the_rows_say_nothing_the_priors_decide(links, boxes, nominal, scale):
-    """Directions without data are determined by the priors alone: their gradient has no part in the rows' null space."""
+    """Directions without data are determined by the priors alone: their gradient has no part in the null space."""
     generator = np.random.default_rng(3)
     seen = generator.normal(size=(12, len(nominal))) / scale
     target = seen @ nominal + 2 * generator.normal(size=12)

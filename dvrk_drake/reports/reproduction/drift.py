@@ -161,7 +161,8 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
     remarks = (
         mtm.truth.origin,
         f"**Ours** is identified from {sample_sizes.collected} poses that were collected on that arm, with its "
-        "friction, noise and encoders, each approached from both sides; `identify` made a model of them, which alone carries the arm. "
+        "friction, noise and encoders, each approached from both sides. The model that `identify` made of them alone "
+        "compensates gravity. "
         f"**The paper's** is {_whose(session)}. Each release starts at rest at a random pose anywhere inside the "
         f"limits, its friction unloaded, and is watched for {sample_sizes.duration:g} s.",
         f"**Ours holds every joint within {1e3 * BAND[0]:.0f} mrad at {share(ours.num_held, len(poses))}** of the "
@@ -205,8 +206,8 @@ def reproduce_figure_6(session: ReproductionSession) -> Section:
         f"{share(paper.num_held, len(few))} of the poses, with ours at {share(ours.num_held, len(few))}. Zeroing "
         "hides wrong torques and adds no right ones: joint 5 still falls where the spring and the weight that it "
         "should balance exceed its friction.",
-        "Differences: the gravity torque of joints 6 and 7 is that of the recording of 72 poses, which is about as large "
-        "as their friction. They therefore drift less here than the team's did. See the ground-truth arm of Fig. 5.",
+        "Differences: the gravity torque of joints 6 and 7 is that of the recording of 72 poses, about as large as "
+        "their friction. They therefore drift less here than the team's did. See the ground-truth arm of Fig. 5.",
     )
     return Section("fig6", "Fig. 6: drift after release, joints 5-7 zeroed", remarks, (table,), figures)
 
