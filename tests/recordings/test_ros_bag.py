@@ -1,0 +1,194 @@
+"""ROS bags: the same numbers as were written, joints by name, the jaw by time, and one line for what cannot be read."""
+
+import numpy as np
+import pytest
+from bags import KINDS, joint_states, write_bag
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+from dvrk_drake.errors import RecordingError
+from dvrk_drake.models.arm import load_arm
+from dvrk_drake.recordings.ros_bag import is_ros_bag, read_joint_states
+
+START = 1_700_000_000_000_000_000
+
+
+@pytest.fixture(scope="module")
+def mtm():
+    return load_arm("mtml")
+
+
+@pytest.fixture(scope="module")
+def psm():
+    return load_arm("psm")
+
+
+def blocks(rows, joints, seed=0):
+    return np.random.default_rng(seed).uniform(-0.2, 0.2, (3, rows, joints))
+
+
+def stamps(rows, period=0.01):
+    return START + np.arange(rows) * round(1e9 * period)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_reads_the_numbers_that_were_written(mtm, tmp_path, kind):
+    q, qd, tau = blocks(20, 7)
+    path = write_bag(tmp_path, kind, {"/MTML/measured_js": joint_states(stamps(20), mtm.joint_names, q, qd, tau)})
+    assert is_ros_bag(path)
+    states = read_joint_states(path, mtm)
+    np.testing.assert_array_equal(states.q, q)
+    np.testing.assert_array_equal(states.qd, qd)
+    np.testing.assert_array_equal(states.tau, tau)
+    np.testing.assert_allclose(states.t, 0.01 * np.arange(20), atol=1e-12)
+    assert not states.notes
+
+
+@pytest.mark.parametrize(
+    "kind, compression",
+    [
+        ("ros1", (Ros1Writer.CompressionFormat.LZ4,)),
+        ("ros1", (Ros1Writer.CompressionFormat.BZ2,)),
+        ("sqlite3", (CompressionMode.MESSAGE, CompressionFormat.ZSTD)),
+        ("mcap", (CompressionMode.STORAGE, CompressionFormat.ZSTD)),
+    ],
+)
+def test_reads_compressed_bags(mtm, tmp_path, kind, compression):
+    q, qd, tau = blocks(20, 7)
+    rows = joint_states(stamps(20), mtm.joint_names, q, qd, tau)
+    path = write_bag(tmp_path, kind, {"/MTML/measured_js": rows}, compression=compression)
+    np.testing.assert_array_equal(read_joint_states(path, mtm).tau, tau)
+
+
+def test_orders_joints_by_name_and_ignores_others(mtm, tmp_path):
+    q, qd, tau = blocks(5, 8)
+    names = ("gripper", *mtm.joint_names[::-1])
+    path = write_bag(tmp_path, "mcap", {"/MTML/measured_js": joint_states(stamps(5), names, q, qd, tau)})
+    np.testing.assert_array_equal(read_joint_states(path, mtm).q, q[:, :0:-1])
+
+
+def test_joins_the_jaw_of_a_psm_by_time(psm, tmp_path):
+    q, qd, tau = blocks(40, 6)
+    arm = joint_states(stamps(40), psm.joint_names[:6], q, qd, tau)
+    # A jaw whose position is the time, at another rate and phase: linear interpolation is exact.
+    jaw_stamps = START + 3_000_000 + np.arange(20) * 15_000_000
+    ramp = 1e-9 * (jaw_stamps - START)[:, None]
+    jaw = joint_states(jaw_stamps, ["jaw"], ramp, ramp, ramp)
+    path = write_bag(tmp_path, "mcap", {"/PSM1/measured_js": arm, "/PSM1/jaw/measured_js": jaw})
+    states = read_joint_states(path, psm)
+    inside = slice(1, 29)
+    row = np.searchsorted(states.messages, np.arange(40)[inside] + 1)
+    np.testing.assert_allclose(states.q[row, 6], 0.01 * np.arange(40)[inside], atol=1e-9)
+    np.testing.assert_array_equal(states.q[row, :6], q[inside])
+    assert any("no message of the jaw" in note for note in states.notes)
+
+
+def test_reads_the_named_arm_of_several(psm, tmp_path):
+    first, second = blocks(5, 7, seed=1), blocks(5, 7, seed=2)
+    topics = {
+        "/PSM1/measured_js": joint_states(stamps(5), psm.joint_names, *first),
+        "/PSM2/measured_js": joint_states(stamps(5), psm.joint_names, *second),
+    }
+    path = write_bag(tmp_path, "mcap", topics)
+    with pytest.raises(RecordingError, match=r"several topics fit PSM: /PSM1/measured_js, /PSM2/measured_js"):
+        read_joint_states(path, psm)
+    for topic in ("/PSM2", "/PSM2/measured_js"):
+        np.testing.assert_array_equal(read_joint_states(path, psm, topic).q, second[0])
+
+
+def test_finds_the_arm_in_a_namespace(mtm, tmp_path):
+    q, qd, tau = blocks(5, 7)
+    path = write_bag(tmp_path, "mcap", {"/left/MTML/measured_js": joint_states(stamps(5), mtm.joint_names, q, qd, tau)})
+    np.testing.assert_array_equal(read_joint_states(path, mtm).q, q)
+
+
+def test_omits_invalid_and_repeated_stamps(mtm, tmp_path):
+    q, qd, tau = blocks(10, 7)
+    times = stamps(10)
+    times[0], times[5] = 0, times[4]
+    path = write_bag(tmp_path, "mcap", {"/MTML/measured_js": joint_states(times, mtm.joint_names, q, qd, tau)})
+    states = read_joint_states(path, mtm)
+    np.testing.assert_array_equal(states.messages, [2, 3, 4, 5, 7, 8, 9, 10])
+    np.testing.assert_array_equal(states.q, q[states.messages - 1])
+    assert [note.partition(" omitted")[0] for note in states.notes] == [
+        "1 messages of /MTML/measured_js",
+        "1 messages of /MTML/measured_js",
+    ]
+
+
+def damaged(mtm):
+    """(topics, expected text) of bags that must be refused."""
+    q, qd, tau = blocks(10, 7)
+    names, topic = mtm.joint_names, "/MTML/measured_js"
+    bad = tau.copy()
+    bad[3, 6] = np.nan
+    still = np.full(10, START)
+    yield (
+        {"/MTMR/measured_js": joint_states(stamps(10), names, q, qd, tau)},
+        r"no topic /MTML/measured_js.*MTMR/measured_js \(10\)",
+    )
+    yield {topic: joint_states(stamps(10), names, q, qd, bad)}, "message 4 .*effort of wrist_roll is nan"
+    yield {topic: joint_states(stamps(10), names[:6], q[:, :6])}, "also needs wrist_roll"
+    yield {topic: joint_states(stamps(10), [f"joint{i}" for i in range(7)], q)}, "another arm"
+    yield {topic: joint_states(stamps(10), names, (), qd, tau)}, "has no positions"
+    yield {topic: joint_states(stamps(10), names, q[:, :5], qd, tau)}, "5 numbers in `position`, but 7 joints"
+    yield {topic: joint_states(stamps(10), (), q)}, "names no joints"
+    yield {topic: joint_states(stamps(10), [names[0]] * 7, q)}, "names a joint twice"
+    yield {topic: joint_states(still, names, q, qd, tau)}, "stand still or go back in 9 of 10"
+    yield {topic: joint_states(np.zeros(10), names, q, qd, tau)}, "no usable message.*header stamp 0"
+    yield {topic: []}, "no messages"
+    yield {}, "JointState messages: none"
+    mixed = joint_states(stamps(10), names, q, qd, tau)
+    mixed[7] = (*mixed[7][:1], list(names[::-1]), *mixed[7][2:])
+    yield {topic: mixed}, "message 8 .*Choose a topic with one publisher"
+
+
+@pytest.mark.parametrize("case", range(13))
+def test_refuses_unusable_bags_with_one_line(mtm, tmp_path, case):
+    topics, text = list(damaged(mtm))[case]
+    path = write_bag(tmp_path, "mcap", topics)
+    with pytest.raises(RecordingError, match=text) as caught:
+        read_joint_states(path, mtm)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+def test_can_omit_numbers_that_are_not_finite(mtm, tmp_path):
+    q, qd, tau = blocks(10, 7)
+    tau[3, 6] = np.inf
+    path = write_bag(tmp_path, "mcap", {"/MTML/measured_js": joint_states(stamps(10), mtm.joint_names, q, qd, tau)})
+    states = read_joint_states(path, mtm, skip_invalid=True)
+    assert 4 not in states.messages and len(states.t) == 9
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_refuses_truncated_and_damaged_bags_with_one_line(mtm, tmp_path, kind):
+    q, qd, tau = blocks(300, 7)
+    rows = joint_states(stamps(300), mtm.joint_names, q, qd, tau)
+    path = write_bag(tmp_path, kind, {"/MTML/measured_js": rows})
+    file = next(path.glob("*.db3")) if path.is_dir() else path
+    content = file.read_bytes()
+    generator = np.random.default_rng(0)
+    for cut in (16, 20, len(content) // 3, len(content) // 2):
+        file.write_bytes(content[:cut])
+        with pytest.raises(RecordingError) as caught:
+            read_joint_states(path, mtm)
+        assert "\n" not in str(caught.value)
+    # A damaged byte may be a number that is still valid; anything else must be a refusal.
+    for _ in range(40):
+        flipped = bytearray(content)
+        for place in generator.integers(16, len(content), 3):
+            flipped[place] ^= 1 << generator.integers(8)
+        file.write_bytes(bytes(flipped))
+        try:
+            states = read_joint_states(path, mtm)
+        except RecordingError as error:
+            assert "\n" not in str(error)
+        else:
+            assert states.q.shape[1] == 7
+
+
+def test_other_files_are_no_bags(tmp_path):
+    (tmp_path / "poses.csv").write_text("q1,q2\n")
+    assert not is_ros_bag(tmp_path / "poses.csv")
+    assert not is_ros_bag(tmp_path)
+    assert not is_ros_bag(tmp_path / "missing.mcap")
