@@ -57,19 +57,23 @@ EFFECT_KINDS: dict[str, EffectKind] = {
     "coulomb": EffectKind("N m", _WIDTH, dissipative=True, code=2),
     "coulomb forward": EffectKind("N m", _WIDTH, code=3),
     "stribeck": EffectKind("N m", _WIDTH, code=4),
-    "presliding": EffectKind("N m", "travel until it slips [rad, m]", dissipative=True, code=5),
-    "presliding forward": EffectKind("N m", "travel until it slips [rad, m]", code=6),
+    "presliding": EffectKind("N m", "travel before sliding [rad, m]", dissipative=True, code=5),
+    "presliding forward": EffectKind("N m", "travel before sliding [rad, m]", code=6),
     # Friction of gears and cables that press harder under load.
     "load coulomb": EffectKind("1", _WIDTH, dissipative=True, loaded=True, code=2),
     # It pulls no more than at the travel that a recording covered: a straight line runs away outside of it.
     "spring": EffectKind(
         "N m/rad",
-        "largest |x| to which it is a straight line [rad, m]",
+        "largest |x| of the linear range [rad, m]",
         of_position=lambda f, x, scale: f.Max(-scale, f.Min(scale, x)),
     ),
     # One period a turn: a spring or a cable hooked on off the axis. More: a pulley that is not round, a cable's lay.
-    "cable sine": EffectKind("N m", "periods a turn", revolute=True, of_position=lambda f, x, s: f.sin(s * x)),
-    "cable cosine": EffectKind("N m", "periods a turn", revolute=True, of_position=lambda f, x, s: f.cos(s * x)),
+    "cable sine": EffectKind(
+        "N m", "number of periods per revolution", revolute=True, of_position=lambda f, x, s: f.sin(s * x)
+    ),
+    "cable cosine": EffectKind(
+        "N m", "number of periods per revolution", revolute=True, of_position=lambda f, x, s: f.cos(s * x)
+    ),
 }
 _NUMERIC = SimpleNamespace(sin=np.sin, cos=np.cos, Min=np.minimum, Max=np.maximum)
 #: Kinds that act at rest as well; friction holds either way and is left to the arm.
@@ -223,7 +227,8 @@ def effect_fault(arm: Arm, effect: ActuatorEffect, kinds: Collection[str] = EFFE
         return f'kind is "{effect.kind}"; allowed: {", ".join(kinds)}'
     kind = EFFECT_KINDS[effect.kind]
     if kind.revolute and slides(arm, effect.coordinate):
-        return f"kind {effect.kind} is of an angle, and {effect.coordinate} slides"
+        return f"kind {effect.kind} requires a revolute coordinate, but {effect.coordinate} is prismatic"
     if not (0 < effect.scale < math.inf if kind.scale else effect.scale == 0):
-        return f"scale is {effect.scale:g}; of kind {effect.kind} it is {kind.scale or 'always 0'}"
+        allowed = f"a positive number, the {kind.scale}" if kind.scale else "0"
+        return f"scale is {effect.scale:g}; allowed for kind {effect.kind}: {allowed}"
     return ""

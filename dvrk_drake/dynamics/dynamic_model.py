@@ -143,17 +143,21 @@ def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
         raise ModelError(f"dynamics.links must be, in this order: {', '.join(link.link for link in regressor.links)}")
     for link in section.links:
         if len(link.parameters) != len(PARAMETER_NAMES):
-            raise ModelError(f"dynamics: {link.link} must have ten numbers: {', '.join(PARAMETER_NAMES)}")
+            raise ModelError(f"dynamics: {link.link} must have ten parameters: {', '.join(PARAMETER_NAMES)}")
         least = float(np.linalg.eigvalsh(pseudo_inertia(link.parameters))[0])
         if not least > 0:
             raise ModelError(
-                f"dynamics: no body has the inertia of {link.link}: least eigenvalue {least:.2g} of its pseudo-inertia"
+                f"dynamics: the inertia of {link.link} is not physically consistent: the smallest eigenvalue of its "
+                f"pseudo-inertia is {least:.2g}, but must be positive"
             )
     if [rotor.actuator for rotor in section.rotors] != list(arm.joint_names):
         raise ModelError(f"dynamics.rotors must be, in this order: {', '.join(arm.joint_names)}")
     _check_effects(arm, section)
     settings = section.signals
-    for which, values in (("acceleration_cut_off", settings.acceleration_cut_off), ("delay", settings.effort_delay)):
+    for which, values in (
+        ("acceleration_cut_off", settings.acceleration_cut_off),
+        ("effort_delay", settings.effort_delay),
+    ):
         if len(values) != arm.num_joints:
             raise ModelError(f"dynamics.signals: {which} must have {arm.num_joints} numbers")
 
@@ -164,4 +168,4 @@ def _check_effects(arm: Arm, section: DynamicSection) -> None:
         if fault := effect_fault(arm, law):
             raise ModelError(f"{where}: {fault}")
         if law.dissipative and effect.coefficient < 0:
-            raise ModelError(f"{where}: coefficient is {effect.coefficient:g}; of friction 0 or more")
+            raise ModelError(f"{where}: coefficient is {effect.coefficient:g}; for friction it must be 0 or more")

@@ -167,13 +167,13 @@ class DynamicRegressor:
         q, v, vd = (np.ascontiguousarray(x, dtype=np.float64) for x in motion)
         n = self.arm.num_joints
         if q.ndim != 2 or q.shape[1] != n or not q.shape == v.shape == vd.shape:
-            raise ModelError(f"q, v, vd have shapes {q.shape}, {v.shape}, {vd.shape}; allowed: (m, {n}), all alike")
+            raise ModelError(f"q, v, vd have shapes {q.shape}, {v.shape}, {vd.shape}; allowed: (m, {n}) for all")
         return q, v, vd
 
     def _checked_parameters(self, parameters: ArrayLike) -> NDArray[np.float64]:
         phi = np.ascontiguousarray(parameters, dtype=np.float64)
         if phi.shape != self.values.shape:
-            raise ModelError(f"parameters have shape {phi.shape}; {self.arm.name} has {len(self.values)}")
+            raise ModelError(f"parameters have shape {phi.shape}; allowed for {self.arm.name}: ({len(self.values)},)")
         return phi
 
 

@@ -54,7 +54,7 @@ class Friction:
         """
         values = np.asarray(coefficients, float)
         if values.shape != (len(effects),):
-            raise ControllerError(f"friction: {len(effects)} effects need as many coefficients, not {values.shape}")
+            raise ControllerError(f"friction: coefficients have shape {values.shape}; allowed: ({len(effects)},)")
         loaded = [kind for kind, what in EFFECT_KINDS.items() if what.loaded]
         kept = [
             k
@@ -80,7 +80,7 @@ class Friction:
         """
         effects = [effect for effect in arm.effects.friction if not effect.fall_speed]
         if not effects:
-            raise ControllerError(f"friction: the files of {arm.name} state none")
+            raise ControllerError(f"friction: the files of {arm.name} contain no friction that can be compensated")
         return cls.of(arm, list(map(ActuatorEffect.of, effects)), [e.coefficient for e in effects])
 
     @classmethod
@@ -92,7 +92,7 @@ class Friction:
         """
         if model.dynamics is None:
             raise ModelError(
-                "friction: the model was identified from poses, which tell nothing of friction; give a motion's"
+                "friction: a model identified from static poses has no friction; use a model identified from a motion"
             )
         effects = model.dynamics.effects
         return cls.of(model.arm, list(map(ActuatorEffect.of, effects)), [e.coefficient for e in effects])
@@ -157,7 +157,7 @@ def safe_ratios(
     arm = friction.arm
     check_ratios(ratio, hysteresis_ratio)
     if error.shape != (arm.num_joints,) or not np.all((error >= 0) & np.isfinite(error)):
-        raise ControllerError(f"holding_error must be {arm.num_joints} numbers from 0; got {error.tolist()}")
+        raise ControllerError(f"holding_error must be {arm.num_joints} numbers of 0 or more; got {error.tolist()}")
     names = list(dict.fromkeys(effect.coordinate for effect in friction.effects))
     rows = np.array([joint_row(arm, name) for name in names]).reshape(-1, arm.num_joints)
     index = np.array([names.index(effect.coordinate) for effect in friction.effects], np.intp)

@@ -69,15 +69,15 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
         ArmError: the arm's SDF has no frames of that prefix, gravity is (almost) zero, or `serial` of an arm whose
             joints move other links than the numbered ones, as a PSM's jaw does.
     """
-    if np.linalg.norm(arm.gravity) < 1.0:
-        raise ArmError(f"{arm.name} is weightless: gravity must be 1 m/s^2 or more for a gravity model, on Earth 9.8")
+    if (size := float(np.linalg.norm(arm.gravity))) < 1.0:
+        raise ArmError(f"{arm.name}: gravity is {size:.3g} m/s^2; it must be 1 m/s^2 or more for a gravity model")
     plant = shared_plant(arm)
     bodies = labelled_bodies(plant, frames)
     kept = {label: body for label, body in bodies.items() if label.isdigit() or not serial}
     driven = {plant.GetJointByName(name).child_body().index() for name in arm.joint_names}
     if serial and not driven <= {body.index() for body, _ in kept.values()}:
         raise ArmError(
-            f"{arm.name} has joints whose links have no number: its links cannot be separated from its linkage"
+            f"{arm.name}: serial is not possible, because a joint moves a link that has no frame {frames}_<number>"
         )
     parameters = [StandardParameter(label, axis) for label in kept for axis in ("", "x", "y", "z")]
     lengths = named_lengths(plant, bodies, frames)
@@ -146,11 +146,11 @@ def _balanced_rotor(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
     """
     child = joint.child_body()
     if joint.type_name() != "revolute":
-        raise ArmError(f"{child.name()} needs a frame dh_<name>: it does not turn like a rotor")
+        raise ArmError(f"{child.name()} needs a frame dh_<name>, because its joint is not revolute")
     X_CM = joint.frame_on_child().GetFixedPoseInBodyFrame()
     axis, p_CM = X_CM.rotation() @ joint.revolute_axis(), X_CM.translation()
     if np.linalg.norm(np.cross(child.default_com() - p_CM, axis)) > 1e-9:
-        raise ArmError(f"{child.name()} needs a frame dh_<name>: its centre of mass is off its joint's axis")
+        raise ArmError(f"{child.name()} needs a frame dh_<name>, because its centre of mass is not on its joint axis")
     X_BC = child.body_frame().CalcPose(plant.CreateDefaultContext(), joint.parent_body().body_frame())
     along = np.outer(axis, axis)
     R_BC, p_BM = X_BC.rotation().matrix(), X_BC.multiply(p_CM)
@@ -169,7 +169,7 @@ def labelled_bodies(plant: MultibodyPlant, frames: str) -> dict[str, tuple[Rigid
         if (prefix == frames or (prefix == "dh" and not label.isdigit())) and not plant.IsAnchored(frame.body()):
             bodies[label] = (frame.body(), frame.GetFixedPoseInBodyFrame())
     if not any(label.isdigit() for label in bodies):
-        raise ArmError(f'the SDF has no frames "{frames}_1", "{frames}_2", ...; try "dh"')
+        raise ArmError(f'the SDF has no frames "{frames}_1", "{frames}_2", ...; use the prefix "dh"')
     return dict(sorted(bodies.items(), key=lambda item: (not item[0].isdigit(), item[0])))
 
 

@@ -211,7 +211,7 @@ class IdentifiedModel(_Identified):
             ModelError: Both `effects` and `dynamics` are given.
         """
         if dynamics and effects:
-            raise ModelError("a model with dynamics has all effects of the arm; give either effects or dynamics")
+            raise ModelError("dynamics already includes all effects of the arm; give either effects or dynamics")
         gravity = gravity_parameters(arm)
         return cls(
             arm=arm,
@@ -242,7 +242,7 @@ class IdentifiedModel(_Identified):
         # Reject an unknown version before its keys are checked.
         version = content.get("format") if isinstance(content, dict) else None
         if version and version not in (FORMAT, *_EARLIER_FORMATS):
-            raise ModelError(f'{path}: format is "{version}", this version reads "{FORMAT}", 3 and 2; identify anew')
+            raise ModelError(f'{path}: format is "{version}"; allowed: "{FORMAT}", 3 and 2. Identify the arm again')
         content = with_current_keys(ModelFile, content, str(path))
         file = typed_content(ModelFile, content, str(path), ModelError, "a model file")
         # A missing number would otherwise silently become 0.
@@ -251,11 +251,11 @@ class IdentifiedModel(_Identified):
         try:
             own_arm = load_arm(_named_from(path, file.arm)).with_gravity(file.gravity)
             if arm is not None and own_arm.name != arm.name:
-                raise ModelError(f"is of {own_arm.name}, not of {arm.name}")
+                raise ModelError(f"the model is of {own_arm.name}, not of {arm.name}")
             model = cls(arm=own_arm, **{part.name: getattr(file, part.name) for part in fields(_Identified)})
             model.check()
         except ArmError as error:
-            raise ModelError(f'{path}: its arm "{file.arm}" cannot be loaded: {error}') from error
+            raise ModelError(f'{path}: the arm "{file.arm}" cannot be loaded: {error}') from error
         except ModelError as error:
             raise ModelError(f"{path}: {error}") from error
         return model
@@ -291,14 +291,19 @@ class IdentifiedModel(_Identified):
             if fault := effect_fault(self.arm, ActuatorEffect.of(effect), POSITION_KINDS):
                 raise ModelError(f"effects[{i}]: {fault}")
         if self.validation is not None and set(self.validation.verdicts) != set(self.arm.joint_names):
-            raise ModelError(f"validation.verdicts must name these joints: {', '.join(self.arm.joint_names)}")
+            raise ModelError(
+                f"validation.verdicts has entries for {', '.join(self.validation.verdicts) or 'no joint'}; it needs "
+                f"one entry for each joint: {', '.join(self.arm.joint_names)}"
+            )
         for name, verdict in self.validation.verdicts.items() if self.validation else ():
             if verdict not in get_args(Verdict):
                 raise ModelError(f'validation.verdicts.{name} is "{verdict}"; allowed: {", ".join(get_args(Verdict))}')
         if self.dynamics is not None:
             DynamicModel(self.arm, self.dynamics)
             if self.effects or not np.allclose(self.dynamics.gravity, self.arm.gravity, rtol=0, atol=1e-9):
-                raise ModelError("a model with dynamics has effects only there, and the gravity that stands there")
+                raise ModelError(
+                    "a model with dynamics needs all effects in dynamics and gravity equal to dynamics.gravity"
+                )
 
     @property
     def holding_effects(self) -> list[DriveEffect]:
@@ -332,7 +337,7 @@ class IdentifiedModel(_Identified):
             ModelError: The model was identified from poses and has no `dynamics`.
         """
         if self.dynamics is None:
-            raise ModelError("the model has no dynamics: it was identified from poses; identify a motion")
+            raise ModelError("the model has no dynamics; use a model that was identified from a motion")
         return DynamicModel(self.arm, self.dynamics)
 
     def with_scaled_parameters(self, factors: ArrayLike) -> "IdentifiedModel":

@@ -59,7 +59,8 @@ class LinkInertia:
         try:
             return SpatialInertia(mass, moment / mass, UnitInertia(*(inertia / mass)))
         except RuntimeError as error:
-            raise ModelError(f"{self.link}: no body has this inertia: {str(error).splitlines()[0]}") from error
+            reason = str(error).splitlines()[0]
+            raise ModelError(f"{self.link}: the inertia is not physically consistent: {reason}") from error
 
 
 def link_inertias(arm: Arm) -> tuple[LinkInertia, ...]:

@@ -23,7 +23,7 @@ def handle_frame(arm: Arm) -> str:
     """
     numbered = [name for name in _frame_names(shared_plant(arm)) if re.fullmatch(r"dh_\d+", name)]
     if not numbered:
-        raise ArmError(f"{arm.name}: its SDF has no frames dh_0, dh_1, ...; name the handle's frame")
+        raise ArmError(f"{arm.name}: its SDF has no frames dh_0, dh_1, ...; give the name of the handle's frame")
     return max(numbered, key=lambda name: int(name.removeprefix("dh_")))
 
 
@@ -103,7 +103,7 @@ class PsmInverseKinematics:
         Raises:
             ArmError: the arm has not the kinematics of a PSM.
         """
-        not_a_psm = ArmError(f"{arm.name} has not the kinematics of a PSM with a wrist (roll, pitch, yaw)")
+        not_a_psm = ArmError(f"{arm.name} does not have the kinematics of a PSM with roll, wrist pitch and wrist yaw")
         if arm.num_joints < 6:
             raise not_a_psm
         plant = shared_plant(arm)

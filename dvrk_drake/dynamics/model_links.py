@@ -53,7 +53,7 @@ def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
         z = _nearest_body(A, b)
     z = _polished(A, b, z)
     if _least_eigenvalue(z) < MIN_SHARE / 2:
-        raise ModelError(f"{arm.name}: no bodies were found that have these base parameters")
+        raise ModelError(f"{arm.name}: no physically consistent links have these base parameters")
     links = list(regressor.links)
     for (i, T), part in zip(maps.items(), z.reshape(-1, 10), strict=True):
         links[i] = LinkInertia(links[i].link, T @ part)
@@ -124,7 +124,8 @@ def _nearest_body(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.
         program.AddPositiveSemidefiniteConstraint(_symmetric(np.array(shifted, dtype=object)))
     result = ClarabelSolver().Solve(program)
     if not result.is_success():
-        raise ModelError(f"no bodies were found that have these base parameters: {result.get_solution_result().name}")
+        status = result.get_solution_result().name
+        raise ModelError(f"found no physically consistent links with these base parameters (Clarabel: {status})")
     return np.asarray(result.GetSolution(z))
 
 
@@ -182,18 +183,18 @@ def model_bodies(model: IdentifiedModel) -> ModelBodies:
     if not np.allclose(arm.gravity, expected, atol=0.02):
         gravity = ", ".join(f"{x:.3f}" for x in arm.gravity)
         left_out.append(
-            f"gravity ({gravity}) m/s^2 in the base frame: set it in the world that the file is loaded into"
+            f"gravity ({gravity}) m/s^2 in the base frame; set this vector in the simulator that loads the file"
         )
     if model.dynamics is None:
         base_values = np.array([p.value for p in model.base_parameters])
         return ModelBodies(nearest_links(arm, base_values), {}, left_out)
     if effects := model.dynamics.effects:
         coordinates = dict.fromkeys(effect.coordinate for effect in effects)
-        left_out.append(f"{len(effects)} effects in the drive (friction, cables, springs): {', '.join(coordinates)}")
+        left_out.append(f"{len(effects)} drive effects (friction, cables, springs) along {', '.join(coordinates)}")
     links = {link.link: np.array(link.parameters) for link in model.dynamics.links}
     rotors, lost = _place_rotors(arm, links, [rotor.value for rotor in model.dynamics.rotors])
     if lost:
-        left_out.append(f"by what rotors couple joints, which SDF cannot say [kg m^2, largest]: {', '.join(lost)}")
+        left_out.append(f"rotor inertias that couple joints, largest element [kg m^2]: {', '.join(lost)}")
     return ModelBodies(tuple(LinkInertia(name, phi) for name, phi in links.items()), rotors, left_out)
 
 

@@ -69,7 +69,7 @@ def _shapes_of_links(arm: Arm) -> dict[str, BoundingShapes]:
     for url, shapes in zip(arm.sdf, arm.identification.bounding_shapes, strict=True):
         names = [link.get("name", "") for link in compose_sdf([url]).iterfind("model/link")]
         if unknown := set(shapes.boxes) - set(names):
-            raise ArmError(f"{arm.name}: bounding_shapes.boxes names {', '.join(sorted(unknown))}, no link of {url}")
+            raise ArmError(f"{arm.name}: bounding_shapes.boxes: {url} has no link {', '.join(sorted(unknown))}")
         for name in names:
             settings.setdefault(name, shapes)
     return settings
@@ -86,8 +86,8 @@ def _around_shapes(plant: MultibodyPlant, inspector: SceneGraphInspector, link: 
         upper = np.maximum(upper, X_LB.translation() + half_width)
     if not np.all(np.isfinite(lower)):
         raise ArmError(
-            f"{link} has no <collision> in its SDF, so nothing says where its mass can be: give it a box in "
-            "bounding_shapes of the arm's mechanism or instrument file"
+            f"{link} has no <collision> in its SDF, so the bounds of its mass are unknown. Give it a box in "
+            "bounding_shapes.boxes of the arm's mechanism or instrument file"
         )
     return BoundingBox(lower - margin, upper + margin)
 
@@ -225,8 +225,8 @@ def _solve(program: MathematicalProgram) -> MathematicalProgramResult:
         if result.is_success() and details.status == "Solved":
             return result
     raise IdentificationError(
-        f"the program for physically consistent parameters did not converge: Clarabel says {details.status} after "
-        f"{details.iterations} iterations; are efforts and positions this arm's?"
+        f"the identification did not converge (Clarabel: {details.status} after {details.iterations} iterations). "
+        "Usual causes: efforts of another arm, wrong units, or exchanged channels. Run: dvrk-drake check RECORDING"
     )
 
 
@@ -321,6 +321,6 @@ def _check(x: NDArray[np.float64], links: Sequence[LinkInertia]) -> None:
         least = float(np.linalg.eigvalsh(pseudo_inertia(x[10 * k : 10 * k + 10]))[0])
         if least < least_eigenvalue_bound(link):
             raise IdentificationError(
-                f"the program for physically consistent parameters left {link.link} with a pseudo-inertia of least "
-                f"eigenvalue {least:.2g}; it must be {least_eigenvalue_bound(link):.2g} or more"
+                f"the identified inertia of {link.link} is not physically consistent: the smallest eigenvalue of its "
+                f"pseudo-inertia is {least:.2g}, but must be {least_eigenvalue_bound(link):.2g} or more"
             )

@@ -47,5 +47,5 @@ def test_no_solution_above_the_remote_centre():
 
 
 def test_inverse_kinematics_refuses_an_arm_of_another_kind():
-    with pytest.raises(ArmError, match="MTML has not the kinematics of a PSM"):
+    with pytest.raises(ArmError, match="MTML does not have the kinematics of a PSM"):
         PsmInverseKinematics(MTM)

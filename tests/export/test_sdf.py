@@ -158,7 +158,7 @@ def test_what_urdf_cannot_say_is_refused(tmp_path):
     text = sdf.read_text()
     for old, new, message in (
         ("<axis>", "<pose>0 0 1 0 0 0</pose><axis>", "joint outer_yaw has a <pose>"),
-        ("<cylinder>", "<plane/><cylinder>", "URDF has no shape like plane"),
+        ("<cylinder>", "<plane/><cylinder>", "URDF does not support the shape plane"),
     ):
         sdf.write_text(text.replace(old, new, 1))
         with pytest.raises(ModelError, match=message):
@@ -187,7 +187,7 @@ def test_meshes_that_cannot_be_copied_are_one_line_and_no_model(tmp_path, capsys
     write_sdf(load_arm("mtml"), [], tmp_path / "other.sdf", "a test")
     (tmp_path / "other_meshes" / "mtm" / "base_link.gltf").unlink()
     incomplete = dataclasses.replace(load_arm("mtml"), sdf=(str(tmp_path / "other.sdf"),))
-    with pytest.raises(ArmError, match=r"base_link.gltf: no such mesh"):
+    with pytest.raises(ArmError, match=r"base_link.gltf: the mesh file does not exist"):
         write_sdf(incomplete, [], tmp_path / "again.sdf", "a test")
 
 
@@ -230,8 +230,8 @@ def test_what_no_body_has_is_refused(tmp_path):
     arm, path = load_arm("mtml"), tmp_path / "arm.sdf"
     link = link_inertias(arm)[0]
     for parameters, message in (
-        (link.parameters * np.r_[-1, np.ones(9)], "no body has this inertia"),
-        (link.parameters * np.r_[1, np.ones(3), 0.01, np.ones(5)], "no body has this inertia"),
+        (link.parameters * np.r_[-1, np.ones(9)], "not physically consistent"),
+        (link.parameters * np.r_[1, np.ones(3), 0.01, np.ones(5)], "not physically consistent"),
     ):
         with pytest.raises(ModelError, match=message):
             write_sdf(arm, [LinkInertia(link.link, parameters)], path, "a test")

@@ -64,12 +64,12 @@ def with_shapes(arm, shapes):
 
 def test_links_without_bounds_are_refused():
     arm = load_arm("mtmr")
-    with pytest.raises(ArmError, match=r"motor_4_link has no <collision> in its SDF.*give it a box"):
+    with pytest.raises(ArmError, match=r"motor_4_link has no <collision> in its SDF.*Give it a box"):
         bounding_boxes(with_shapes(arm, BoundingShapes()))
     box = BoxCorners([0, 0, 0], [1, -1, 1])
     with pytest.raises(ArmError, match="lower and upper of crank_link must be three numbers each"):
         shapes = dataclasses.replace(arm.identification.bounding_shapes[0], boxes={"crank_link": box})
         bounding_boxes(with_shapes(arm, shapes))
-    with pytest.raises(ArmError, match="boxes names elbow, no link of"):
+    with pytest.raises(ArmError, match=r"boxes: .* has no link elbow"):
         shapes = dataclasses.replace(arm.identification.bounding_shapes[0], boxes={"elbow": box})
         bounding_boxes(with_shapes(arm, shapes))
