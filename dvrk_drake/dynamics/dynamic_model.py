@@ -27,13 +27,13 @@ def effect_shapes(
 ) -> Iterator[NDArray[np.float64]]:
     """Yields the shape (m,) of each effect along its coordinate x = h a, starting from state 0.
 
-    The load of a coordinate is the effort f along it that bears the arm's weight as the SDF states it: of the efforts
-    tau of the actuators at rest the part h f, f = h tau / h h.
+    The load of a coordinate is |h tau| / (h h), where tau are the actuator efforts that compensate gravity according to
+    the SDF.
 
     Args:
-        regressor: of the arm.
-        effects: in its drives.
-        q, v: (m, n) positions and velocities of the joints [rad, m], evenly sampled.
+        regressor: Regressor of the arm.
+        effects: Effects in the drive.
+        q, v: Positions [rad, m] and velocities (m, n) of the joints, evenly sampled.
     """
     arm, q = regressor.arm, np.asarray(q, dtype=np.float64)
     a, a_dot = arm.transmission.position(q), arm.transmission.velocity(v)
@@ -52,8 +52,10 @@ def nominal_weight(regressor: DynamicRegressor, q: ArrayLike) -> NDArray[np.floa
     return regressor.arm.transmission.inverse.pull_back_effort(regressor.torque(q, rest, rest, regressor.values))
 
 
-#: An actuator with a gravity effort up to MIN_WEIGHT [N m, N] at WEIGHING_POSES random poses carries no weight.
-MIN_WEIGHT, WEIGHING_POSES = 1e-9, 20
+#: Largest gravity effort of an actuator that carries no weight [N m, N].
+MIN_WEIGHT = 1e-9
+#: Number of random poses at which the gravity efforts are computed.
+WEIGHING_POSES = 20
 
 
 class DynamicModel:

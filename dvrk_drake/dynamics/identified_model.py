@@ -1,4 +1,4 @@
-"""The identified model of an arm: its files, its torques, and its evaluation in a control loop."""
+"""Identified model of an arm: model file, holding torque, and evaluation in a control loop."""
 
 import math
 import os
@@ -151,7 +151,7 @@ class _Identified:
 
 @dataclass(kw_only=True)
 class _Head:
-    """The first lines of a model file.
+    """First fields of a model file.
 
     Attributes:
         format: Version of the file's keys.

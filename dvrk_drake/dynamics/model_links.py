@@ -1,4 +1,4 @@
-"""Computes links and rotors of an identified model for use in a simulator."""
+"""Computes inertial parameters of links and rotors from an identified model, for use in a simulator."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _map(link: LinkInertia) -> NDArray[np.float64]:
 def _is_rotor(arm: Arm, link: str) -> bool:
     """Returns whether a link has no frame dh_<name>.
 
-    The centre of mass of such a link is on its axis (see `derive_gravity`) and must remain there.
+    Such a link is a rotor. Its centre of mass is on its axis (see `gravity_parameters`) and must remain there.
     """
     plant = shared_plant(arm)
     frames = map(plant.get_frame, plant.GetFrameIndices(plant.GetBodyByName(link).model_instance()))
@@ -158,9 +158,9 @@ class ModelBodies:
     """Parts of an identified model that a simulator can represent.
 
     Attributes:
-        links: All moving links. A rotor that turns together with a link is part of it, as in the SDF.
+        links: All moving links. A rotor that rotates with a link is part of this link, as in the SDF.
         rotors: Joint -> reflected rotor inertia [kg m^2; kg for a prismatic joint]. If empty, those of the SDF apply.
-        left_out: Descriptions of the terms of the model's torque that are not represented, one line each.
+        left_out: Descriptions of the terms of the model's torque that are not represented.
     """
 
     links: tuple[LinkInertia, ...]
@@ -240,7 +240,10 @@ def _place_rotors(
 
 
 def _about(axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns Ixx .. Iyz (6,) of a rotor with inertia 1 about `axis` and 1/2 about perpendicular axes."""
+    """Returns the rotational inertia (6,) of a rotor, in the order Ixx, Iyy, Izz, Ixy, Ixz, Iyz.
+
+    The moment of inertia is 1 about `axis` and 1/2 about perpendicular axes.
+    """
     inertia = (np.eye(3) + np.outer(axis, axis)) / 2
     return np.concatenate([np.diag(inertia), inertia[[0, 0, 1], [1, 2, 2]]])
 

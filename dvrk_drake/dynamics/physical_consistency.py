@@ -24,7 +24,7 @@ from dvrk_drake.models.sdf_model import compose_sdf
 
 @dataclass(frozen=True, eq=False)
 class BoundingBox:
-    """Box aligned with the axes of the frame of link L. `lower` and `upper` (3,) are its corners p_LoC_L [m]."""
+    """Axis-aligned box in the frame of a link, given by its lower and upper corners (3,) [m]."""
 
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]

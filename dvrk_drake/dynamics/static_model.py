@@ -33,7 +33,10 @@ class StaticModel:
 
     @cached_property
     def torque_into(self) -> Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None]:
-        """Compiled f(q, theta, out), float64 C-contiguous (n,), (b + e,), (n,); for control loops."""
+        """Compiled function f(q, theta, out) for control loops, which writes the holding torque to `out`.
+
+        The arguments are C-contiguous float64 arrays (n,) [rad, m], (b + e,) and (n,) [N m, N].
+        """
         theta = sympy.symbols(f"theta0:{self.num_parameters}")
         terms = codegen.share_terms(sympy.Array(list(self._symbolic_regressor * sympy.Matrix(theta))))
         return codegen.compile_function("torque", [("q", self.gravity.q), ("theta", theta)], terms)
