@@ -36,7 +36,7 @@ class EffectKind:
         revolute: True if it is allowed for revolute coordinates only.
         loaded: True if the shape is multiplied by the load of the coordinate [N m, N].
         code: Code of the kind in `effect_step`. 0 for kinds that depend on position only.
-        of_position: Function (f, x, scale) -> shape for a kind that depends on position only, otherwise None. These
+        position_shape: Function (f, x, scale) -> shape for a kind that depends on position only, otherwise None. These
             effects also act at rest. f provides sin, cos, Min and Max for numbers or symbols.
     """
 
@@ -46,14 +46,14 @@ class EffectKind:
     revolute: bool = False
     loaded: bool = False
     code: int = 0
-    of_position: Callable[[Any, Any, Any], Any] | None = None
+    position_shape: Callable[[Any, Any, Any], Any] | None = None
 
 
 _WIDTH = "speed at which the smoothed sign is 0.76 [rad/s, m/s]"
 #: Name -> kind of effect.
 EFFECT_KINDS: dict[str, EffectKind] = {
     # Cable preload or offset of the motor current.
-    "offset": EffectKind("N m", of_position=lambda f, x, scale: 1),
+    "offset": EffectKind("N m", position_shape=lambda f, x, scale: 1),
     "viscous": EffectKind("N m s/rad", dissipative=True, code=1),
     "coulomb": EffectKind("N m", _WIDTH, dissipative=True, code=2),
     "coulomb forward": EffectKind("N m", _WIDTH, code=3),
@@ -66,19 +66,19 @@ EFFECT_KINDS: dict[str, EffectKind] = {
     "spring": EffectKind(
         "N m/rad",
         "largest |x| of the linear range [rad, m]",
-        of_position=lambda f, x, scale: f.Max(-scale, f.Min(scale, x)),
+        position_shape=lambda f, x, scale: f.Max(-scale, f.Min(scale, x)),
     ),
     # One period per revolution: a spring or cable attached off the axis. More: an eccentric pulley or cable stranding.
     "cable sine": EffectKind(
-        "N m", "number of periods per revolution", revolute=True, of_position=lambda f, x, s: f.sin(s * x)
+        "N m", "number of periods per revolution", revolute=True, position_shape=lambda f, x, s: f.sin(s * x)
     ),
     "cable cosine": EffectKind(
-        "N m", "number of periods per revolution", revolute=True, of_position=lambda f, x, s: f.cos(s * x)
+        "N m", "number of periods per revolution", revolute=True, position_shape=lambda f, x, s: f.cos(s * x)
     ),
 }
 _NUMERIC = SimpleNamespace(sin=np.sin, cos=np.cos, Min=np.minimum, Max=np.maximum)
 #: Kinds that depend on position only and therefore act at rest. Friction at rest has no unique value.
-POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.of_position is not None)
+POSITION_KINDS = tuple(name for name, kind in EFFECT_KINDS.items() if kind.position_shape is not None)
 
 
 @numba.njit(cache=True)
@@ -142,7 +142,7 @@ class ActuatorEffect:
         """True if the coefficient must not be negative."""
         return EFFECT_KINDS[self.kind].dissipative
 
-    def of_position(self, x: sympy.Expr) -> sympy.Expr:
+    def position_shape(self, x: sympy.Expr) -> sympy.Expr:
         """Returns the shape at position x [rad, m] of the coordinate. The kind must be in `POSITION_KINDS`."""
         import sympy  # Importing sympy takes 0.3 s, and motions do not need it.
 
@@ -150,7 +150,7 @@ class ActuatorEffect:
         return sympy.sympify(self._shape(sympy, x, scale))
 
     def _shape(self, functions: Any, x: Any, scale: Any) -> Any:
-        shape = EFFECT_KINDS[self.kind].of_position
+        shape = EFFECT_KINDS[self.kind].position_shape
         assert shape is not None, f"{self} depends on more than position"
         return shape(functions, x, scale)
 
@@ -181,17 +181,17 @@ class ActuatorEffect:
         if self.kind in POSITION_KINDS:
             return np.array(np.broadcast_to(self._shape(_NUMERIC, x, self.scale), x.shape), dtype=np.float64)
         kind = EFFECT_KINDS[self.kind]
-        shape = _run(kind.code, np.ascontiguousarray(x), np.ascontiguousarray(v), self.scale)
+        shape = _run_effect(kind.code, np.ascontiguousarray(x), np.ascontiguousarray(v), self.scale)
         return shape * load if kind.loaded else shape
 
 
 @numba.njit(cache=True)
-def _run(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+def _run_effect(code: int, x: NDArray[np.float64], v: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
     out = np.empty(len(x))
-    state, before = 0.0, x[0]
+    state, previous = 0.0, x[0]
     for i in range(len(x)):
-        state, out[i] = effect_step(code, state, x[i] - before, v[i], scale)
-        before = x[i]
+        state, out[i] = effect_step(code, state, x[i] - previous, v[i], scale)
+        previous = x[i]
     return out
 
 
@@ -206,7 +206,7 @@ def distinct_coordinates(arm: Arm) -> list[str]:
     return kept
 
 
-def slides(arm: Arm, coordinate: str) -> bool:
+def is_prismatic(arm: Arm, coordinate: str) -> bool:
     """Returns whether a coordinate is that of a prismatic actuator or joint."""
     return any(p and coordinate.endswith(f".{n}") for p, n in zip(arm.prismatic, arm.joint_names, strict=True))
 
@@ -224,7 +224,7 @@ def position_along(arm: Arm, coordinate: str, q: NDArray[np.float64]) -> NDArray
     return np.asarray(arm.transmission.position(q) @ arm.effect_coordinates[coordinate])
 
 
-def spring_over(coordinate: str, x: NDArray[np.float64]) -> ActuatorEffect:
+def spring_for_range(coordinate: str, x: NDArray[np.float64]) -> ActuatorEffect:
     """Returns a spring whose linear range exceeds the positions x (m,) [rad, m] of a recording by 1 %."""
     return ActuatorEffect(coordinate, "spring", float(f"{1.01 * np.abs(x).max():.3g}"))
 
@@ -243,7 +243,7 @@ def effect_fault(arm: Arm, effect: ActuatorEffect, kinds: Collection[str] = EFFE
     if effect.kind not in kinds:
         return f'kind is "{effect.kind}"; allowed: {", ".join(kinds)}'
     kind = EFFECT_KINDS[effect.kind]
-    if kind.revolute and slides(arm, effect.coordinate):
+    if kind.revolute and is_prismatic(arm, effect.coordinate):
         return f"kind {effect.kind} requires a revolute coordinate, but {effect.coordinate} is prismatic"
     if not (0 < effect.scale < math.inf if kind.scale else effect.scale == 0):
         allowed = f"a positive number, the {kind.scale}" if kind.scale else "0"

@@ -17,13 +17,13 @@ class StandardParameter:
     Attributes:
         label: Number or name of the link, such as "2" or "crank". For a rotor, number of the actuator.
         axis: "" for the mass [kg], "x", "y" or "z" for a first moment [kg m], "xx", "yy", "zz", "xy", "xz" or "yz" for
-            a moment or product of inertia [kg m^2], and "a" for the inertia of a rotor [kg m^2; kg if `slides`].
-        slides: True for the rotor of a prismatic actuator.
+            a moment or product of inertia [kg m^2], and "a" for the inertia of a rotor [kg m^2; kg if `prismatic`].
+        prismatic: True for the rotor of a prismatic actuator.
     """
 
     label: str
     axis: str = ""
-    slides: bool = False
+    prismatic: bool = False
 
     def __str__(self) -> str:
         if self.is_inertia:
@@ -41,7 +41,7 @@ class StandardParameter:
     def unit(self) -> str:
         """SI unit of the parameter."""
         if self.is_inertia:
-            return "kg" if self.slides else "kg m^2"
+            return "kg" if self.prismatic else "kg m^2"
         return "kg m" if self.axis else "kg"
 
 
@@ -114,20 +114,22 @@ def reduce_to_base(
             basis = np.column_stack([basis, residual / norm])
     columns.sort()
     in_basis = basis.T @ regressor
-    combination = _snap(np.asarray(np.linalg.solve(in_basis[:, columns], in_basis)), lengths)
-    names = tuple(_readable(row, parameters, lengths) for row in combination)
+    combination = _snap_to_known(np.asarray(np.linalg.solve(in_basis[:, columns], in_basis)), lengths)
+    names = tuple(_format_combination(row, parameters, lengths) for row in combination)
     units = tuple(parameters[column].unit for column in columns)
     return BaseParameters(tuple(columns), combination, names, units)
 
 
-def _snap(combination: NDArray[np.float64], lengths: Mapping[str, float]) -> NDArray[np.float64]:
+def _snap_to_known(combination: NDArray[np.float64], lengths: Mapping[str, float]) -> NDArray[np.float64]:
     """Replaces coefficients within rounding error of 0, +-1 or a named length by the exact values."""
     known = np.array([0.0, 1.0, -1.0, *lengths.values(), *(-v for v in lengths.values())])
     nearest = known[np.argmin(np.abs(combination[..., None] - known), axis=-1)]
     return np.where(np.abs(combination - nearest) < 1e-9, nearest, combination)
 
 
-def _readable(row: NDArray[np.float64], parameters: Sequence[StandardParameter], lengths: Mapping[str, float]) -> str:
+def _format_combination(
+    row: NDArray[np.float64], parameters: Sequence[StandardParameter], lengths: Mapping[str, float]
+) -> str:
     """Formats a base parameter as a sum of inertias, masses and first moments.
 
     Masses with a common coefficient are grouped in brackets.

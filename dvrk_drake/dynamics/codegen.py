@@ -61,7 +61,7 @@ def python_source(
     lines = [f"def {name}({', '.join(n for n, _ in arguments)}, out):"]
     if docstring:
         lines.append(f'    """{docstring}"""')
-    lines += unpacking(arguments, terms, "    {symbol} = {array}[{index}]")
+    lines += unpacking_lines(arguments, terms, "    {symbol} = {array}[{index}]")
     code = partial(sympy.pycode, user_functions=dict(functions or {}))
     lines += [f"    {symbol} = {code(e)}" for symbol, e in terms.assignments]
     if len(terms.entries) < math.prod(terms.shape):
@@ -129,7 +129,9 @@ def is_scalar(name: str, symbols: Sequence[sympy.Symbol]) -> bool:
     return len(symbols) == 1 and symbols[0].name == name
 
 
-def unpacking(arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms, form: str) -> list[str]:
+def unpacking_lines(
+    arguments: Sequence[tuple[str, Sequence[sympy.Symbol]]], terms: SharedTerms, form: str
+) -> list[str]:
     """Returns one line of code for each array element that `terms` use.
 
     Args:

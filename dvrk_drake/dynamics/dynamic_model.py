@@ -166,8 +166,8 @@ def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
 
 def _check_effects(arm: Arm, section: DynamicSection) -> None:
     for i, effect in enumerate(section.effects):
-        where, law = f"dynamics.effects[{i}]", ActuatorEffect.of(effect)
-        if fault := effect_fault(arm, law):
+        where, actuator_effect = f"dynamics.effects[{i}]", ActuatorEffect.of(effect)
+        if fault := effect_fault(arm, actuator_effect):
             raise ModelError(f"{where}: {fault}")
-        if law.dissipative and effect.coefficient < 0:
+        if actuator_effect.dissipative and effect.coefficient < 0:
             raise ModelError(f"{where}: coefficient is {effect.coefficient:g}; for friction it must be 0 or more")

@@ -231,11 +231,11 @@ def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True)
     for rotor in rotors:
         a, b = (model.arm.joint_names.index(name) for name in rotor.actuators)
         label = f"{a + 1}" if a == b else f"{a + 1},{b + 1}"
-        parameters.append(StandardParameter(label, "a", slides=bool(a == b and model.arm.prismatic[a])))
+        parameters.append(StandardParameter(label, "a", prismatic=bool(a == b and model.arm.prismatic[a])))
     base = reduce_to_base(
         _regressor_at_random_states(model)[:, :p] @ to_links,
         parameters,
-        _readable_preference(parameters, _hinge_axes(plant, model, frames)),
+        _preference_order(parameters, _hinge_axes(plant, model, frames)),
         _named_coefficients(named_lengths(plant, bodies)),
     )
     return DynamicBaseParameters(tuple(parameters), base, to_links)
@@ -274,7 +274,7 @@ def _hinge_axes(
     return axes
 
 
-def _readable_preference(parameters: list[StandardParameter], hinge_axes: dict[str, int]) -> list[int]:
+def _preference_order(parameters: list[StandardParameter], hinge_axes: dict[str, int]) -> list[int]:
     """Returns the columns in the order of preference as base parameters.
 
     For a revolute link with axis u, three parameters can be regrouped with the previous link: its mass, its first
@@ -283,18 +283,18 @@ def _readable_preference(parameters: list[StandardParameter], hinge_axes: dict[s
     links of the linkage. Rotors follow the links, and masses are last.
     """
 
-    def given_away(p: StandardParameter) -> bool:
+    def is_regrouped(p: StandardParameter) -> bool:
         if not p.axis:
             return True
         u = hinge_axes.get(p.label)
-        across = [axis for axis in range(3) if axis != u]
-        return u is not None and p.axis in ("xyz"[u], 2 * "xyz"[across[-1]])
+        perpendicular = [axis for axis in range(3) if axis != u]
+        return u is not None and p.axis in ("xyz"[u], 2 * "xyz"[perpendicular[-1]])
 
     def key(index: int) -> tuple:
         p = parameters[index]
         number = int(p.label) if p.label.isdigit() else math.inf
         rotor = p.axis == "a"
-        return (not p.axis, rotor, given_away(p), number == math.inf, number if given_away(p) else -number, index)
+        return (not p.axis, rotor, is_regrouped(p), number == math.inf, number if is_regrouped(p) else -number, index)
 
     return sorted(range(len(parameters)), key=key)
 

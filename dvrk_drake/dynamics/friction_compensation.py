@@ -26,7 +26,7 @@ MAX_RATIO = 0.6
 #: Largest share of hysteresis (see `Friction.springs_back`) that may be compensated.
 MAX_HYSTERESIS_RATIO = 0.9
 #: Assumed ratio of a model's largest holding error to its leave-one-out RMS error. Simulated arms rarely exceed it.
-WRONG_AT_MOST = 2.0
+HOLDING_ERROR_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
@@ -167,25 +167,27 @@ def safe_ratios(
     index = np.array([names.index(effect.coordinate) for effect in friction.effects], np.intp)
     holding = np.bincount(index, friction.coefficients * friction.holds, len(names)).astype(float)
     ratios = np.zeros(len(names))
-    _, block_of = connected_components(np.abs(rows).T @ np.abs(rows))
-    for block in range(block_of.max() + 1):
-        joints = block_of == block
+    _, group_of = connected_components(np.abs(rows).T @ np.abs(rows))
+    for group in range(group_of.max() + 1):
+        joints = group_of == group
         along = np.any(rows[:, joints] != 0, axis=1)
         if not np.any(along):  # No friction acts on these joints.
             continue
-        ratios[along] = _largest(rows[np.ix_(along, joints)], holding[along], error[joints], ratio)
+        ratios[along] = _largest_ratios(rows[np.ix_(along, joints)], holding[along], error[joints], ratio)
     if hysteresis_ratio <= ratio:
         return ratios[index]
-    dry = np.array([effect.kind != "viscous" for effect in friction.effects], bool)
-    wide = np.bincount(index, friction.coefficients * friction.springs_back, len(names))
-    most = MAX_RATIO * np.bincount(index, friction.coefficients * dry, len(names))
-    of_wide = np.minimum(hysteresis_ratio, most / np.maximum(wide, 1e-12))
-    left_for_rest = (most - of_wide * wide) / np.maximum(most / MAX_RATIO - wide, 1e-12)
-    of_rest = np.where(wide > 0, np.minimum(ratios, np.maximum(left_for_rest, 0.0)), ratios)
-    return np.where(friction.springs_back, of_wide[index], of_rest[index])
+    is_dry = np.array([effect.kind != "viscous" for effect in friction.effects], bool)
+    hysteresis = np.bincount(index, friction.coefficients * friction.springs_back, len(names))
+    max_compensated = MAX_RATIO * np.bincount(index, friction.coefficients * is_dry, len(names))
+    hysteresis_ratios = np.minimum(hysteresis_ratio, max_compensated / np.maximum(hysteresis, 1e-12))
+    remaining_ratios = (max_compensated - hysteresis_ratios * hysteresis) / np.maximum(
+        max_compensated / MAX_RATIO - hysteresis, 1e-12
+    )
+    other_ratios = np.where(hysteresis > 0, np.minimum(ratios, np.maximum(remaining_ratios, 0.0)), ratios)
+    return np.where(friction.springs_back, hysteresis_ratios[index], other_ratios[index])
 
 
-def _largest(
+def _largest_ratios(
     rows: NDArray[np.float64], holding: NDArray[np.float64], error: NDArray[np.float64], most: float
 ) -> NDArray[np.float64]:
     """Returns the largest ratios (c,) of coordinates for which the remaining friction holds all errors.
@@ -201,7 +203,7 @@ def _largest(
     m, c = len(corners), len(rows)
     # The unknowns are the ratios, then the forces along the coordinates at each corner.
     identity, limits = np.eye(m * c), np.tile(np.diag(holding), (m, 1))
-    done = linprog(
+    result = linprog(
         np.concatenate([-np.ones(c), np.zeros(m * c)]),
         A_ub=np.block([[limits, identity], [limits, -identity]]),
         b_ub=np.tile(holding, 2 * m),
@@ -209,12 +211,13 @@ def _largest(
         b_eq=np.concatenate(corners),
         bounds=[*[(0.0, most)] * c, *[(None, None)] * (m * c)],
     )
-    return done.x[:c] if done.success else np.zeros(c)
+    return result.x[:c] if result.success else np.zeros(c)
 
 
 def holding_error(model: IdentifiedModel) -> NDArray[np.float64]:
     """Returns the assumed error (n,) of the model's gravity torque [N m, N].
 
-    It is `WRONG_AT_MOST` times the leave-one-out RMS error, and zero for a model that was not identified from poses.
+    It is `HOLDING_ERROR_FACTOR` times the leave-one-out RMS error. It is zero for a model that was not identified from
+    static poses.
     """
-    return WRONG_AT_MOST * np.array([joint.rms_leave_one_out_included for joint in model.joints])
+    return HOLDING_ERROR_FACTOR * np.array([joint.rms_leave_one_out_included for joint in model.joints])

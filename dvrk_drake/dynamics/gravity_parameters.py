@@ -88,7 +88,7 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
         standard_parameters=tuple(parameters),
         to_standard=_to_standard(plant, arm, list(kept.values())),
         lengths={name: length for name, length in lengths.items() if name != "1"},
-        base=reduce_to_base(regressor, parameters, _readable_preference(parameters), lengths),
+        base=reduce_to_base(regressor, parameters, _preference_order(parameters), lengths),
     )
 
 
@@ -215,7 +215,7 @@ def named_lengths(
     return lengths
 
 
-def _readable_preference(parameters: Sequence[StandardParameter]) -> list[int]:
+def _preference_order(parameters: Sequence[StandardParameter]) -> list[int]:
     """Returns parameter indices in the order of preference as base parameters.
 
     First moments of numbered links come first, from the tip to the base, then first moments of the linkage, then

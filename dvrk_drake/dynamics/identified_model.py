@@ -150,7 +150,7 @@ class _Identified:
 
 
 @dataclass(kw_only=True)
-class _Head:
+class _Header:
     """First fields of a model file.
 
     Attributes:
@@ -165,7 +165,7 @@ class _Head:
 
 
 @dataclass(kw_only=True)
-class ModelFile(_Identified, _Head):
+class ModelFile(_Identified, _Header):
     """Schema of a model file."""
 
 
@@ -249,7 +249,7 @@ class IdentifiedModel(_Identified):
         if key := missing_key(ModelFile, content):
             raise ModelError(f"{path}: {key} is missing")
         try:
-            own_arm = load_arm(_named_from(path, file.arm)).with_gravity(file.gravity)
+            own_arm = load_arm(_arm_argument(path, file.arm)).with_gravity(file.gravity)
             if arm is not None and own_arm.name != arm.name:
                 raise ModelError(f"the model is of {own_arm.name}, not of {arm.name}")
             model = cls(arm=own_arm, **{part.name: getattr(file, part.name) for part in fields(_Identified)})
@@ -268,7 +268,7 @@ class IdentifiedModel(_Identified):
         """
         self.check()
         with atomic_write(path) as stream:
-            stream.write(yaml_dump_typed(self._file(_name_for(path, self.arm))))
+            stream.write(yaml_dump_typed(self._file(_arm_reference(path, self.arm))))
 
     def to_yaml(self) -> str:
         """Returns the text of a model file that refers to the arm by `Arm.source`."""
@@ -391,14 +391,14 @@ class ControlModel:
         return self._regressor.mass_matrix(q[None], self._parameters)[0]
 
 
-def _name_for(path: str | Path, arm: Arm) -> str:
+def _arm_reference(path: str | Path, arm: Arm) -> str:
     """Returns the name of the arm in the model file at `path`: a URL, or a path relative to that file."""
     if not os.path.isabs(arm.source):
         return f"{PACKAGE_URL}arms/{arm.source}.yaml"
     return os.path.relpath(arm.source, os.path.dirname(os.path.realpath(path)))
 
 
-def _named_from(path: str | Path, name: str) -> str:
+def _arm_argument(path: str | Path, name: str) -> str:
     """Returns the argument of `load_arm` for the arm that the model file at `path` calls `name`."""
     if not name.endswith((".yaml", ".yml")) or name.startswith(PACKAGE_URL):
         return name

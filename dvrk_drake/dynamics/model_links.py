@@ -22,7 +22,7 @@ from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.plant import shared_plant
 
 #: Lower bound on the eigenvalues of Z, the pseudo-inertia of a link relative to that of the SDF (see `nearest_links`).
-MIN_SHARE = 0.01
+MIN_EIGENVALUE_RATIO = 0.01
 #: Change of Z below which a link counts as unchanged.
 _ROUNDING = 1e-7
 _UPPER = [(i, k) for i in range(4) for k in range(i, 4)]
@@ -32,10 +32,10 @@ def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
     """Returns the physically consistent links nearest to those of the SDF whose gravity torque is Y(q) beta.
 
     With the pseudo-inertia J0 = L L' of a link in the SDF, Z = L^-1 J L^-T is the identity for an unchanged link of any
-    size. The distance is the sum of |Z - 1|^2 (Frobenius norm) over the links. It is minimized subject to Z > MIN_SHARE
-    and the linear equations of the gravity torque. Distance and constraint do not depend on frames or units. The
-    distance is the second-order approximation at J0 of the one by Lee, Wensing and Park, "Geometric robot dynamic
-    identification" (2020).
+    size. The distance is the sum of |Z - 1|^2 (Frobenius norm) over the links. It is minimized subject
+    to Z > MIN_EIGENVALUE_RATIO and the linear equations of the gravity torque. Distance and constraint do not depend on
+    frames or units. The distance is the second-order approximation at J0 of the one by Lee, Wensing and Park,
+    "Geometric robot dynamic identification" (2020).
 
     Args:
         arm: Arm of the links.
@@ -46,13 +46,13 @@ def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
     """
     regressor = DynamicRegressor(arm)
     # phi of a link is a linear function of the ten elements z of its Z. Rotors are not changed.
-    maps = {i: _map(link) for i, link in enumerate(regressor.links) if not _is_rotor(arm, link.link)}
+    maps = {i: _parameter_map(link) for i, link in enumerate(regressor.links) if not _is_rotor(arm, link.link)}
     A, b = _equations(regressor, maps, np.asarray(base_values, dtype=np.float64))
     z = _nearest(A, b)
-    if _least_eigenvalue(z) < MIN_SHARE:
-        z = _nearest_body(A, b)
-    z = _polished(A, b, z)
-    if _least_eigenvalue(z) < MIN_SHARE / 2:
+    if _least_eigenvalue(z) < MIN_EIGENVALUE_RATIO:
+        z = _nearest_consistent(A, b)
+    z = _refine(A, b, z)
+    if _least_eigenvalue(z) < MIN_EIGENVALUE_RATIO / 2:
         raise ModelError(f"{arm.name}: no physically consistent links have these base parameters")
     links = list(regressor.links)
     for (i, T), part in zip(maps.items(), z.reshape(-1, 10), strict=True):
@@ -60,7 +60,7 @@ def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
     return tuple(links)
 
 
-def _map(link: LinkInertia) -> NDArray[np.float64]:
+def _parameter_map(link: LinkInertia) -> NDArray[np.float64]:
     L = np.linalg.cholesky(link.pseudo_inertia())
     return np.column_stack([parameters_from_pseudo_inertia(L @ _symmetric(e) @ L.T) for e in np.eye(10)])
 
@@ -112,15 +112,15 @@ def _nearest(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float
     return target + step / np.sqrt(weights)
 
 
-def _nearest_body(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the nearest z for which the eigenvalues of all Z are at least MIN_SHARE."""
+def _nearest_consistent(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the nearest z for which the eigenvalues of all Z are at least MIN_EIGENVALUE_RATIO."""
     weights, target = _weights(A.shape[1] // 10)
     program = MathematicalProgram()
     z = program.NewContinuousVariables(len(weights), "z")
     program.AddQuadraticCost(2 * np.diag(weights), -2 * weights * target, z, is_convex=True)
     program.AddLinearEqualityConstraint(A, b, z)
     for link in z.reshape(-1, 10):
-        shifted = [variable - MIN_SHARE * (i == k) for variable, (i, k) in zip(link, _UPPER, strict=True)]
+        shifted = [variable - MIN_EIGENVALUE_RATIO * (i == k) for variable, (i, k) in zip(link, _UPPER, strict=True)]
         program.AddPositiveSemidefiniteConstraint(_symmetric(np.array(shifted, dtype=object)))
     result = ClarabelSolver().Solve(program)
     if not result.is_success():
@@ -129,15 +129,15 @@ def _nearest_body(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.
     return np.asarray(result.GetSolution(z))
 
 
-def _polished(A: NDArray[np.float64], b: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float64]:
+def _refine(A: NDArray[np.float64], b: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float64]:
     """Resets links that changed only by rounding, and satisfies the equations to machine precision with the others.
 
     Clarabel satisfies the equations to 1e-8. This correction is much smaller than the distance to the cone boundary.
     """
     _, target = _weights(A.shape[1] // 10)
-    moved = np.repeat(np.abs(z - target).reshape(-1, 10).max(axis=1) > _ROUNDING, 10)
-    z = np.where(moved, z, target)
-    z[moved] -= np.linalg.lstsq(A[:, moved], A @ z - b, rcond=None)[0]
+    changed = np.repeat(np.abs(z - target).reshape(-1, 10).max(axis=1) > _ROUNDING, 10)
+    z = np.where(changed, z, target)
+    z[changed] -= np.linalg.lstsq(A[:, changed], A @ z - b, rcond=None)[0]
     return z
 
 
@@ -192,9 +192,9 @@ def model_bodies(model: IdentifiedModel) -> ModelBodies:
         coordinates = dict.fromkeys(effect.coordinate for effect in effects)
         left_out.append(f"{len(effects)} drive effects (friction, cables, springs) along {', '.join(coordinates)}")
     links = {link.link: np.array(link.parameters) for link in model.dynamics.links}
-    rotors, lost = _place_rotors(arm, links, [rotor.value for rotor in model.dynamics.rotors])
-    if lost:
-        left_out.append(f"rotor inertias that couple joints, largest element [kg m^2]: {', '.join(lost)}")
+    rotors, couplings = _assign_rotors(arm, links, [rotor.value for rotor in model.dynamics.rotors])
+    if couplings:
+        left_out.append(f"rotor inertias that couple joints, largest element [kg m^2]: {', '.join(couplings)}")
     return ModelBodies(tuple(LinkInertia(name, phi) for name, phi in links.items()), rotors, left_out)
 
 
@@ -207,7 +207,7 @@ def _static_effects(model: IdentifiedModel) -> list[str]:
     return remarks
 
 
-def _place_rotors(
+def _assign_rotors(
     arm: Arm, links: dict[str, NDArray[np.float64]], inertias: list[float]
 ) -> tuple[dict[str, float], list[str]]:
     """Assigns rotor inertias to joints, or adds them to `links` that turn with the rotor.
@@ -218,28 +218,28 @@ def _place_rotors(
     the two perpendicular axes is half of it, to be physically consistent.
 
     Returns:
-        Joint -> rotor inertia, and descriptions of the rotors whose coupling terms are lost.
+        Joint -> rotor inertia, and descriptions of the rotors whose coupling terms are not represented.
     """
     plant = shared_plant(arm)
-    turning = _turning_links(plant, arm)
+    rotations = _rotation_rates(plant, arm)
     joints = np.zeros(arm.num_joints)
-    lost = []
+    couplings = []
     for name, row, inertia in zip(arm.joint_names, arm.transmission.matrix, inertias, strict=True):
-        same = [link for link, (rate, _) in turning.items() if np.allclose(rate, row, atol=1e-9)]
+        same = [link for link, (rate, _) in rotations.items() if np.allclose(rate, row, atol=1e-9)]
         if np.count_nonzero(row) > 1 and same:
             # All links in `same` turn at the same rate, so any of them can be used. The last is part of the linkage.
             link = same[-1]
-            axis = turning[link][1]
-            links[link] = links[link] + inertia * np.concatenate([np.zeros(4), _about(axis)])
+            axis = rotations[link][1]
+            links[link] = links[link] + inertia * np.concatenate([np.zeros(4), _unit_rotor_inertia(axis)])
             continue
         joints += inertia * row**2
         if np.count_nonzero(row) > 1 and inertia > 0:
             coupling = inertia * np.outer(row, row)
-            lost.append(f"{name} {np.abs(coupling - np.diag(np.diag(coupling))).max():.2g}")
-    return {name: float(x) for name, x in zip(arm.joint_names, joints, strict=True)}, lost
+            couplings.append(f"{name} {np.abs(coupling - np.diag(np.diag(coupling))).max():.2g}")
+    return {name: float(x) for name, x in zip(arm.joint_names, joints, strict=True)}, couplings
 
 
-def _about(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unit_rotor_inertia(axis: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the rotational inertia (6,) of a rotor, in the order Ixx, Iyy, Izz, Ixy, Ixz, Iyz.
 
     The moment of inertia is 1 about `axis` and 1/2 about perpendicular axes.
@@ -248,14 +248,14 @@ def _about(axis: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([np.diag(inertia), inertia[[0, 0, 1], [1, 2, 2]]])
 
 
-def _turning_links(plant: MultibodyPlant, arm: Arm) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def _rotation_rates(plant: MultibodyPlant, arm: Arm) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Returns link -> (rate, axis) for links with a revolute joint.
 
     rate (n,) is the angular velocity about the joint axis per joint velocity. It includes parents with parallel axes.
     axis (3,) is the joint axis in the link's frame.
     """
     context = plant.CreateDefaultContext()
-    turning: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+    rotations: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
     axes: dict[str, NDArray[np.float64]] = {}
     for name, row in zip(arm.tree_joint_names, arm.linkage.matrix, strict=True):
         joint = plant.GetJointByName(name)
@@ -265,8 +265,8 @@ def _turning_links(plant: MultibodyPlant, arm: Arm) -> dict[str, tuple[NDArray[n
         link, parent = joint.child_body(), joint.parent_body().name()
         axis_W = X_WM.rotation() @ joint.revolute_axis()
         X_WL = link.EvalPoseInWorld(context)
-        parallel = parent in turning and np.allclose(axes[parent], axis_W, atol=1e-9)
-        rate = row + turning[parent][0] if parallel else row
-        turning[link.name()] = rate, X_WL.rotation().inverse() @ axis_W
+        parallel = parent in rotations and np.allclose(axes[parent], axis_W, atol=1e-9)
+        rate = row + rotations[parent][0] if parallel else row
+        rotations[link.name()] = rate, X_WL.rotation().inverse() @ axis_W
         axes[link.name()] = axis_W
-    return turning
+    return rotations

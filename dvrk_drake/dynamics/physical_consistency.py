@@ -55,11 +55,11 @@ def bounding_boxes(arm: Arm) -> dict[str, BoundingBox]:
     for body in map(plant.get_body, plant.GetBodyIndices(instance)):
         if not plant.IsAnchored(body):
             name = body.name()
-            stated = shapes[name].boxes.get(name)
-            if stated is None:
-                boxes[name] = _around_shapes(plant, scene_graph.model_inspector(), name, shapes[name].margin)
+            corners = shapes[name].boxes.get(name)
+            if corners is None:
+                boxes[name] = _box_around_shapes(plant, scene_graph.model_inspector(), name, shapes[name].margin)
             else:
-                boxes[name] = _stated(name, stated)
+                boxes[name] = _box_from_corners(name, corners)
     return boxes
 
 
@@ -75,7 +75,7 @@ def _shapes_of_links(arm: Arm) -> dict[str, BoundingShapes]:
     return settings
 
 
-def _around_shapes(plant: MultibodyPlant, inspector: SceneGraphInspector, link: str, margin: float) -> BoundingBox:
+def _box_around_shapes(plant: MultibodyPlant, inspector: SceneGraphInspector, link: str, margin: float) -> BoundingBox:
     lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
     frame = plant.GetBodyFrameIdOrThrow(plant.GetBodyByName(link).index())
     for geometry in inspector.GetGeometries(frame, Role.kProximity):
@@ -92,7 +92,7 @@ def _around_shapes(plant: MultibodyPlant, inspector: SceneGraphInspector, link: 
     return BoundingBox(lower - margin, upper + margin)
 
 
-def _stated(link: str, corners: BoxCorners) -> BoundingBox:
+def _box_from_corners(link: str, corners: BoxCorners) -> BoundingBox:
     lower, upper = np.array(corners.lower, float), np.array(corners.upper, float)
     if lower.shape != (3,) or upper.shape != (3,) or not np.all(lower < upper) or not np.isfinite(upper - lower).all():
         raise ArmError(f"bounding_shapes: lower and upper of {link} must be three numbers each, lower below upper [m]")
@@ -194,8 +194,8 @@ def consistent_parameters(
     program.AddQuadraticCost(np.eye(len(b)), -Q.T @ b, z, is_convex=True)
     bounded = np.flatnonzero(np.isfinite(lower))
     size = np.linalg.norm(to_x[bounded], axis=1)
-    high = np.full(len(bounded), np.inf)
-    program.AddLinearConstraint(to_x[bounded] / size[:, None], lower[bounded] / size, high, z)
+    upper = np.full(len(bounded), np.inf)
+    program.AddLinearConstraint(to_x[bounded] / size[:, None], lower[bounded] / size, upper, z)
     for k, link in enumerate(links):
         to_link = to_x[10 * k : 10 * k + 10]
         own = np.flatnonzero(np.any(to_link, axis=0))
@@ -249,12 +249,12 @@ def least_eigenvalue_bound(link: LinkInertia) -> float:
     return min(MIN_EIGENVALUE, 0.25 * float(np.linalg.eigvalsh(link.pseudo_inertia())[0]))
 
 
-def room_in_box(parameters: NDArray[np.float64], box: BoundingBox) -> NDArray[np.float64]:
+def box_margins(parameters: NDArray[np.float64], box: BoundingBox) -> NDArray[np.float64]:
     """Returns 1 - (mean square distance from the center of the box) / (half width)^2 for each axis (3,).
 
     A negative value means that the mass does not fit into the box.
     """
-    return _room(box) @ parameters / parameters[0]
+    return _margin_matrix(box) @ parameters / parameters[0]
 
 
 def reached_bounds(parameters: NDArray[np.float64], link: LinkInertia, box: BoundingBox) -> list[str]:
@@ -264,7 +264,9 @@ def reached_bounds(parameters: NDArray[np.float64], link: LinkInertia, box: Boun
         for limit in MASS_RANGE
         if abs(parameters[0] / link.parameters[0] - limit) < _AT_BOUND * limit
     ]
-    sides = "".join(axis for axis, room in zip("xyz", room_in_box(parameters, box), strict=True) if room < _AT_BOUND)
+    sides = "".join(
+        axis for axis, margin in zip("xyz", box_margins(parameters, box), strict=True) if margin < _AT_BOUND
+    )
     if sides:
         bounds.append(f"mass fills its box along {sides}")
     return bounds
@@ -296,12 +298,12 @@ def _constrain_link(
     program: MathematicalProgram, z: NDArray, to_link: NDArray[np.float64], link: LinkInertia, box: BoundingBox
 ) -> None:
     mass = link.parameters[0]
-    low, high = MASS_RANGE
-    program.AddLinearConstraint(to_link[:1] / mass, [low], [high], z)
-    program.AddLinearConstraint(_room(box) @ to_link / mass, np.zeros(3), np.full(3, np.inf), z)
+    lower_ratio, upper_ratio = MASS_RANGE
+    program.AddLinearConstraint(to_link[:1] / mass, [lower_ratio], [upper_ratio], z)
+    program.AddLinearConstraint(_margin_matrix(box) @ to_link / mass, np.zeros(3), np.full(3, np.inf), z)
 
 
-def _room(box: BoundingBox) -> NDArray[np.float64]:
+def _margin_matrix(box: BoundingBox) -> NDArray[np.float64]:
     """Returns a matrix (3, 10) that maps parameters to the integral of 1 - (x - c)^2 / w^2 over the mass, per axis.
 
     c and w are center and half width of the box.

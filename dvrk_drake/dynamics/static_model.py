@@ -86,7 +86,7 @@ def _effect_columns(
         row = [_number(r) for r in joint_row(arm, effect.coordinate).tolist()]
         offset = arm.effect_coordinates[effect.coordinate] @ arm.transmission.offset
         x = sum((r * q for r, q in zip(row, joint_positions, strict=True)), _number(float(offset)))
-        columns.append(sympy.Matrix(row) * effect.of_position(x))
+        columns.append(sympy.Matrix(row) * effect.position_shape(x))
     return columns
 
 

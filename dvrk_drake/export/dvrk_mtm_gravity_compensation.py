@@ -23,7 +23,7 @@ NUM_GRAVITY = 10
 #: Order of the polynomials.
 ORDER = 4
 #: Effects that the first two columns represent at the shoulder.
-_FIRST = ("cable sine", "cable cosine")
+_FIRST_EFFECTS = ("cable sine", "cable cosine")
 MTM_JOINTS = (
     "outer_yaw",
     "shoulder_pitch",
@@ -148,21 +148,21 @@ def compensation_from_model(
     check_tolerance(options.tolerance)
     poses = arm.sample_poses(20000, np.random.default_rng(0))
     gravity, effects = _gravity_parameters(model, poses[:4000]), _effect_parameters(model, arm)
-    _refuse_errors(model, gravity, effects, poses[:4000], options.tolerance)
+    _check_errors(model, gravity, effects, poses[:4000], options.tolerance)
     parameters = gravity + effects
-    coulomb = _seven("coulomb", options.coulomb)
+    coulomb = _checked_values("coulomb", options.coulomb)
     friction = np.zeros(NUM_PARAMETERS)
     friction[[polynomial_columns(j).start for j in range(NUM_JOINTS - 1)]] = coulomb[:-1]
-    needed = controller_regressor(poses) @ parameters
-    lower, upper = _torque_limits(arm, needed.min(axis=0) - coulomb, needed.max(axis=0) + coulomb)
+    torque = controller_regressor(poses) @ parameters
+    lower, upper = _torque_limits(arm, torque.min(axis=0) - coulomb, torque.max(axis=0) + coulomb)
     file = GravityCompensationFile(
         positive=parameters + friction,
         negative=parameters - friction,
         torque_lower=lower,
         torque_upper=upper,
-        dead_band=_seven("dead_band", options.dead_band),
-        saturation=_seven("saturation", options.saturation),
-        friction_ratio=_seven("friction_ratio", options.friction_ratio),
+        dead_band=_checked_values("dead_band", options.dead_band),
+        saturation=_checked_values("saturation", options.saturation),
+        friction_ratio=_checked_values("friction_ratio", options.friction_ratio),
     )
     file.check()
     return file
@@ -210,10 +210,10 @@ def _gravity_parameters(model: IdentifiedModel, poses: NDArray[np.float64]) -> N
     solution = np.linalg.lstsq(R.reshape(-1, NUM_GRAVITY), _gravity_torque(model, q).ravel(), rcond=None)[0]
     parameters = np.concatenate([solution, np.zeros(NUM_PARAMETERS - NUM_GRAVITY)])
     R = controller_regressor(poses)
-    left = _gravity_torque(model, poses) - R @ parameters
+    residual = _gravity_torque(model, poses) - R @ parameters
     for joint in range(NUM_JOINTS - 1):
         columns = polynomial_columns(joint)
-        parameters[columns] = np.linalg.lstsq(R[:, joint, columns], left[:, joint], rcond=None)[0]
+        parameters[columns] = np.linalg.lstsq(R[:, joint, columns], residual[:, joint], rcond=None)[0]
     return parameters
 
 
@@ -221,15 +221,15 @@ def _effect_parameters(model: IdentifiedModel, arm: Arm) -> NDArray[np.float64]:
     parameters = np.zeros(NUM_PARAMETERS)
     for estimate in model.holding_effects:
         row = joint_row(arm, estimate.coordinate)
-        # The file has no torque at the last joint and no functions of two joints. _refuse_errors includes that error.
+        # The file has no torque at the last joint and no functions of two joints. _check_errors includes that error.
         for joint in map(int, np.flatnonzero(row[:-1])):
             value = float(model.feedforward_scale[joint] * estimate.coefficient * row[joint])
             if estimate.kind == "offset":
                 parameters[polynomial_columns(joint).start] += value
             elif np.count_nonzero(row) > 1:
                 continue
-            elif joint == 1 and estimate.scale == 1.0 and estimate.kind in _FIRST:
-                parameters[_FIRST.index(estimate.kind)] += value / CONTROLLER_GRAVITY
+            elif joint == 1 and estimate.scale == 1.0 and estimate.kind in _FIRST_EFFECTS:
+                parameters[_FIRST_EFFECTS.index(estimate.kind)] += value / CONTROLLER_GRAVITY
             else:
                 parameters[polynomial_columns(joint)] += value * _best_polynomial(
                     ActuatorEffect.of(estimate), arm, joint
@@ -251,7 +251,7 @@ def _best_polynomial(effect: ActuatorEffect, arm: Arm, joint: int) -> NDArray[np
     return np.resize(np.append(polynomial.coef, np.zeros(ORDER + 1)), ORDER + 1)
 
 
-def _refuse_errors(
+def _check_errors(
     model: IdentifiedModel,
     gravity: NDArray[np.float64],
     effects: NDArray[np.float64],
@@ -319,7 +319,7 @@ def _torque_limits(
     return lower, upper
 
 
-def _seven(name: str, values: tuple[float, ...]) -> NDArray[np.float64]:
+def _checked_values(name: str, values: tuple[float, ...]) -> NDArray[np.float64]:
     if len(values) != NUM_JOINTS or not np.all(np.isfinite(values)) or min(values) < 0:
         raise ModelError(f"{name} must be {NUM_JOINTS} numbers of 0 or more, one per joint")
     return np.array(values, dtype=np.float64)

@@ -25,7 +25,7 @@ _MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
 _SIDE_JOINTS = slice(1, 4)
 #: Largest ratio of errors at which the mirror image fits clearly better. For the four public files, the error of a
 #: model of the wrong side is 1.8 to 2.1 times the error of a model of the correct side.
-_CLEARLY_BETTER = 0.8
+_MAX_ERROR_RATIO = 0.8
 #: Number of poses inside the sweep of the file that are required to compare the sides only there.
 _MIN_POSES = 200
 #: Smallest torque whose sign is compared, as a share of the model's largest torque on that joint.
@@ -194,7 +194,7 @@ def _is_of_other_side(
     if np.count_nonzero(in_sweep) >= _MIN_POSES:
         q, tau_file = q[in_sweep], tau_file[in_sweep]
     own, mirrored = model.holding_torque(q), _MIRROR * model.holding_torque(_MIRROR * q)
-    return _side_error(tau_file, mirrored) < _CLEARLY_BETTER * _side_error(tau_file, own)
+    return _side_error(tau_file, mirrored) < _MAX_ERROR_RATIO * _side_error(tau_file, own)
 
 
 def _side_error(tau_file: NDArray[np.float64], tau_model: NDArray[np.float64]) -> float:

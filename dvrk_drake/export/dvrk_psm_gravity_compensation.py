@@ -119,9 +119,9 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
     # (m, 3, 7, 4): torque on yaw, pitch and insertion per unit of mass and first moments of each link of the chain.
     frames = [_frames(alpha, A, theta, D, pose) for pose in straight[:, :3]]
     Y = np.array([_regressor(X, arm.gravity) for X in frames])
-    mass, moment = _prior(model_bodies(model).links, plant, _frames(alpha, A, theta, D, np.zeros(3)))
-    lifted = Y[:, 2, _LAST, 0]
-    mass_7 = float(lifted @ tau[:, 2] / (lifted @ lifted))
+    mass, moment = _initial_links(model_bodies(model).links, plant, _frames(alpha, A, theta, D, np.zeros(3)))
+    mass_column = Y[:, 2, _LAST, 0]
+    mass_7 = float(mass_column @ tau[:, 2] / (mass_column @ mass_column))
     if not mass_7 > 0:
         raise ModelError(
             f"{arm.name}: the net mass on the insertion joint is {mass_7:.3g} kg because of the counterweight. The "
@@ -136,9 +136,9 @@ def kinematic_compensation(model: IdentifiedModel, tolerance: float = 1e-6) -> K
     tau_model = model.holding_torque(straight)[:, :3]
     error = np.abs(np.einsum("mjlk,lk->mj", Y, known) - tau_model).max(axis=0)
     if error.max() > tolerance:
-        off = ", ".join(f"{name} {e:.2g}" for name, e in zip(ARM_JOINTS, error, strict=True) if e > tolerance)
+        errors = ", ".join(f"{name} {e:.2g}" for name, e in zip(ARM_JOINTS, error, strict=True) if e > tolerance)
         raise ModelError(
-            f"the controller's file cannot represent this model: the largest errors are {off} (N m; N for insertion). "
+            f"the controller's file cannot represent this model: the largest errors are {errors} [N m, N]. "
             "The file supports only gravity with a feedforward scale of 1. Effects that are not represented: "
             f"{_omitted_effects(model, straight)}. To accept the errors, repeat the command with "
             f"--gc-tolerance {round_up(error.max()):g}"
@@ -222,7 +222,7 @@ def _regressor(X: NDArray[np.float64], gravity: NDArray[np.float64]) -> NDArray[
     return np.einsum("jk,klm->jlm", ARM_FROM_CHAIN, chain)
 
 
-def _prior(
+def _initial_links(
     links: tuple[LinkInertia, ...], plant: MultibodyPlant, home: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns masses (7,) [kg] and first moments (7, 3) [kg m] of the links of the chain, before the fit.

@@ -107,7 +107,7 @@ def c_source(
     size = math.prod(terms.shape)
     lines = [f"/* {comment} */"] if comment else []
     lines += ["#include <math.h>", "", f"void {name}({', '.join(parameters)}, double out[{size}]) {{"]
-    lines += codegen.unpacking(arguments, terms, "  const double {symbol} = {array}[{index}];")
+    lines += codegen.unpacking_lines(arguments, terms, "  const double {symbol} = {array}[{index}];")
     lines += [f"  const double {symbol} = {sympy.ccode(e)};" for symbol, e in terms.assignments]
     lines.append(f"  for (int i = 0; i < {size}; ++i) out[i] = 0.0;")
     for index, e in terms.entries:

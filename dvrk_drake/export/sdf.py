@@ -50,7 +50,7 @@ def changed_links(arm: Arm, links: Sequence[LinkInertia]) -> list[LinkChange]:
     if len(set(names)) < len(names):
         raise ModelError(f"{arm.name}: each link may be given only once; got {', '.join(names)}")
     changes = (LinkChange(inertia.link, before[inertia.link], inertia) for inertia in links)
-    return [c for c in changes if not _same(c.before.parameters, c.after.parameters)]
+    return [c for c in changes if not _equal_parameters(c.before.parameters, c.after.parameters)]
 
 
 def with_inertias(
@@ -171,7 +171,7 @@ def _numbers(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
     return [repr(float(x)) if abs(x) > least else "0" for x in values]
 
 
-def _same(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+def _equal_parameters(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
     """Returns whether mass, first moments and rotational inertia are equal, each relative to its magnitude."""
     parts = (slice(0, 1), slice(1, 4), slice(4, 10))
     return all(np.abs(a[p] - b[p]).max() <= _UNCHANGED * np.abs(a[p]).max() for p in parts)
@@ -220,8 +220,8 @@ def redirect_meshes(root: ElementTree.Element, model_path: Path) -> dict[Path, P
         target = model_path.parent / relative
         if copies.setdefault(source, target) != target or list(copies.values()).count(target) > 1:
             raise ArmError(f"{source}: another mesh of the model has the same name and folder name; rename one of them")
-        for part in _parts_of(source):
-            copies[source.parent / part] = target.parent / part
+        for file in _referenced_files(source):
+            copies[source.parent / file] = target.parent / file
         uri.text = relative.as_posix()
     return copies
 
@@ -252,13 +252,13 @@ def _local_path(uri: str) -> Path | None:
     return local_path(uri.removeprefix(_FILE_URL))
 
 
-def _parts_of(mesh: Path) -> list[str]:
+def _referenced_files(mesh: Path) -> list[str]:
     """Returns paths of the buffers and images of a glTF file, relative to its folder. Other meshes have none."""
     if mesh.suffix != ".gltf":
         return []
     content = read_json_input(mesh, ArmError, MAX_BINARY)
     try:
-        uris = [part.get("uri", "data:") for kind in ("buffers", "images") for part in content.get(kind, [])]
+        uris = [file.get("uri", "data:") for kind in ("buffers", "images") for file in content.get(kind, [])]
         names = [uri for uri in uris if not uri.startswith("data:")]
     except (AttributeError, TypeError) as error:
         raise ArmError(f"{mesh}: not a valid glTF file; its buffers and images must be objects with a uri") from error

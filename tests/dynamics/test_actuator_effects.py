@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, slides
+from dvrk_drake.dynamics.actuator_effects import EFFECT_KINDS, ActuatorEffect, is_prismatic
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.arm import load_arm
@@ -73,4 +73,4 @@ def test_effects_do_equal_work_on_actuators_and_coordinates():
     rows = arm.effect_coordinates
     a = arm.transmission.position(q)
     assert rows["finger_1"] @ a == pytest.approx(q[5] - q[6] / 2)
-    assert slides(arm, "actuator.insertion") and not slides(arm, "finger_1")
+    assert is_prismatic(arm, "actuator.insertion") and not is_prismatic(arm, "finger_1")

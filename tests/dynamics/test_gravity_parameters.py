@@ -65,7 +65,7 @@ def test_base_parameters_are_those_of_the_symbolic_derivation(arm):
     base = reduce_to_base(
         np.concatenate([np.array(regressor(*q), dtype=float) for q in poses]),
         parameters.standard_parameters,
-        numeric._readable_preference(parameters.standard_parameters),
+        numeric._preference_order(parameters.standard_parameters),
         numeric.named_lengths(shared_plant(arm), plant.bodies),
     )
     assert base.names == parameters.base.names

@@ -6,7 +6,7 @@ import pytest
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.gravity_regressor import derive_gravity
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
-from dvrk_drake.dynamics.model_links import MIN_SHARE, nearest_links
+from dvrk_drake.dynamics.model_links import MIN_EIGENVALUE_RATIO, nearest_links
 from dvrk_drake.dynamics.static_model import compile_static_model
 from dvrk_drake.models.arm import load_arm
 
@@ -35,7 +35,7 @@ def test_they_have_the_base_parameters_and_can_exist(name, size):
     tau = regressor.torque(q, np.zeros_like(q), np.zeros_like(q), parameters)
     expected = compile_static_model(arm).torque(q, values)
     np.testing.assert_allclose(tau, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
-    assert min(np.linalg.eigvalsh(Z).min() for Z in relative(arm, links)) > 0.99 * MIN_SHARE
+    assert min(np.linalg.eigvalsh(Z).min() for Z in relative(arm, links)) > 0.99 * MIN_EIGENVALUE_RATIO
 
 
 def test_nothing_changes_where_nothing_is_asked():
@@ -51,7 +51,7 @@ def test_no_feasible_step_towards_the_sdf_remains():
     arm = load_arm("mtml")
     values = other_base_values(arm, 0.2)
     nearest = np.array(relative(arm, nearest_links(arm, values)))
-    active = min(np.linalg.eigvalsh(Z).min() for Z in nearest) < 1.5 * MIN_SHARE
+    active = min(np.linalg.eigvalsh(Z).min() for Z in nearest) < 1.5 * MIN_EIGENVALUE_RATIO
     assert active  # the cone's edge was met, so this was Clarabel's work
     towards_sdf = np.eye(4) - nearest
     generator = np.random.default_rng(2)

@@ -11,10 +11,10 @@ from dvrk_drake.dynamics.physical_consistency import (
     TOTAL_MASS_TOLERANCE,
     LinkScale,
     bounding_boxes,
+    box_margins,
     consistent_parameters,
     least_eigenvalue_bound,
     log_det_curvature,
-    room_in_box,
 )
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import load_arm
@@ -81,7 +81,7 @@ def test_what_cannot_exist_becomes_what_can_at_least_cost(links, boxes, nominal,
         assert np.linalg.eigvalsh(pseudo_inertia(own))[0] >= least_eigenvalue_bound(link)
         low, high = (share * link.parameters[0] for share in MASS_RANGE)
         assert low * (1 - 1e-6) <= own[0] <= high * (1 + 1e-6)
-        assert np.min(room_in_box(own, boxes[link.link])) > -1e-5
+        assert np.min(box_margins(own, boxes[link.link])) > -1e-5
         com, box = own[1:4] / own[0], boxes[link.link]
         assert np.all(np.abs(com - box.center) <= box.half_width * (1 + 1e-5))
     assert abs(np.sum(x[::10]) / np.sum(nominal[::10]) - 1) <= TOTAL_MASS_TOLERANCE + 1e-6

@@ -14,9 +14,9 @@ from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
     distinct_coordinates,
     effect_fault,
+    is_prismatic,
     position_along,
-    slides,
-    spring_over,
+    spring_for_range,
 )
 from dvrk_drake.dynamics.base_parameters import independent_columns
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
@@ -108,7 +108,7 @@ def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
             by_position = which != ASYMMETRIC
             if which in known or (by_position and set(known) - {ASYMMETRIC}):
                 continue
-            if which == "spring" or not by_position or not slides(arm, name):
+            if which == "spring" or not by_position or not is_prismatic(arm, name):
                 effects += _named(arm, name, which, x, v)
     return effects
 
@@ -123,7 +123,7 @@ def _named(
     if which == ASYMMETRIC:
         return [ActuatorEffect(coordinate, "coulomb forward", _rounded(DIRECTION_WIDTH * v.std()))]
     if which == "spring":
-        return [spring_over(coordinate, x)]
+        return [spring_for_range(coordinate, x)]
     effects = [ActuatorEffect(coordinate, kind, NAMED_EFFECTS[which]) for kind in ("cable sine", "cable cosine")]
     if fault := effect_fault(arm, effects[0]):
         raise ArmError(f"{where}: {fault}")

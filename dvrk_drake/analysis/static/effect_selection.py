@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.static.linear_fit import RobustFit, robust_fit
 from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
+    is_prismatic,
     joint_row,
     position_along,
-    slides,
-    spring_over,
+    spring_for_range,
 )
 from dvrk_drake.models.arm import Arm
 
@@ -99,11 +99,11 @@ def _known_spring(problem: StaticProblem, joint: str) -> list[ActuatorEffect]:
     if "spring" not in problem.arm.identification.known_effects.get(name, []):
         return []
     x = position_along(problem.arm, name, problem.q)
-    return [spring_over(name, x)] if np.ptp(x) >= MIN_SPAN["spring"] else []
+    return [spring_for_range(name, x)] if np.ptp(x) >= MIN_SPAN["spring"] else []
 
 
 def _cables(problem: StaticProblem, coordinate: str) -> list[ActuatorEffect]:
-    if slides(problem.arm, coordinate):
+    if is_prismatic(problem.arm, coordinate):
         return []
     span = np.ptp(position_along(problem.arm, coordinate, problem.q))
     kinds = ("cable sine", "cable cosine")

@@ -13,9 +13,9 @@ from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
     distinct_coordinates,
     effect_fault,
+    is_prismatic,
     joint_row,
     position_along,
-    slides,
 )
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics
@@ -129,7 +129,7 @@ def test_identical_coordinates_are_listed_once(name):
     assert np.abs(unit @ unit.T - np.eye(len(kept))).max() < 1 - 1e-6
     for c, row in rows.items():
         assert np.abs(unit @ row / np.linalg.norm(row)).max() > 1 - 1e-9, f"{c} is lost"
-    assert [c for c in rows if slides(arm, c)] == [f"{kind}.insertion" for kind in ("actuator", "joint")] * (
+    assert [c for c in rows if is_prismatic(arm, c)] == [f"{kind}.insertion" for kind in ("actuator", "joint")] * (
         name == "psm"
     )
 
