@@ -90,9 +90,9 @@ def reduce_to_base(
 ) -> BaseParameters:
     """Computes base parameters whose regressor columns come as early as possible in `preference`.
 
-    This is a QR decomposition with pivots in the order of `preference` instead of their magnitude. For exact regressor
-    values, the order affects only the form of the base parameters (Gautier, "Numerical calculation of the base inertial
-    parameters of robots", 1991).
+    This is a QR decomposition with pivots in the order of `preference` instead of their magnitude. For an exact
+    regressor, the order affects only the form of the base parameters. Reference: Gautier, "Numerical calculation of the
+    base inertial parameters of robots" (1991).
 
     Args:
         regressor: Regressor rows (rows, p) at random states, with many more rows than columns.

@@ -40,9 +40,9 @@ class DynamicRegressor:
     """Regressor Y of the inverse dynamics tau = Y(q, v, vd) phi of an arm, including linkage and rotors.
 
     tau is the torque on the n independent joints. phi (p,) contains the ten inertial parameters of every moving link,
-    about the origin and along the axes of its SDF frame, then the inertias of the rotors in actuator coordinates. The
-    joints are read from the arm's MultibodyPlant. tau equals the plant's inverse dynamics minus gravity forces,
-    projected through the linkage with G'. Friction and joint damping are not included.
+    then the inertias of the rotors in actuator coordinates. The parameters of a link are about the origin of its SDF
+    frame and expressed in this frame. The joints are read from the arm's MultibodyPlant. tau equals the plant's inverse
+    dynamics minus gravity forces, projected through the linkage with G'. Friction and joint damping are not included.
 
     Attributes:
         arm: Arm of the regressor. Its `gravity` specifies the mounting.
@@ -184,9 +184,9 @@ _AXES = tuple(parameter_axis(name) for name in PARAMETER_NAMES)
 class DynamicBaseParameters:
     """Base parameters beta = base.combination phi_F, with tau = Y_base beta = Y phi for every motion.
 
-    phi_F (p,) contains the ten parameters of each link about the origin and along the axes of its frame dh_<label>,
-    then those of the rotors. A link without such a frame uses its SDF frame. `base.names` refer to phi_F. phi (p,) are
-    the parameters of `DynamicRegressor`, about the origins of the SDF frames.
+    phi_F (p,) contains the ten parameters of each link in its frame dh_<label>, then the parameters of the rotors. A
+    link without such a frame uses its SDF frame. `base.names` refer to phi_F. phi (p,) contains the parameters of
+    `DynamicRegressor`, in the SDF frames.
 
     Attributes:
         standard_parameters: Standard parameters phi_F (p,).
@@ -277,10 +277,10 @@ def _hinge_axes(
 def _preference_order(parameters: list[StandardParameter], hinge_axes: dict[str, int]) -> list[int]:
     """Returns the columns in the order of preference as base parameters.
 
-    For a revolute link with axis u, three parameters can be regrouped with the previous link: its mass, its first
-    moment along u and one moment of inertia about an axis perpendicular to u (Khalil and Dombre, "Modeling,
-    Identification and Control of Robots", 9.4.2). These come last, starting from the base. Numbered links precede the
-    links of the linkage. Rotors follow the links, and masses are last.
+    Three parameters of a revolute link with axis u can be regrouped with the previous link. They are the mass, the
+    first moment along u and one moment of inertia about an axis perpendicular to u. These parameters come last, in the
+    order from base to tip. Numbered links precede the links of the linkage. Rotors follow the links, and masses are
+    last. Reference: Khalil and Dombre, "Modeling, Identification and Control of Robots", 9.4.2.
     """
 
     def is_regrouped(p: StandardParameter) -> bool:

@@ -136,11 +136,11 @@ def safe_ratios(
 ) -> NDArray[np.float64]:
     """Returns the largest share of each effect that can be compensated while the remaining friction holds the arm.
 
-    The remaining friction must hold the arm at rest for every error of the gravity compensation up to `holding_error`.
-    For every torque e with |e_i| <= holding_error_i, there must be forces f_k along the coordinates with
-    sum row_k' f_k = e and |f_k| <= (1 - ratio_k) coefficient_k. This set of torques is convex, so it is sufficient to
-    check its corners. A linear program computes the largest ratios for each group of joints that share coordinates. If
-    the friction of a group cannot hold the error even without compensation, its ratios are 0.
+    The remaining friction must hold the arm at rest for every torque error e with |e_i| <= holding_error_i. This means
+    that there are forces f_k along the coordinates with sum row_k' f_k = e and |f_k| <= (1 - ratio_k) coefficient_k.
+    The set of errors is convex, so it is sufficient to check its corners. A linear program computes the largest ratios
+    for each group of joints that share coordinates. If the friction of a group cannot hold the error even without
+    compensation, the ratios of this group are 0.
 
     Args:
         friction: Friction of the arm.

@@ -97,8 +97,9 @@ def _regressor_at_random_poses(
 ) -> NDArray[np.float64]:
     """Returns regressor rows (rows, p) at random poses for gravity of 1 m/s^2.
 
-    The potential energy of a link is its mass times the height of the origin of frame F, plus its first moments times
-    the upward components of the axes of F. The regressor contains the derivatives of these heights and components.
+    The potential energy of a link is linear in mass and first moments. The factor of the mass is the height of the
+    origin of frame F. The factors of the first moments are the upward components of the axes of F. The regressor
+    contains the derivatives of these factors.
     """
     up = -arm.gravity / np.linalg.norm(arm.gravity)
     points = [X_BF.multiply(np.hstack([np.zeros((3, 1)), np.eye(3)])) for _, X_BF in bodies]
@@ -218,9 +219,9 @@ def named_lengths(
 def _preference_order(parameters: Sequence[StandardParameter]) -> list[int]:
     """Returns parameter indices in the order of preference as base parameters.
 
-    First moments of numbered links come first, from the tip to the base, then first moments of the linkage, then
-    masses from base to tip. With this order, a mass is part of the first moments of preceding links. Only masses that a
-    prismatic joint lifts have a base parameter, such as "(m3+...+m7)".
+    The order is: first moments of numbered links from tip to base, first moments of the linkage, masses from base to
+    tip. With this order, a mass is part of the first moments of preceding links. Only masses that a prismatic joint
+    lifts have a base parameter, such as "(m3+...+m7)".
     """
 
     def key(index: int) -> tuple:

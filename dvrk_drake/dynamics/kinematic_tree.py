@@ -19,8 +19,9 @@ from dvrk_drake.models.arm import Arm
 class KinematicTree:
     """Moving links C of an arm with their parents P and inboard joints. Each parent precedes its children.
 
-    One formula represents revolute, prismatic and fixed joints. With the joint coordinate x = G q + c, the pose of a
-    link in its parent is X_PC(x) = T0 + sin(x) T1 + (1 - cos(x)) T2 + x T3, and its velocity is V_PC_C = H dx/dt.
+    The same formulas represent revolute, prismatic and fixed joints. They use the joint coordinate x = G q + c:
+
+        X_PC(x) = T0 + sin(x) T1 + (1 - cos(x)) T2 + x T3,    V_PC_C = H dx/dt.
 
     Attributes:
         links: Names of the l links.

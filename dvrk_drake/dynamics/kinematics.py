@@ -135,8 +135,9 @@ class PsmInverseKinematics:
     def solve(self, X_BF: RigidTransform, q_near: ArrayLike) -> NDArray[np.float64] | None:
         """Returns the joint positions (6,) [rad, m], or None if there is no solution.
 
-        There is no solution if the wrist centre is closer to the RCM than `min_depth`, the wrist pitch is 90 degrees or
-        more, or |yaw| > 135 degrees, which corresponds to a tip above the RCM. Joint limits are not checked.
+        There is no solution if the wrist centre is closer to the RCM than `min_depth`, or if the wrist pitch is 90
+        degrees or more. |yaw| > 135 degrees, which corresponds to a tip above the RCM, is not a solution either. Joint
+        limits are not checked.
 
         Args:
             X_BF: Pose of the frame in the base frame.

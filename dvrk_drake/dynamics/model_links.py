@@ -29,13 +29,13 @@ _UPPER = [(i, k) for i in range(4) for k in range(i, 4)]
 
 
 def nearest_links(arm: Arm, base_values: ArrayLike) -> tuple[LinkInertia, ...]:
-    """Returns the physically consistent links nearest to those of the SDF whose gravity torque is Y(q) beta.
+    """Returns the links nearest to the SDF that are physically consistent and have the gravity torque Y(q) beta.
 
-    With the pseudo-inertia J0 = L L' of a link in the SDF, Z = L^-1 J L^-T is the identity for an unchanged link of any
-    size. The distance is the sum of |Z - 1|^2 (Frobenius norm) over the links. It is minimized subject
-    to Z > MIN_EIGENVALUE_RATIO and the linear equations of the gravity torque. Distance and constraint do not depend on
-    frames or units. The distance is the second-order approximation at J0 of the one by Lee, Wensing and Park,
-    "Geometric robot dynamic identification" (2020).
+    Z = L^-1 J L^-T is the pseudo-inertia J of a link relative to the pseudo-inertia J0 = L L' in the SDF. It is the
+    identity for an unchanged link of any size. The distance to the SDF is the sum of |Z - 1|^2 (Frobenius norm) over
+    the links. It is minimized subject to Z > MIN_EIGENVALUE_RATIO and to the linear equations of the gravity torque.
+    Distance and constraints do not depend on frames or units. The distance is a second-order approximation at J0 of the
+    distance by Lee, Wensing and Park, "Geometric robot dynamic identification" (2020).
 
     Args:
         arm: Arm of the links.
@@ -210,12 +210,12 @@ def _static_effects(model: IdentifiedModel) -> list[str]:
 def _assign_rotors(
     arm: Arm, links: dict[str, NDArray[np.float64]], inertias: list[float]
 ) -> tuple[dict[str, float], list[str]]:
-    """Assigns rotor inertias to joints, or adds them to `links` that turn with the rotor.
+    """Assigns rotor inertias to joints, or adds them to `links` that rotate with the rotor.
 
     A rotor adds I J_k' J_k to the mass matrix, where J_k is its row of the transmission. In SDF, a joint can represent
-    only the diagonal of this matrix. This is sufficient if a single joint moves the motor. If several joints do, the
-    inertia is added to a link that turns by J_k q, such as the crank and motor_4 links of the SDF. The inertia about
-    the two perpendicular axes is half of it, to be physically consistent.
+    only the diagonal of this matrix. This is sufficient if a single joint moves the motor. If several joints move the
+    motor, the inertia is added to a link that rotates by J_k q, such as crank_link or motor_4_link. Half of the inertia
+    is added about each perpendicular axis, so that the link remains physically consistent.
 
     Returns:
         Joint -> rotor inertia, and descriptions of the rotors whose coupling terms are not represented.

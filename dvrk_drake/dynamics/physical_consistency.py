@@ -164,14 +164,14 @@ def consistent_parameters(
     definite. Parameters that R does not determine keep the values of the SDF.
 
     The mass of each link and the total mass are bounded relative to the SDF (`MASS_RANGE`, `TOTAL_MASS_TOLERANCE`).
-    The mass of a link must fit into its bounding box (`BoundingBox`): along each axis, the mean square distance from
-    the center of the box is at most the squared half width. This constraint is linear in J and implies that the centre
-    of mass is inside the box.
+    The mass of a link must fit into its bounding box (`BoundingBox`). This means that along each axis, the mean square
+    distance of the mass from the center of the box is at most the squared half width. This constraint is linear in J
+    and implies that the centre of mass is inside the box.
 
-    References: Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter
-    identification" (2018) for the pseudo-inertia and the constraint trace(J Q) >= 0 of a bounding ellipsoid, applied
-    here to one degenerate ellipsoid per axis. Lee, Wensing and Park, "Geometric robot dynamic identification" (2020)
-    for the log-det prior.
+    Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter identification"
+    (2018) describe the pseudo-inertia and the constraint trace(J Q) >= 0 of a bounding ellipsoid. Here, each axis has
+    one degenerate ellipsoid. Lee, Wensing and Park, "Geometric robot dynamic identification" (2020) describe the
+    log-det prior.
 
     Args:
         R, b: Compressed regressor (p, p) and efforts (p,), e.g. from a QR decomposition, in units of their standard

@@ -25,10 +25,10 @@ def fill_regressor(
 ):  # pragma: no cover - compiled
     """Computes the regressor (m, n, 10 l + r) of an arm with n independent joints, l links and r rotor parameters.
 
-    From base to tip, the recursion computes the spatial velocity V and acceleration A of each link, and its spatial
-    velocity J_j per unit rate of each independent joint j. The torque of joint j due to a link is J_j' f, where the
-    wrench f about the link's origin is linear in the ten parameters of the link. All are expressed in the link frame
-    (Featherstone, "Rigid Body Dynamics Algorithms", 2008, 5.3).
+    From base to tip, the recursion computes three quantities of each link in the link frame. These are the spatial
+    velocity V, the spatial acceleration A, and the spatial velocity J_j per unit rate of each independent joint j. The
+    wrench f about the link's origin is linear in the ten parameters of the link. The torque of joint j due to the link
+    is J_j' f. Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008), 5.3.
 
     Args:
         q, v, vd: Positions [rad, m], velocities and accelerations (m, n) of the independent joints.
@@ -113,7 +113,7 @@ def _pose(terms, joint, X):  # pragma: no cover - compiled
 
 @_compiled
 def _to_child(X, s, w0, w1, w2, u0, u1, u2):  # pragma: no cover - compiled
-    """Returns R' w and R' (u + w x p), which is sample s of a spatial velocity at Po in P, shifted to Co, in C."""
+    """Transforms sample s of a spatial velocity (w, u) from P to C: returns R' w and R' (u + w x p)."""
     p0, p1, p2 = X[3 * BLOCK + s], X[7 * BLOCK + s], X[11 * BLOCK + s]
     u0, u1, u2 = u0 + w1 * p2 - w2 * p1, u1 + w2 * p0 - w0 * p2, u2 + w0 * p1 - w1 * p0
     r0, r1, r2 = X[s], X[4 * BLOCK + s], X[8 * BLOCK + s]

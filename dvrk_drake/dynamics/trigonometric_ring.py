@@ -73,8 +73,8 @@ class TrigonometricRing:
     def shortest(self, polynomial: Polynomial) -> Polynomial:
         """Returns an equal polynomial with the angles of parallel joints combined.
 
-        For each pair (a, b) of `sums`, products such as sin a cos b + cos a sin b become sin(a + b) if this makes the
-        polynomial shorter. Squared cosines are eliminated, so that an identically zero polynomial becomes 0.
+        For each pair (a, b) of `sums`, terms such as sin a cos b + cos a sin b become sin(a + b) if this shortens the
+        polynomial. Squared cosines are eliminated, so that an identically zero polynomial becomes 0.
         Coefficients below `ROUNDING` are removed. sympy's trigsimp gives the same result, but its search takes seconds.
         """
         result, shortest = polynomial, self._without_squared_cosines(polynomial)

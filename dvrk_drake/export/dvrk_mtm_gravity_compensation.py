@@ -133,8 +133,8 @@ def compensation_from_model(
     The ten gravity columns represent exactly an upright MTM whose last link is balanced about its axis. Polynomials in
     the joint positions approximate the additional gravity torque of a tilted base. The constant of a polynomial
     represents the offset of a joint. The first two columns represent the cable torque of the shoulder, and polynomials
-    approximate other effects. The torque limits are the torque range within the joint limits, widened by 10 % at both
-    ends, but at most the effort limits of the arm. Joint 7 has no torque.
+    approximate other effects. The torque limits are the torque range within the joint limits plus 10 % at both ends.
+    They do not exceed the effort limits of the arm. Joint 7 has no torque.
 
     Raises:
         ModelError: The model is not of an MTM, options have the wrong length, or the error exceeds `options.tolerance`.
