@@ -102,12 +102,12 @@ class DynamicModel:
         arm = self.arm.with_gravity(self.section.gravity_expected or self.section.gravity)
         poses = arm.sample_poses(WEIGHING_POSES, np.random.default_rng(0))
         weight = np.abs(nominal_weight(DynamicRegressor(arm), poses)).max(axis=0)
-        left_out = {f"actuator.{name}" for name, w in zip(arm.joint_names, weight, strict=True) if w > MIN_WEIGHT}
-        left_out -= {e.coordinate for e in self.effects if e.kind == "cable cosine"}
+        excluded = {f"actuator.{name}" for name, w in zip(arm.joint_names, weight, strict=True) if w > MIN_WEIGHT}
+        excluded -= {e.coordinate for e in self.effects if e.kind == "cable cosine"}
         return tuple(
             i
             for i, e in enumerate(self.effects)
-            if e.kind in POSITION_KINDS and (e.kind != "offset" or e.coordinate not in left_out)
+            if e.kind in POSITION_KINDS and (e.kind != "offset" or e.coordinate not in excluded)
         )
 
     def rigid_body_effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
@@ -142,7 +142,9 @@ def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
     if fault := number_fault(section):
         raise ModelError(f"dynamics.{fault}")
     if [link.link for link in section.links] != [link.link for link in regressor.links]:
-        raise ModelError(f"dynamics.links must be, in this order: {', '.join(link.link for link in regressor.links)}")
+        raise ModelError(
+            f"dynamics.links must have these links in this order: {', '.join(link.link for link in regressor.links)}"
+        )
     for link in section.links:
         if len(link.parameters) != len(PARAMETER_NAMES):
             raise ModelError(f"dynamics: {link.link} must have ten parameters: {', '.join(PARAMETER_NAMES)}")
@@ -153,7 +155,7 @@ def check_section(regressor: DynamicRegressor, section: DynamicSection) -> None:
                 f"pseudo-inertia is {least:.2g}, but must be positive"
             )
     if [rotor.actuator for rotor in section.rotors] != list(arm.joint_names):
-        raise ModelError(f"dynamics.rotors must be, in this order: {', '.join(arm.joint_names)}")
+        raise ModelError(f"dynamics.rotors must have these actuators in this order: {', '.join(arm.joint_names)}")
     _check_effects(arm, section)
     settings = section.signals
     for which, values in (

@@ -58,7 +58,7 @@ class Friction:
         values = np.asarray(coefficients, float)
         if values.shape != (len(effects),):
             raise ControllerError(f"friction: coefficients have shape {values.shape}; allowed: ({len(effects)},)")
-        loaded = [kind for kind, what in EFFECT_KINDS.items() if what.loaded]
+        loaded = [name for name, kind in EFFECT_KINDS.items() if kind.loaded]
         kept = [
             k
             for k, effect in enumerate(effects)
@@ -108,8 +108,8 @@ class Friction:
     @property
     def holds(self) -> NDArray[np.bool_]:
         """Mask (k,), True for effects that hold the arm at rest within `HOLDING_TRAVEL`."""
-        widest = {"coulomb": HOLDING_SPEED, "presliding": HOLDING_TRAVEL}
-        return np.array([e.scale <= widest.get(e.kind, -1.0) for e in self.effects], bool)
+        max_scale = {"coulomb": HOLDING_SPEED, "presliding": HOLDING_TRAVEL}
+        return np.array([e.scale <= max_scale.get(e.kind, -1.0) for e in self.effects], bool)
 
     @property
     def springs_back(self) -> NDArray[np.bool_]:

@@ -112,9 +112,9 @@ def _regressor_at_random_poses(
             J = plant.CalcJacobianTranslationalVelocity(
                 context, JacobianWrtVariable.kV, body.body_frame(), p_BoP, world, world
             )
-            rise = np.tensordot(J.reshape(4, 3, -1)[..., selector], up, axes=(1, 0))
-            rise[1:] -= rise[0]
-            columns.append(rise @ arm.linkage.matrix)
+            height_rates = np.tensordot(J.reshape(4, 3, -1)[..., selector], up, axes=(1, 0))
+            height_rates[1:] -= height_rates[0]
+            columns.append(height_rates @ arm.linkage.matrix)
         rows.append(np.concatenate(columns).T)
     return np.concatenate(rows)
 
@@ -149,11 +149,13 @@ def _balanced_rotor(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
     """
     child = joint.child_body()
     if joint.type_name() != "revolute":
-        raise ArmError(f"{child.name()} needs a frame dh_<name>, because its joint is not revolute")
+        raise ArmError(f"link {child.name()} needs a frame dh_<name>, because its joint is not revolute")
     X_CM = joint.frame_on_child().GetFixedPoseInBodyFrame()
     axis, p_CM = X_CM.rotation() @ joint.revolute_axis(), X_CM.translation()
     if np.linalg.norm(np.cross(child.default_com() - p_CM, axis)) > 1e-9:
-        raise ArmError(f"{child.name()} needs a frame dh_<name>, because its centre of mass is not on its joint axis")
+        raise ArmError(
+            f"link {child.name()} needs a frame dh_<name>, because its centre of mass is not on its joint axis"
+        )
     X_BC = child.body_frame().CalcPose(plant.CreateDefaultContext(), joint.parent_body().body_frame())
     along = np.outer(axis, axis)
     R_BC, p_BM = X_BC.rotation().matrix(), X_BC.multiply(p_CM)

@@ -284,9 +284,9 @@ class IdentifiedModel(_Identified):
             raise ModelError(fault)
         names = gravity_parameters(self.arm).base.names
         if tuple(p.name for p in self.base_parameters) != names:
-            raise ModelError(f"base parameters must be, in this order: {'; '.join(names)}")
+            raise ModelError(f"base_parameters must have these names in this order: {'; '.join(names)}")
         if tuple(joint.name for joint in self.joints) != self.arm.joint_names:
-            raise ModelError(f"joints must be, in this order: {', '.join(self.arm.joint_names)}")
+            raise ModelError(f"joints must have these names in this order: {', '.join(self.arm.joint_names)}")
         for i, effect in enumerate(self.effects):
             if fault := effect_fault(self.arm, ActuatorEffect.of(effect), POSITION_KINDS):
                 raise ModelError(f"effects[{i}]: {fault}")

@@ -154,14 +154,14 @@ def rotor_inertias(plant: MultibodyPlant, arm: Arm) -> tuple[RotorInertia, ...]:
     G = arm.linkage.matrix
     D = J_inverse.T @ (G.T @ D_tree @ G) @ J_inverse
     names = arm.joint_names
-    alone = [RotorInertia((name, name), float(D[i, i])) for i, name in enumerate(names)]
+    diagonal = [RotorInertia((name, name), float(D[i, i])) for i, name in enumerate(names)]
     coupled = [
         RotorInertia((names[i], names[k]), float(D[i, k]))
         for i in range(len(names))
         for k in range(i + 1, len(names))
         if abs(D[i, k]) > 1e-12 * np.abs(D).max()
     ]
-    return (*alone, *coupled)
+    return (*diagonal, *coupled)
 
 
 def rotor_links(arm: Arm) -> set[str]:

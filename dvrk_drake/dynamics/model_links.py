@@ -225,10 +225,10 @@ def _assign_rotors(
     joints = np.zeros(arm.num_joints)
     couplings = []
     for name, row, inertia in zip(arm.joint_names, arm.transmission.matrix, inertias, strict=True):
-        same = [link for link, (rate, _) in rotations.items() if np.allclose(rate, row, atol=1e-9)]
-        if np.count_nonzero(row) > 1 and same:
-            # All links in `same` turn at the same rate, so any of them can be used. The last is part of the linkage.
-            link = same[-1]
+        candidates = [link for link, (rate, _) in rotations.items() if np.allclose(rate, row, atol=1e-9)]
+        if np.count_nonzero(row) > 1 and candidates:
+            # All candidates rotate at the same rate, so any of them can be used. The last is part of the linkage.
+            link = candidates[-1]
             axis = rotations[link][1]
             links[link] = links[link] + inertia * np.concatenate([np.zeros(4), _unit_rotor_inertia(axis)])
             continue

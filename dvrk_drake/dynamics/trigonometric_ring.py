@@ -36,7 +36,7 @@ class TrigonometricRing:
         self._symbols: list[sympy.Symbol] = []
         self._functions: dict[sympy.Symbol, sympy.Expr] = {}
         self._indices: dict[sympy.Expr, int] = {}
-        self._of_drake: dict[str, tuple[float, int]] = {}
+        self._variables: dict[str, tuple[float, int]] = {}
         self._memo: dict = {}
 
     def from_drake(self, expression: symbolic.Expression) -> Polynomial:
@@ -56,7 +56,7 @@ class TrigonometricRing:
                 coefficient *= sign**power
                 monomial += [index] * power
             _add(polynomial, tuple(sorted(monomial)), coefficient)
-        return _without_rounding(polynomial)
+        return _remove_rounding_errors(polynomial)
 
     def derivative(self, polynomial: Polynomial, q: sympy.Symbol) -> Polynomial:
         """Returns the derivative with respect to a joint position."""
@@ -77,13 +77,13 @@ class TrigonometricRing:
         polynomial. Squared cosines are eliminated, so that an identically zero polynomial becomes 0.
         Coefficients below `ROUNDING` are removed. sympy's trigsimp gives the same result, but its search takes seconds.
         """
-        result, shortest = polynomial, self._without_squared_cosines(polynomial)
+        result, shortest = polynomial, self._replace_squared_cosines(polynomial)
         for a, b in self._sums:
-            trial = self._add_up(result, a, b)
-            shorter = self._without_squared_cosines(trial)
+            trial = self._combine_angles(result, a, b)
+            shorter = self._replace_squared_cosines(trial)
             if _operations(shorter) <= _operations(shortest):
                 result, shortest = trial, shorter
-        return _without_rounding(shortest)
+        return _remove_rounding_errors(shortest)
 
     def to_sympy(self, polynomial: Polynomial) -> sympy.Expr:
         """Converts a polynomial to an expression in `q`. Common factors of all terms are factored out."""
@@ -100,13 +100,13 @@ class TrigonometricRing:
     def _variable(self, expression: symbolic.Expression) -> tuple[float, int]:
         """Returns sign and variable index of an expression q, sin(angle) or cos(angle)."""
         key = expression.to_string()
-        if key not in self._of_drake:
+        if key not in self._variables:
             function = symbolic.to_sympy(expression, memo=self._memo)
             function = function.xreplace({s: self.q[int(s.name[1:]) - 1] for s in function.free_symbols})
             function = function.xreplace({x: exact_half(float(x)) for x in function.atoms(sympy.Float)})
             sign = -1.0 if function.could_extract_minus_sign() else 1.0
-            self._of_drake[key] = sign, self._index(int(sign) * function)
-        return self._of_drake[key]
+            self._variables[key] = sign, self._index(int(sign) * function)
+        return self._variables[key]
 
     def _index(self, function: sympy.Expr) -> int:
         if function not in self._indices:
@@ -124,7 +124,7 @@ class TrigonometricRing:
             return [self._index(sympy.cos(function.args[0]))], slope
         return [self._index(sympy.sin(function.args[0]))], -slope
 
-    def _add_up(self, p: Polynomial, a: sympy.Expr, b: sympy.Expr) -> Polynomial:
+    def _combine_angles(self, p: Polynomial, a: sympy.Expr, b: sympy.Expr) -> Polynomial:
         """Replaces sin a cos b and cos a cos b in every monomial by terms with sin(a + b) and cos(a + b)."""
         (sign_a, sa, ca), (sign_b, sb, cb), (sign, S, C) = (self._sine_and_cosine(angle) for angle in (a, b, a + b))
         if sa == sb:
@@ -141,7 +141,7 @@ class TrigonometricRing:
         sign = 1 if isinstance(sine, sympy.sin) else -1
         return float(sign), self._index(sign * sine), self._index(sympy.cos(angle))
 
-    def _without_squared_cosines(self, p: Polynomial) -> Polynomial:
+    def _replace_squared_cosines(self, p: Polynomial) -> Polynomial:
         """Replaces every squared cosine by 1 - sine^2, so that equal polynomials have equal terms."""
         for c in {index for monomial in p for index in monomial}:
             function = self._functions[self._symbols[c]]
@@ -174,7 +174,7 @@ def _add(polynomial: Polynomial, monomial: tuple[int, ...], coefficient: float) 
     polynomial[monomial] = polynomial.get(monomial, 0.0) + coefficient
 
 
-def _without_rounding(p: Polynomial) -> Polynomial:
+def _remove_rounding_errors(p: Polynomial) -> Polynomial:
     """Removes terms whose coefficients are rounding errors, such as -0.4318 + 0.4162 + 0.0156."""
     return {monomial: coefficient for monomial, coefficient in p.items() if abs(coefficient) > ROUNDING}
 

@@ -135,9 +135,9 @@ def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) 
     q = arm.sample_poses(POSES, np.random.default_rng(0))
     tau_model, tau_raw, tau_clipped = model.holding_torque(q), unclipped_torque(file, q), controller_torque(file, q)
     half_range = 0.5 * np.ptp(tau_model, axis=0)
-    least = SIGN_SHARE * np.abs(tau_model).max(axis=0)
+    threshold = SIGN_SHARE * np.abs(tau_model).max(axis=0)
     clipped = tau_raw != tau_clipped
-    opposed = (tau_model * tau_clipped < 0) & (np.abs(tau_model) > least) & (np.abs(tau_clipped) > least)
+    opposed = (tau_model * tau_clipped < 0) & (np.abs(tau_model) > threshold) & (np.abs(tau_clipped) > threshold)
     runaway = (tau_raw < tau_model.min(axis=0) - half_range) | (tau_raw > tau_model.max(axis=0) + half_range)
     # A joint without gravity torque has no range, and the file does not compensate the last joint.
     compared = (half_range > 1e-9) & (np.arange(NUM_JOINTS) < NUM_JOINTS - 1)
@@ -193,8 +193,8 @@ def _is_of_other_side(
     """
     if np.count_nonzero(in_sweep) >= _MIN_POSES:
         q, tau_file = q[in_sweep], tau_file[in_sweep]
-    own, mirrored = model.holding_torque(q), _MIRROR * model.holding_torque(_MIRROR * q)
-    return _side_error(tau_file, mirrored) < _MAX_ERROR_RATIO * _side_error(tau_file, own)
+    unmirrored, mirrored = model.holding_torque(q), _MIRROR * model.holding_torque(_MIRROR * q)
+    return _side_error(tau_file, mirrored) < _MAX_ERROR_RATIO * _side_error(tau_file, unmirrored)
 
 
 def _side_error(tau_file: NDArray[np.float64], tau_model: NDArray[np.float64]) -> float:

@@ -167,8 +167,8 @@ def _add(parent: ElementTree.Element, tag: str, text: str) -> None:
 
 def _numbers(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
     """Formats numbers in full precision. Numbers below 1e-15 of the largest one are rounding errors and become 0."""
-    least = 1e-15 * max(abs(x) for x in values)
-    return [repr(float(x)) if abs(x) > least else "0" for x in values]
+    threshold = 1e-15 * max(abs(x) for x in values)
+    return [repr(float(x)) if abs(x) > threshold else "0" for x in values]
 
 
 def _equal_parameters(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:

@@ -97,16 +97,23 @@ def _add_shape(out: ElementTree.Element, kind: str, link: str, shape: ElementTre
     name, X_LG = shape.get("name", ""), _pose(shape)
     parts: list[tuple[str, RigidTransform, str, dict[str, str]]] = []
     geometry = shape.find("geometry")
-    what = next(iter(geometry)) if geometry is not None and len(geometry) else None
-    tag = "none" if what is None else what.tag
-    if what is not None and tag == "mesh":
-        parts.append((name, X_LG, "mesh", {"filename": _text(what, "uri"), "scale": what.findtext("scale", "1 1 1")}))
-    elif what is not None and tag == "box":
-        parts.append((name, X_LG, "box", {"size": _text(what, "size")}))
-    elif what is not None and tag == "sphere":
-        parts.append((name, X_LG, "sphere", {"radius": _text(what, "radius")}))
-    elif what is not None and tag in ("cylinder", "capsule"):
-        radius, length = _text(what, "radius"), _text(what, "length")
+    shape_element = next(iter(geometry)) if geometry is not None and len(geometry) else None
+    tag = "none" if shape_element is None else shape_element.tag
+    if shape_element is not None and tag == "mesh":
+        parts.append(
+            (
+                name,
+                X_LG,
+                "mesh",
+                {"filename": _text(shape_element, "uri"), "scale": shape_element.findtext("scale", "1 1 1")},
+            )
+        )
+    elif shape_element is not None and tag == "box":
+        parts.append((name, X_LG, "box", {"size": _text(shape_element, "size")}))
+    elif shape_element is not None and tag == "sphere":
+        parts.append((name, X_LG, "sphere", {"radius": _text(shape_element, "radius")}))
+    elif shape_element is not None and tag in ("cylinder", "capsule"):
+        radius, length = _text(shape_element, "radius"), _text(shape_element, "length")
         parts.append((name, X_LG, "cylinder", {"radius": radius, "length": length}))
         if tag == "capsule":
             for end, sign in (("end", 1), ("start", -1)):

@@ -41,10 +41,10 @@ def drake_torque(plant: MultibodyPlant, context: Context, arm: Arm, q, v, vd):
     return tau
 
 
-def assert_equal_torque(ours, drakes):
+def assert_equal_torque(actual, expected):
     """Compares torques with a tolerance of 1e-10 relative to the largest torque of the joint, at most 1e-10 N m."""
-    scale = np.minimum(np.abs(drakes).max(axis=0), 1.0)
-    np.testing.assert_array_less(np.abs(ours - drakes).max(axis=0), 1e-10 * np.maximum(scale, 1e-6))
+    scale = np.minimum(np.abs(expected).max(axis=0), 1.0)
+    np.testing.assert_array_less(np.abs(actual - expected).max(axis=0), 1e-10 * np.maximum(scale, 1e-6))
 
 
 @pytest.fixture(scope="module", params=["mtml", "mtmr", "psm"])
@@ -91,8 +91,8 @@ def test_equals_the_plant_with_other_parameters(arm, seed):
     D = J_inverse.T @ D_joint @ J_inverse
     rotors = [D[tuple(arm.joint_names.index(name) for name in rotor.actuators)] for rotor in model.rotors]
     motion = random_motion(arm, 50, seed)
-    ours = model.torque(*motion, np.concatenate([*parameters, rotors]))
-    assert_equal_torque(ours, drake_torque(plant, context, arm, *motion))
+    actual = model.torque(*motion, np.concatenate([*parameters, rotors]))
+    assert_equal_torque(actual, drake_torque(plant, context, arm, *motion))
 
 
 def test_rotors_act_in_actuator_coordinates(arm):
@@ -131,8 +131,8 @@ def test_many_samples_equal_single_samples(arm, count):
     motion = random_motion(arm, count)
     Y = model.regressor(*motion)
     assert Y.shape == (count, arm.num_joints, len(model.names))
-    ones = [model.regressor(*(x[i : i + 1] for x in motion)) for i in range(count)]
-    np.testing.assert_allclose(Y, np.reshape(ones, Y.shape), rtol=0, atol=1e-12 * np.abs(Y).max(initial=0.0))
+    single = [model.regressor(*(x[i : i + 1] for x in motion)) for i in range(count)]
+    np.testing.assert_allclose(Y, np.reshape(single, Y.shape), rtol=0, atol=1e-12 * np.abs(Y).max(initial=0.0))
 
 
 def test_torque_equals_regressor_times_parameters(arm):

@@ -139,8 +139,8 @@ def test_torque_is_the_gradient_of_the_potential(any_arm, random_q):
     constants = []
     for q in random_q:
         set_arm_positions(plant, context, arm, q)
-        ours = (np.array(potential(*q), float) @ gravity.base_values)[0]
-        constants.append(plant.CalcPotentialEnergy(context) - ours)
+        actual = (np.array(potential(*q), float) @ gravity.base_values)[0]
+        constants.append(plant.CalcPotentialEnergy(context) - actual)
     assert np.ptp(constants) < 1e-12
 
 

@@ -50,7 +50,7 @@ def dvrk_controller(path, q, gravity):
     return np.array([t[0], t[2] - t[3] + t[4], t[6]])
 
 
-def other_psm():
+def perturbed_psm():
     model = IdentifiedModel.from_arm(load_arm("psm"))
     generator = np.random.default_rng(7)
     for p in model.base_parameters:
@@ -60,7 +60,7 @@ def other_psm():
 
 @pytest.mark.parametrize("gravity", [None, [0.0, -4.0, -9.0]])
 def test_file_gives_the_torque_of_the_model(gravity, tmp_path):
-    model = other_psm()
+    model = perturbed_psm()
     if gravity is not None:
         model.arm = model.arm.with_gravity(gravity)
         model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
@@ -80,7 +80,7 @@ def test_file_gives_the_torque_of_the_model(gravity, tmp_path):
 def test_chain_has_the_dimensions_of_the_arm(tmp_path):
     """The chain has the dimensions of the linkage, and its last frame is frame 3 of the dVRK."""
     path = tmp_path / "psm.json"
-    kinematic_compensation(other_psm()).save(path)
+    kinematic_compensation(perturbed_psm()).save(path)
     joints = json.loads(path.read_text())["DH"]["joints"]
     assert [j["type"] for j in joints] == ["revolute"] * 5 + ["prismatic"] * 2
     # Distances AO, AB, BE and the distance of E from the shaft, see psm.sdf.
@@ -89,11 +89,11 @@ def test_chain_has_the_dimensions_of_the_arm(tmp_path):
 
 
 def test_rejects_a_model_that_the_file_cannot_represent():
-    model = other_psm()
+    model = perturbed_psm()
     model.effects = [DriveEffect("joint.pitch", "offset", 0.0, 0.1)]
     with pytest.raises(ModelError, match=r"errors are pitch 0\.1 .*: joint.pitch offset 0\.1\. .*--gc-tolerance 0\.1"):
         kinematic_compensation(model)
-    heavy = other_psm()
+    heavy = perturbed_psm()
     (net,) = (p for p in heavy.base_parameters if "- m_counterweight" in p.name and p.name.startswith("(m3"))
     net.value = -0.2
     with pytest.raises(ModelError, match=r"net mass on the insertion joint is -0\.2 kg"):
@@ -112,7 +112,7 @@ def test_command_exports_a_psm_and_rejects_an_mtm(tmp_path, capsys):
 
 def test_rejected_export_writes_no_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    model = other_psm()
+    model = perturbed_psm()
     model.effects = [DriveEffect("joint.pitch", "offset", 0.0, 0.1)]
     model.save("model.yaml")
     arguments = ["export", "--model", "model.yaml", "--sdf", "model.sdf", "--dvrk-kinematic-gc", "gc.json"]

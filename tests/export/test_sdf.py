@@ -64,9 +64,9 @@ def test_sdf_has_the_given_inertial_parameters(name, tmp_path):
     arm, path = load_arm(name), tmp_path / "identified.sdf"
     links = perturbed(arm)
     write_sdf(arm, links, path, "a test")
-    written = dataclasses.replace(arm, sdf=(str(path),))
+    exported = dataclasses.replace(arm, sdf=(str(path),))
     motion = motion_of(arm)
-    actual = inverse_dynamics(make_arm_plant(written), written, motion)
+    actual = inverse_dynamics(make_arm_plant(exported), exported, motion)
     # Compute the expected torque from the regressor of the original arm.
     regressor = DynamicRegressor(arm)
     parameters = regressor.values.copy()
@@ -77,7 +77,7 @@ def test_sdf_has_the_given_inertial_parameters(name, tmp_path):
     scale = np.abs(expected).max(axis=0)
     assert np.abs((actual - expected) / scale).max() < 1e-12
     assert np.abs((expected - regressor.torque(*motion, regressor.values)) / scale).max() > 0.05
-    for before, after in zip(links, link_inertias(written), strict=True):
+    for before, after in zip(links, link_inertias(exported), strict=True):
         assert before.link == after.link
         np.testing.assert_allclose(after.parameters, before.parameters, rtol=0, atol=1e-13)
 
@@ -120,8 +120,8 @@ def test_urdf_has_the_equations_of_motion_of_the_sdf(name, tmp_path):
     links = perturbed(arm)
     write_urdf(arm, links, path, "a test")
     write_sdf(arm, links, tmp_path / "arm.sdf", "a test")
-    written = dataclasses.replace(arm, sdf=(str(tmp_path / "arm.sdf"),))
-    sdf_plant, (urdf_plant, scene_graph, _) = make_arm_plant(written), parse(path)
+    exported = dataclasses.replace(arm, sdf=(str(tmp_path / "arm.sdf"),))
+    sdf_plant, (urdf_plant, scene_graph, _) = make_arm_plant(exported), parse(path)
     motion = motion_of(arm)
     expected = inverse_dynamics(sdf_plant, arm, motion)
     actual = inverse_dynamics(urdf_plant, arm, motion)
@@ -217,9 +217,9 @@ def test_rotor_inertia_is_added_to_the_mass_matrix(tmp_path):
     arm, path = load_arm("mtml"), tmp_path / "arm.sdf"
     rotors = {"outer_yaw": 0.011, "wrist_platform": 0.003}  # wrist_platform has no rotor in the SDF.
     write_sdf(arm, [], path, "a test", rotors)
-    written = dataclasses.replace(arm, sdf=(str(path),))
+    exported = dataclasses.replace(arm, sdf=(str(path),))
     M_before, M_after = (
-        DynamicRegressor(a).mass_matrix(np.zeros((1, 7)), DynamicRegressor(a).values)[0] for a in (arm, written)
+        DynamicRegressor(a).mass_matrix(np.zeros((1, 7)), DynamicRegressor(a).values)[0] for a in (arm, exported)
     )
     expected = np.zeros((7, 7))
     expected[0, 0], expected[3, 3] = 0.011 - 1e-6 * 63.41**2, 0.003
