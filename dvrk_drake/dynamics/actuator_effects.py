@@ -224,7 +224,7 @@ def position_along(arm: Arm, coordinate: str, q: NDArray[np.float64]) -> NDArray
     return np.asarray(arm.transmission.position(q) @ arm.effect_coordinates[coordinate])
 
 
-def spring_for_range(coordinate: str, x: NDArray[np.float64]) -> ActuatorEffect:
+def spring_over(coordinate: str, x: NDArray[np.float64]) -> ActuatorEffect:
     """Returns a spring whose linear range exceeds the positions x (m,) [rad, m] of a recording by 1 %."""
     return ActuatorEffect(coordinate, "spring", float(f"{1.01 * np.abs(x).max():.3g}"))
 

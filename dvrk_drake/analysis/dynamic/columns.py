@@ -16,7 +16,7 @@ from dvrk_drake.dynamics.actuator_effects import (
     effect_fault,
     is_prismatic,
     position_along,
-    spring_for_range,
+    spring_over,
 )
 from dvrk_drake.dynamics.base_parameters import independent_columns
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
@@ -123,7 +123,7 @@ def _named(
     if which == ASYMMETRIC:
         return [ActuatorEffect(coordinate, "coulomb forward", _rounded(DIRECTION_WIDTH * v.std()))]
     if which == "spring":
-        return [spring_for_range(coordinate, x)]
+        return [spring_over(coordinate, x)]
     effects = [ActuatorEffect(coordinate, kind, NAMED_EFFECTS[which]) for kind in ("cable sine", "cable cosine")]
     if fault := effect_fault(arm, effects[0]):
         raise ArmError(f"{where}: {fault}")

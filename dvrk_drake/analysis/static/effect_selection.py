@@ -15,7 +15,7 @@ from dvrk_drake.dynamics.actuator_effects import (
     is_prismatic,
     joint_row,
     position_along,
-    spring_for_range,
+    spring_over,
 )
 from dvrk_drake.models.arm import Arm
 
@@ -99,7 +99,7 @@ def _known_spring(problem: StaticProblem, joint: str) -> list[ActuatorEffect]:
     if "spring" not in problem.arm.identification.known_effects.get(name, []):
         return []
     x = position_along(problem.arm, name, problem.q)
-    return [spring_for_range(name, x)] if np.ptp(x) >= MIN_SPAN["spring"] else []
+    return [spring_over(name, x)] if np.ptp(x) >= MIN_SPAN["spring"] else []
 
 
 def _cables(problem: StaticProblem, coordinate: str) -> list[ActuatorEffect]:
