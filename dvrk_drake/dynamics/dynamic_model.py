@@ -81,7 +81,7 @@ class DynamicModel:
         self.regressor = DynamicRegressor(self.arm)
         check_section(self.regressor, section)
         phi = [x for link in section.links for x in link.parameters] + [rotor.value for rotor in section.rotors]
-        # Columns that couple two rotors belong to no motor, see `rotor_inertias`.
+        # Elements that couple two rotors are 0, because no motor has them (see `rotor_inertias`).
         self.parameters = np.concatenate([phi, np.zeros(len(self.regressor.values) - len(phi))])
         self.effects = tuple(map(ActuatorEffect.of, section.effects))
         self.coefficients = np.array([e.coefficient for e in section.effects])

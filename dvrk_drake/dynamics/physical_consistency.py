@@ -184,9 +184,9 @@ def consistent_parameters(
         IdentificationError: The solver did not converge.
     """
     program = MathematicalProgram()
-    # With z = R x the cost is isotropic. In x its curvature varies by many orders of magnitude, also after scaling.
+    # With z = R x, the cost is isotropic. With x, its curvature would vary by many orders of magnitude, even if scaled.
     z = program.NewContinuousVariables(len(b), "z")
-    # With the links last, the triangular factor makes them depend on few z, so the matrices of Clarabel are sparse.
+    # With the links last, each of their parameters depends on few elements of z, and Clarabel's matrices are sparse.
     order = np.roll(np.arange(len(b)), -10 * len(links))
     Q, triangle = np.linalg.qr(R[:, order])
     to_x = np.empty_like(R)

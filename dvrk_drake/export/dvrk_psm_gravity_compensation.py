@@ -168,7 +168,7 @@ def _chain(plant: MultibodyPlant) -> tuple[NDArray[np.float64], ...]:
     )
     p_3 = plant.GetFrameByName("dh_3").CalcPoseInWorld(context).translation()
     crank, bar = p_B - p_A, p_E - p_B
-    # Frame 2 has its origin at the remote centre of motion. In the base frame, its axes are -y, z and -x.
+    # Frame 2 has its origin at the remote centre of motion. Its x, y and z axes are -y, z and -x of the base frame.
     crank_angle, bar_angle = (np.arctan2(v[2], -v[1]) for v in (crank, bar))
     half, whole = np.pi / 2, np.pi
     alpha = np.array([half, -half, 0, 0, 0, -half, 0])
