@@ -122,7 +122,7 @@ def test_a_result_replaces_a_file_only_on_request(poses, tmp_path):
     dvrk.export_model(model, tmp_path / "arm.urdf")
     with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.urdf: exists already"):
         dvrk.export_model(model, tmp_path / "arm.urdf")
-    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.xml: its format is not clear; state one of sdf, urdf"):
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.xml: the format is not given; give one of sdf, urdf"):
         dvrk.export_model(model, tmp_path / "arm.xml")
 
 

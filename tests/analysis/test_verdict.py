@@ -226,7 +226,7 @@ def test_run_warns_of_saved_verdicts(files, capsys):
 
 
 def test_saved_verdicts_include_all_joints(truth, tmp_path):
-    with pytest.raises(ModelError, match=r"validation\.verdicts must name these joints: outer_yaw"):
+    with pytest.raises(ModelError, match=r"verdicts has entries for outer_yaw; it needs one entry for each joint"):
         dataclasses.replace(truth, validation=ValidationSummary("a.csv", "", {"outer_yaw": "good"})).check()
     verdicts = {joint.name: "good" for joint in truth.joints} | {"wrist_roll": "splendid"}
     with pytest.raises(ModelError, match=r'verdicts\.wrist_roll is "splendid"; allowed: off, good, usable'):

@@ -375,7 +375,7 @@ def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
     assert "its folder does not exist" in fails(capsys, *identify, tmp_path / "no" / "m.yaml")
     assert "no such file" in fails(capsys, "identify", tmp_path / "x.csv", "--arm", "mtmr", "--output", out)
     assert "no such file" in fails(capsys, "validate", poses, "--model", tmp_path / "x.yaml")
-    assert "is weightless: gravity must be 1 m/s^2 or more" in fails(capsys, *identify, out, "--gravity", "0", "0", "0")
+    assert "gravity is 0 m/s^2; it must be 1 m/s^2 or more" in fails(capsys, *identify, out, "--gravity", "0", "0", "0")
 
     text = poses.read_text().splitlines()
     bad = tmp_path / "bad.csv"
@@ -426,7 +426,7 @@ def test_meshes_are_not_replaced_unasked(folder, tmp_path, capsys):
     (tmp_path / "o_meshes").mkdir()
     (tmp_path / "o_meshes/mine.txt").write_text("mine")
     export = ["export", "--model", f"{folder}/model.yaml", "--sdf", f"{tmp_path}/o.sdf"]
-    assert "o_meshes: holds files already" in fails(capsys, *export)
+    assert "o_meshes: the folder contains files already" in fails(capsys, *export)
     assert not (tmp_path / "o.sdf").exists()
     assert main([*export, "--overwrite"]) == 0
     assert (tmp_path / "o_meshes/mine.txt").read_text() == "mine"

@@ -199,7 +199,7 @@ def test_scale_out_of_range_is_refused(scale):
 def test_other_invalid_arguments_are_refused():
     with pytest.raises(ControllerError, match="period must be a positive number"):
         Teleoperation(MTM, PSM, period=0.0)
-    with pytest.raises(ArmError, match="MTML has not the kinematics of a PSM"):
+    with pytest.raises(ArmError, match="MTML does not have the kinematics of a PSM"):
         Teleoperation(MTM, MTM)
     with pytest.raises(ArmError, match='PSM: its SDF has no frame "dh_7"; it has dh_0'):
         Teleoperation(PSM, PSM)

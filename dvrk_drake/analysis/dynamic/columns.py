@@ -14,8 +14,8 @@ from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
     distinct_coordinates,
     effect_fault,
+    is_prismatic,
     position_along,
-    slides,
     spring_over,
 )
 from dvrk_drake.dynamics.base_parameters import independent_columns
@@ -108,7 +108,7 @@ def optional_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
             by_position = which != ASYMMETRIC
             if which in known or (by_position and set(known) - {ASYMMETRIC}):
                 continue
-            if which == "spring" or not by_position or not slides(arm, name):
+            if which == "spring" or not by_position or not is_prismatic(arm, name):
                 effects += _named(arm, name, which, x, v)
     return effects
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.static.linear_fit import RobustFit, robust_fit
 from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
+    is_prismatic,
     joint_row,
     position_along,
-    slides,
     spring_over,
 )
 from dvrk_drake.models.arm import Arm
@@ -103,7 +103,7 @@ def _known_spring(problem: StaticProblem, joint: str) -> list[ActuatorEffect]:
 
 
 def _cables(problem: StaticProblem, coordinate: str) -> list[ActuatorEffect]:
-    if slides(problem.arm, coordinate):
+    if is_prismatic(problem.arm, coordinate):
         return []
     span = np.ptp(position_along(problem.arm, coordinate, problem.q))
     kinds = ("cable sine", "cable cosine")

@@ -51,7 +51,7 @@ def test_effects_of_the_arm_file_are_mandatory():
             'actuator.pitch: unknown "magnet"; known: spring, cable 1, cable 2, asymmetric friction',
         ),
         ({"elbow": ["spring"]}, "unknown coordinate actuator.elbow; known: actuator.yaw"),
-        ({"insertion": ["cable 1"]}, "cable sine is of an angle, and actuator.insertion slides"),
+        ({"insertion": ["cable 1"]}, "cable sine requires a revolute coordinate, but actuator.insertion is prismatic"),
     ],
 )
 def test_invalid_known_effects_are_rejected(known, message):

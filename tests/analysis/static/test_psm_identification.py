@@ -122,5 +122,7 @@ def test_unknown_instrument_is_rejected_in_one_line(tmp_path, capsys):
 def test_prismatic_joint_has_no_angular_spring(arm):
     model = IdentifiedModel.from_arm(arm)
     model.effects = [DriveEffect("joint.insertion", "cable sine", 1.0, 1.0)]
-    with pytest.raises(ModelError, match=r"effects\[0\]: kind cable sine is of an angle, and joint.insertion slides"):
+    with pytest.raises(
+        ModelError, match=r"effects\[0\]: kind cable sine requires a revolute .*\.insertion is prismatic"
+    ):
         model.check()

@@ -243,7 +243,7 @@ def test_model_file_round_trip_and_rejections(arm, tmp_path):
         ),
         (
             text.replace("model 4", "model 1").replace("\neffects:", "\njoint_effects:"),
-            'model 1", this version reads "dvrk_drake identified model 4", 3 and 2; identify anew',
+            'model 1"; allowed: "dvrk_drake identified model 4", 3 and 2. Identify the arm again',
         ),
         (
             text.replace("feedforward_scale: 1.0", "feedforward_scale: 2.0"),
@@ -280,7 +280,7 @@ def test_moved_model_files_and_version_2_files_are_loaded(tmp_path):
         with pytest.warns(FutureWarning, match='key "trust" is now "feedforward_scale"'):  # an earlier key
             read = IdentifiedModel.load(tmp_path / "old.yaml")
         assert (read.arm, read.effects) == (load_arm(name), effects)
-    with pytest.raises(ModelError, match=r"new\.yaml: is of MTMR, not of PSM"):
+    with pytest.raises(ModelError, match=r"new\.yaml: the model is of MTMR, not of PSM"):
         IdentifiedModel.load(tmp_path / "new.yaml", load_arm("psm"))
 
 
