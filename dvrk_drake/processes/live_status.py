@@ -79,7 +79,7 @@ class LiveStatusMaker:
 
     def __init__(self, sender_id: int, first: lcmt_dvrk_status) -> None:
         """Starts the counts for a sender at the arm's `first` status. A restarted arm requires a new object."""
-        self._sender_id, self._before, self._told_at = sender_id, first, 0.0
+        self._sender_id, self._before, self._last_time = sender_id, first, 0.0
         self._answered = 0
         self._trips: deque[float] = deque(maxlen=1000)
 
@@ -91,7 +91,7 @@ class LiveStatusMaker:
 
     def make(self, status: lcmt_dvrk_status, time: float, lost: int) -> LiveStatus:
         """Returns the live status since the previous one. `lost` is the number of statuses that were not received."""
-        rate = self._answered / (time - self._told_at)
+        rate = self._answered / (time - self._last_time)
         trip = f"round trip {1e3 * float(np.median(self._trips)):.2f} ms" if self._trips else "no command accepted yet"
         problem = []
         if status.num_refused > self._before.num_refused:
@@ -100,7 +100,7 @@ class LiveStatusMaker:
             problem.append(f"messages that the arm ignores: {describe_refusal(status.ignored_code)}")
         if status.num_expired > self._before.num_expired:
             problem.append("no command for so long that the arm took over")
-        self._before, self._told_at, self._answered = status, time, 0
+        self._before, self._last_time, self._answered = status, time, 0
         pace = f"{rate:.0f} Hz, {trip}, {lost} statuses lost"
         return LiveStatus(describe_state(status.guard_state), pace, ", ".join(problem))
 

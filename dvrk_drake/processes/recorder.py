@@ -53,7 +53,7 @@ class Recorder:
         self._arm, self._path, self._url = arm, path, url
         self._channel = status_channel(arm)
         self._file: RecordingFile | None = None
-        self._heard: Counter[str] = Counter()
+        self._other_channels: Counter[str] = Counter()
         self._arrivals: deque[float] = deque()
         self._lcm = lcm.LCM(url)
         # Statuses of all arms, to list the available ones if there are none of this arm.
@@ -114,7 +114,7 @@ class Recorder:
 
     def _receive(self, channel: str, data: bytes) -> None:
         if channel != self._channel:
-            self._heard[channel] += 1
+            self._other_channels[channel] += 1
             return
         self.num_received += 1
         now = time.monotonic()
@@ -123,7 +123,7 @@ class Recorder:
             self.foreign[reason] += 1
             return
         self._arrivals.append(now)
-        status = self.stream.take(data)
+        status = self.stream.accept(data)
         if self._file is None:
             if self.stream.last is None:
                 return
@@ -135,7 +135,7 @@ class Recorder:
         if self.num_received:
             reasons = "; ".join(self.notes())
             return f"no status of {self._arm.name} within {FIRST_STATUS:.0f} s {where}: {reasons}"
-        if others := ", ".join(sorted(self._heard)):
+        if others := ", ".join(sorted(self._other_channels)):
             return f"no message within {FIRST_STATUS:.0f} s {where}; there is {others}"
         return (
             f"no message within {FIRST_STATUS:.0f} s {where}: does the arm's process or bridge run, on this network? "

@@ -118,7 +118,7 @@ class Teacher:
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
         self._writing: Future[None] | None = None
 
-    def lead(self, status: lcmt_dvrk_status, time: float) -> None:
+    def update(self, status: lcmt_dvrk_status, time: float) -> None:
         """Processes a status that arrived at `time` [s]. Returns no desired state because the operator moves the arm.
 
         Raises:

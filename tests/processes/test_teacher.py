@@ -32,7 +32,7 @@ class Hand:
         self.enter, end = enter, self.time + seconds
         while self.time < end:
             self.time += 0.01
-            self.teacher.lead(SimpleNamespace(position=list(pose)), self.time)
+            self.teacher.update(SimpleNamespace(position=list(pose)), self.time)
 
 
 def test_enter_takes_a_pose(tmp_path):

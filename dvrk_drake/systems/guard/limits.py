@@ -99,7 +99,7 @@ class GuardLimits:
         self._wall_flags = np.full(len(self.A), lcmt_dvrk_status.FLAG_COUPLED_LIMIT, np.int8)
         self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT
 
-    def beyond(self, q: Vector) -> str:
+    def position_limit_fault(self, q: Vector) -> str:
         """Describes the position limit that q (n,) exceeds most, by more than half of its margin. Empty: none."""
         c = self.A.dot(q)
         excess = np.abs(c - self._middle) - self._allowed
@@ -131,7 +131,7 @@ class GuardLimits:
         `gravity` (n,) is the model's gravity effort at q. The result is REFUSAL_NONE for an accepted command.
         """
         if command.control_mode == lcmt_dvrk_command.EFFORT:
-            if self.beyond(q):
+            if self.position_limit_fault(q):
                 return lcmt_dvrk_status.REFUSAL_START_OUTSIDE
             if not np.all(np.abs(effort - gravity) <= self.start_gravity):
                 return lcmt_dvrk_status.REFUSAL_START_GRAVITY

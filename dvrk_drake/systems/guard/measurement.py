@@ -59,7 +59,7 @@ class Measurement:
         """Returns the time from the last good measurement to `measured_utime` [us] in s; inf without one."""
         return math.inf if self._measured_utime is None else 1e-6 * (measured_utime - self._measured_utime)
 
-    def take(
+    def store(
         self,
         measured_utime: int,
         q: ArrayLike,

@@ -76,7 +76,7 @@ def test_beyond_starts_at_half_of_the_margin(row, side):
     def at(share):
         pose = q.copy()
         pose[joint] += bound + side * share * LIMITS.margin[row] - A[row] @ q
-        return LIMITS.beyond(pose)
+        return LIMITS.position_limit_fault(pose)
 
     assert at(-0.5) == at(0.0) == at(0.499) == ""
     assert at(0.501).startswith(f"{LIMITS.names[row]} = ")
@@ -86,9 +86,9 @@ def test_beyond_starts_at_half_of_the_margin(row, side):
 def test_beyond_describes_the_worst_limit():
     q = Q.copy()
     q[4], q[6] = UPPER[4] + 0.6 * LIMITS.margin[4], LOWER[6] - 0.7 * LIMITS.margin[6]
-    assert LIMITS.beyond(q).startswith("wrist_roll = ")
+    assert LIMITS.position_limit_fault(q).startswith("wrist_roll = ")
     q[4] += 0.2 * LIMITS.margin[4]
-    assert LIMITS.beyond(q).startswith("wrist_pitch = ")
+    assert LIMITS.position_limit_fault(q).startswith("wrist_pitch = ")
 
 
 @pytest.mark.parametrize("row", range(N + 1))

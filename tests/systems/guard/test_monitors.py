@@ -49,7 +49,7 @@ def test_slow_guard_holds_until_operator_resumes():
         assert bench.send(Command.HOLD, reset_fault=reset) == Status.REFUSAL_NONE
         bench.step()
     assert bench.guard.hold_reason == ""
-    assert bench.guard.waits_for == "the guard's period has a median above the allowed 5 ms"
+    assert bench.guard.blocked_reason == "the guard's period has a median above the allowed 5 ms"
     assert bench.guard.accepted_modes == modes(Command.HOLD)
     bench.tick()
     bench.utime += MS
