@@ -53,7 +53,7 @@ class CollectionSettings:
 
     def __post_init__(self) -> None:
         if fault := number_fault(self):
-            raise CollectionError(f"the time to cross a joint's range, {fault}")
+            raise CollectionError(f"collection settings: {fault}")
 
 
 class Collector:
@@ -154,9 +154,10 @@ class Collector:
         away = np.abs(self._q - self._desired[:n]) / self._tracking_tolerance
         if away.max() > 1:
             j = int(np.argmax(away))
+            unit = "m" if self._arm.prismatic[j] else "rad"
             raise CollectionError(
-                f"{self._arm.name} does not follow: {self._arm.joint_names[j]} is at {self._q[j]:.3g}, wanted at "
-                f"{self._desired[j]:.3g}. Is something in its way, or the model wrong?"
+                f"{self._arm.name} does not follow: {self._arm.joint_names[j]} is at {self._q[j]:.3g} {unit}, its "
+                f"target is {self._desired[j]:.3g} {unit}. Check for an obstacle, then validate the model."
             )
 
     def _collect(self) -> Steps:
@@ -176,7 +177,7 @@ class Collector:
             if self._time - began > _START:
                 late = self._answers.lateness()
                 raise CollectionError(
-                    f"{self._arm.name} did not let efforts act within {_START:.0f} s" + (late and f": {late}")
+                    f"{self._arm.name} did not apply efforts within {_START:.0f} s" + (late and f": {late}")
                 )
             self._desired = np.concatenate([self._q, np.zeros_like(self._q)])
             yield
@@ -197,7 +198,7 @@ class Collector:
             self._what = f"settling at pose {k + 1}"
             if not (yield from self._settle()):
                 self.unsettled.append(k + 1)
-                self._report(f"pose {k + 1} left out: not at rest within {_SETTLE:.0f} s")
+                self._report(f"pose {k + 1} skipped: the arm did not come to rest within {_SETTLE:.0f} s")
                 return
             self._what = f"measuring pose {k + 1}"
             measured.append((yield from self._measure()))

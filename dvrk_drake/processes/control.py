@@ -154,9 +154,9 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
     status, name = link.next_status(_FIRST_WAIT), link.arm.name
     _check(status, name)
     if not np.all(np.isfinite([*status.position, *status.velocity, *status.effort_measured])):
-        raise ControllerError(f"{name} does not know its state: a position, velocity or effort is not finite")
+        raise ControllerError(f"{name}: a measured position, velocity or effort is not finite. Check its sensors first")
     if violations := link.arm.limit_violations(status.position):
-        raise ControllerError(f"{name} stands outside its limits: {'; '.join(violations)}. Move it inside first")
+        raise ControllerError(f"{name} is outside its limits: {'; '.join(violations)}. Move it inside first")
     if not status.accepted_modes >> lcmt_dvrk_command.EFFORT & 1:
         raise ControllerError(f"{name} does not accept efforts now; its state is {describe_state(status.guard_state)}")
     utimes = [status.utime]
@@ -165,12 +165,15 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
         _check(later, name)
         utimes.append(later.utime)
     if not (later.sequence > status.sequence and later.utime > status.utime):
-        raise ControllerError(f"{name} tells nothing new: its utime or sequence does not increase")
+        raise ControllerError(
+            f"{name}: utime or sequence of its status does not increase. Restart its driver or bridge"
+        )
     # The smallest period is used because a busy computer misses some. Statuses of one measurement have the same utime.
     gaps = np.diff(np.unique(utimes))
     if min(gaps) > _MAX_PERIOD:
         raise ControllerError(
-            f"{name} is measured at {1e6 / min(gaps):.0f} Hz; control needs {1e6 / _MAX_PERIOD:.0f} Hz, better 1 kHz"
+            f"{name} is measured at {1e6 / min(gaps):.0f} Hz; control needs at least {1e6 / _MAX_PERIOD:.0f} Hz "
+            "(1 kHz is recommended)"
         )
     return status, 1e-6 * (later.utime - status.utime) / (later.sequence - status.sequence)
 
@@ -208,7 +211,7 @@ def reset_fault(link: ArmLink, report: Callable[[str], None]) -> None:
     while link.now() < end:
         status = link.next_status(_SILENCE)
     if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
-        raise ControllerError(f"{name} has a fault that stays: {status.fault_text or fault}")
+        raise ControllerError(f"{name} still has a fault after the reset: {status.fault_text or fault}")
     if status.fault_text:
         raise ControllerError(f"{name} does not resume: {status.fault_text}")
 
@@ -225,8 +228,8 @@ def _check(status: lcmt_dvrk_status, name: str, late: Callable[[], str] = lambda
         raise ControllerError(f"{name} took over and holds: {why}. {_RESET}")
     if status.gravity_compensation:
         raise ControllerError(
-            f"{name} adds gravity compensation of its own, and two of them throw the arm upward: switch it off there "
-            "(gravity_compensation in its status)"
+            f"{name} adds its own gravity compensation. Together with this controller, it would throw the arm upward. "
+            "Switch it off in the arm's driver (gravity_compensation in its status)"
         )
 
 
@@ -268,7 +271,7 @@ def control(
             acted, before = now, status
         elif now > acted + _TIMEOUT:
             why = takeover_reason(status, before, answers)
-            raise ControllerError(f"{link.arm.name} lets no command act for {_TIMEOUT:g} s; {why}")
+            raise ControllerError(f"{link.arm.name} applied no command for {_TIMEOUT:g} s: {why}")
         if now >= next_report:
             report(live.make(status, now, link.lost))
             next_report = now + _REPORT_PERIOD
@@ -286,4 +289,4 @@ def _release(link: ArmLink, controller: ArmController, start: float) -> None:
         command = controller.answer(status, link.now() - start)
         command.control_mode = lcmt_dvrk_command.HOLD
         link.send(command)
-    raise ControllerError(f"{link.arm.name} did not confirm that it holds; without commands it does after its expiry")
+    raise ControllerError(f"{link.arm.name} did not confirm HOLD. It holds when the last command expires")

@@ -65,7 +65,7 @@ def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.floa
     if q.shape != (arm.num_joints,) or not np.all(np.isfinite(q)):
         raise StationError(f"a pose of {arm.name} is {arm.num_joints} finite numbers [rad, m]; got {q.tolist()}")
     if violations := arm.limit_violations(q):
-        raise StationError(f"{arm.name} cannot start there: {'; '.join(violations)}")
+        raise StationError(f"{arm.name} cannot start outside its limits: {'; '.join(violations)}")
     return q
 
 

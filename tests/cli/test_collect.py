@@ -75,4 +75,4 @@ def test_the_command_teaches(simulated, tmp_path, monkeypatch, capsys):
     simulated.stopped = lambda sticky: sticky.ticks > 3000
     assert main(["collect", "--arm", "mtml", "--poses", str(poses), "--teach", "--at-rest"]) == 0
     np.testing.assert_allclose(load_poses(poses, arm), near_poses(1), atol=0.01)
-    assert "pose 1 taken\n" in capsys.readouterr().out
+    assert "pose 1 recorded\n" in capsys.readouterr().out

@@ -66,7 +66,9 @@ class DriveJoints:
         plant, i = self._plant, self._arm.joint_names.index(name)
         row = joint_row(self._arm, f"actuator.{name}")
         if self._arm.prismatic[i] or not np.array_equal(row, np.eye(len(row))[i]):
-            raise StationError(f"{self._arm.name}: stretch.{name}: allowed are actuators that turn one joint alone")
+            raise StationError(
+                f"{self._arm.name}: stretch.{name}: the actuator must drive one revolute joint and no other joint"
+            )
         joint = self._new(row, cable)
         motor = plant.AddJointActuator(f"motor_{name}", joint)
         at_joint = plant.GetJointActuatorByName(name, self._instance)

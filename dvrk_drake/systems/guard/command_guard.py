@@ -162,9 +162,9 @@ class CommandGuard:
             StationError: The session is 0, a mode is unknown, or the settings or the arm's gains are out of range.
         """
         if unknown := set(modes or ()) - {*_ACTIVE, lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD}:
-            raise StationError(f"modes must be of POSITION, EFFORT and OFF; got {sorted(unknown)}")
+            raise StationError(f"modes must be POSITION, EFFORT or OFF; got {sorted(unknown)}")
         if session_id == 0:
-            raise StationError("session_id must not be 0, which a command has that was never filled in")
+            raise StationError("session_id must not be 0, the value in a command that was not filled in")
         self.settings = settings or GuardSettings()
         self.settings.check()
         self.limits = GuardLimits(arm, self.settings)
@@ -272,7 +272,7 @@ class CommandGuard:
         self.counts.refused += 1
         self.refusal_code = code
         if code not in OUT_OF_STREAM and self.state == lcmt_dvrk_status.STATE_STARTING:
-            self._take_over(f"a command was refused while its mode began: {describe_refusal(code)}")
+            self._take_over(f"a command was refused during the start check: {describe_refusal(code)}")
         return code
 
     def ignore(self, code: int, count: int = 1) -> None:

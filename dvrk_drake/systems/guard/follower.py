@@ -110,9 +110,10 @@ class Follower:
         j = int(np.argmax(share))
         if not share[j] > 1.0:
             return ""
+        unit = self._limits.unit(j)
         return (
-            f"{self._limits.names[j]} = {q[j]:.4g} does not follow {self.target[j]:.4g}; "
-            f"{self._limits.following_error[j]:.3g} away is allowed"
+            f"{self._limits.names[j]} is at {q[j]:.4g} {unit} and does not follow its target {self.target[j]:.4g} {unit} "
+            f"(allowed difference {self._limits.following_error[j]:.3g} {unit})"
         )
 
     def begin_effort(self, effort: Vector, q: Vector) -> None:

@@ -106,7 +106,10 @@ class GuardLimits:
         k = int(excess.argmax())
         if not excess[k] > 0:
             return ""
-        return f"{self.names[k]} = {c[k]:.4g} is beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}"
+        return (
+            f"{self.names[k]} is at {c[k]:.4g} {self.unit(k)}, outside its limits "
+            f"{self.lower[k]:.4g}..{self.upper[k]:.4g} {self.unit(k)}"
+        )
 
     def implausible_pose(self, q: Vector) -> str:
         """Describes the first position limit that q (n,) exceeds by more than half of its range. Empty: none.
@@ -119,11 +122,15 @@ class GuardLimits:
         if not far.size:
             return ""
         k = int(far[0])
-        unit = "mm" if k < len(self._prismatic) and self._prismatic[k] else "degrees"
+        wrong_unit = "mm" if self.unit(k) == "m" else "degrees"
         return (
-            f"{self.names[k]} = {c[k]:.4g} is far beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}; "
-            f"{unit} or wrong zero?"
+            f"{self.names[k]} is at {c[k]:.4g} {self.unit(k)}, far outside its limits "
+            f"{self.lower[k]:.4g}..{self.upper[k]:.4g} {self.unit(k)}; check its unit ({wrong_unit}?) and its zero"
         )
+
+    def unit(self, k: int) -> str:
+        """Returns the unit of the coordinate of limit `k`: "m" for a prismatic joint, otherwise "rad"."""
+        return "m" if k < len(self._prismatic) and self._prismatic[k] else "rad"
 
     def refusal_to_start(self, command: lcmt_dvrk_command, q: Vector, effort: Vector, gravity: Vector) -> int:
         """Returns REFUSAL_START_* of a command that would begin to act at the measured q and effort (n,).

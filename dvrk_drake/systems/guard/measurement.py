@@ -81,7 +81,7 @@ class Measurement:
             return ""
         if dt < 0:
             self.bad += 1
-            return f"the measurement is {-dt:.6f} s older than the one before"
+            return f"the measurement is {-dt:.6f} s older than the previous one"
         q, v, effort = (np.array(numbers, float) for numbers in (q, v, effort))
         self.bad += 1
         if not (

@@ -82,8 +82,8 @@ def test_large_following_error_is_detected(joint, side):
     away = side * 0.15 * RANGE[joint] * E[joint]
     assert follower.following_fault(Q + 0.999 * away) == ""
     text = follower.following_fault(Q + 1.001 * away)
-    assert text.startswith(f"{ARM.joint_names[joint]} = ")
-    assert text.endswith(f"{0.15 * RANGE[joint]:.3g} away is allowed")
+    assert text.startswith(f"{ARM.joint_names[joint]} is at ")
+    assert text.endswith(f"(allowed difference {0.15 * RANGE[joint]:.3g} rad)")
     # The worst one is reported.
     other = (joint + 1) % N
     assert follower.following_fault(Q + 1.1 * away + 0.5 * RANGE[other] * E[other]).startswith(ARM.joint_names[other])

@@ -85,7 +85,7 @@ def test_repeated_and_older_measurements():
     assert measured.store(NOW, GOOD + 1, GOOD, GOOD) == ""
     assert measured.store(NOW, GOOD + 2, GOOD, GOOD) == "" and measured.dt == 0.0
     problem = measured.store(NOW - 2 * MS, GOOD + 3, GOOD, GOOD)
-    assert problem == "the measurement is 0.002000 s older than the one before" and measured.bad == 1
+    assert problem == "the measurement is 0.002000 s older than the previous one" and measured.bad == 1
     np.testing.assert_array_equal(measured.q, GOOD + 1)
     # After the arm's clock went back, times begin anew.
     measured.advance(NOW - 1000 * MS)
