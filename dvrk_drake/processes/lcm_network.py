@@ -11,8 +11,8 @@ from pydrake.lcm import DrakeLcm, DrakeLcmParams
 
 from dvrk_drake.errors import DvrkDrakeError
 
-#: Longest time for a message to this process on a busy computer [s]. Time between two attempts [s]. Several attempts are
-#: needed because UDP may lose messages.
+#: Longest time for a message to this process on a busy computer [s]. Time between two attempts [s], which are needed
+#: because UDP may lose messages.
 _OWN_MESSAGES, _NEXT_MESSAGE = 5.0, 0.2
 
 

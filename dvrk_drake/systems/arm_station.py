@@ -142,7 +142,7 @@ class ArmStation(Diagram):
         super().__init__()
         self._arm = arm
         self._ground_truth_arm = plant_arm or arm
-        self._parts: PlantEffects | None = None
+        self._plant_effects: PlantEffects | None = None
         self._drive_step: DriveStep | None = None
         plant_config = plant_config or arm_plant_config()
         if fault := plant_config_fault(plant_config):
@@ -161,16 +161,16 @@ class ArmStation(Diagram):
         if modify_plant is not None:
             modify_plant(self._plant)
         if effects is not None:
-            self._parts = PlantEffects(self._plant, self._ground_truth_arm, self._instance, effects)
+            self._plant_effects = PlantEffects(self._plant, self._ground_truth_arm, self._instance, effects)
         self._plant.Finalize()
-        self._drop_idle_shapes()
+        self._remove_idle_collision_shapes()
         self._joints = PlantJoints(self._plant, self._ground_truth_arm, self._instance)
         self._set_default_pose()
         if meshcat is not None:
             # The visualizer deletes its prefix when it starts. One level below, an earlier SetTransform persists.
             parameters = MeshcatVisualizerParams(prefix=f"{arm.name.lower()}/links")
             MeshcatVisualizer.AddToBuilder(builder, self._scene_graph, meshcat, parameters)
-        if effects is None or self._parts is None:
+        if effects is None or self._plant_effects is None:
             ports = add_ideal_drive(builder, self._plant, self._joints, self._instance)
         else:
             drive = DriveWithEffects(
@@ -178,7 +178,7 @@ class ArmStation(Diagram):
                 self._plant,
                 self._instance,
                 self._joints,
-                self._parts,
+                self._plant_effects,
                 effects,
                 seed,
                 self._home(),
@@ -214,8 +214,8 @@ class ArmStation(Diagram):
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
         set_arm_positions(self.plant, plant_context, self._ground_truth_arm, q)
         q_plant = self.plant.GetPositions(plant_context)
-        if self._parts is not None:
-            self._parts.drive.set_positions(q_plant, q)
+        if self._plant_effects is not None:
+            self._plant_effects.drive.set_positions(q_plant, q)
         self.plant.SetPositions(plant_context, q_plant)
         if self._drive_step is not None:
             self._drive_step.SetAtRest(self.GetMutableSubsystemContext(self._drive_step, context), q)
@@ -245,7 +245,7 @@ class ArmStation(Diagram):
         for name, M_LLo_L in inertias.items():
             self.plant.get_body(bodies[name]).SetSpatialInertiaInBodyFrame(plant_context, M_LLo_L)
 
-    def _drop_idle_shapes(self) -> None:
+    def _remove_idle_collision_shapes(self) -> None:
         """Removes the collision shapes if no two of them can collide. They would take a sixth of the time of a step."""
         if self._scene_graph.model_inspector().GetCollisionCandidates():
             return
@@ -262,8 +262,8 @@ class ArmStation(Diagram):
         q_plant = self.plant.GetDefaultPositions()
         tree = tree_selector(self.plant, self._ground_truth_arm, self._instance)
         q_plant[tree] = self._ground_truth_arm.linkage.position(home)
-        if self._parts is not None:
-            self._parts.drive.set_positions(q_plant, home)
+        if self._plant_effects is not None:
+            self._plant_effects.drive.set_positions(q_plant, home)
         self.plant.SetDefaultPositions(q_plant)
 
     def _export(self, builder: DiagramBuilder, ports: DrivePorts) -> None:

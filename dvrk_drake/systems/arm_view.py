@@ -163,11 +163,11 @@ class ArmView:
 
         A coupled limit stops the sliders of its joints. A button without function shows the name of the limit.
         """
-        wanted = np.array([self.meshcat.GetSliderValue(name) for name in self._slider_names])
-        if np.array_equal(wanted, self._q):
+        requested = np.array([self.meshcat.GetSliderValue(name) for name in self._slider_names])
+        if np.array_equal(requested, self._q):
             return self._q
-        q, stopped_by = self._inside_coupled_limits(wanted)
-        for name, value, target in zip(self._slider_names, wanted, q, strict=True):
+        q, stopped_by = self._inside_coupled_limits(requested)
+        for name, value, target in zip(self._slider_names, requested, q, strict=True):
             if value != target:
                 self.meshcat.SetSliderValue(name, target)
         if stopped_by != self._stopped_by:
@@ -179,13 +179,13 @@ class ArmView:
         self.show([self.meshcat.GetSliderValue(name) for name in self._slider_names])
         return self._q
 
-    def _inside_coupled_limits(self, wanted: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
+    def _inside_coupled_limits(self, requested: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
         """Returns the pose with the joints of each coupled limit stopped there, and the names of these limits.
 
         A slider moves in steps, so the shown pose may be slightly beyond a limit. It then moves no further.
         """
         A, lower, upper = self.arm.limit_matrix()
-        n, q, stops = self.arm.num_joints, wanted.copy(), []
+        n, q, stops = self.arm.num_joints, requested.copy(), []
         for a, least, most, limit in zip(A[n:], lower[n:], upper[n:], self.arm.coupled_limits, strict=True):
             start, end = a @ self._q, a @ q
             allowed = np.clip(end, min(least, start), max(most, start))

@@ -132,9 +132,9 @@ def _advance(
 ) -> None:
     """Computes one step of all elements, in place in `memory`, see FrictionCompensator."""
     k, n = rows.shape
-    stretch, last, effort = memory[:k], memory[k : 2 * k], memory[2 * k : 2 * k + n]
+    deflection, last, effort = memory[:k], memory[k : 2 * k], memory[2 * k : 2 * k + n]
     effort[:] = 0.0
-    known = memory[-1] == 1.0
+    was_valid = memory[-1] == 1.0
     memory[-1] = 0.0
     for i in range(2 * n):
         if not abs(state[i]) < IMPLAUSIBLE:  # also true for NaN
@@ -145,9 +145,9 @@ def _advance(
         for i in range(n):
             x += rows[j, i] * state[i]
             v += rows[j, i] * state[n + i]
-        if not known:
-            stretch[j], last[j] = 0.0, x
-        stretch[j], shape = effect_step(codes[j], stretch[j], x - last[j], v, scales[j])
+        if not was_valid:
+            deflection[j], last[j] = 0.0, x
+        deflection[j], shape = effect_step(codes[j], deflection[j], x - last[j], v, scales[j])
         last[j] = x
         for i in range(n):
             effort[i] += weights[j] * shape * rows[j, i]

@@ -113,16 +113,16 @@ class Hand(LeafSystem):
 
     def _force_and_jacobian(self, context: Context) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Returns F_G_B (6,) and J (6, n)."""
-        nothing = np.zeros(6), np.zeros((6, self._num_joints))
+        no_force = np.zeros(6), np.zeros((6, self._num_joints))
         if not self.get_input_port(1).HasValue(context):
-            return nothing
+            return no_force
         q, v = np.split(self.get_input_port(0).Eval(context), 2)
         X_BG_desired = self.get_input_port(1).Eval(context)
         if not all(np.all(np.abs(x) < IMPLAUSIBLE) for x in (q, v, X_BG_desired.GetAsMatrix34())):
-            return nothing
+            return no_force
         X_BG, J = self._frame.pose(q), self._frame.jacobian(q)
-        turn = (X_BG_desired.rotation() @ X_BG.rotation().inverse()).ToAngleAxis()
-        e = np.concatenate([turn.angle() * turn.axis(), X_BG_desired.translation() - X_BG.translation()])
+        rotation = (X_BG_desired.rotation() @ X_BG.rotation().inverse()).ToAngleAxis()
+        e = np.concatenate([rotation.angle() * rotation.axis(), X_BG_desired.translation() - X_BG.translation()])
         V, h = J @ v, self._time_step
         mobility = J @ np.linalg.solve(self._frame.mass_matrix(q), J.T)
         A = np.eye(6) + (h * (self._D + h * self._K))[:, None] * mobility

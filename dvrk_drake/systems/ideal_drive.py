@@ -45,9 +45,9 @@ class PlantJoints:
             plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)
         ]
         driven = [actuator.joint().name() for actuator in self.actuators]
-        if undriven := [joint for joint in arm.joint_names if joint not in driven]:
+        if without_motor := [joint for joint in arm.joint_names if joint not in driven]:
             raise StationError(
-                f"{' '.join(arm.sdf)}: joint {', '.join(undriven)} has no <effort> and therefore no motor"
+                f"{' '.join(arm.sdf)}: joint {', '.join(without_motor)} has no <effort> and therefore no motor"
             )
         columns = [driven.index(joint) for joint in arm.joint_names]
         self.actuation = np.zeros((len(self.actuators), n))

@@ -1,6 +1,6 @@
 """Configuration of a station, as a schema for Drake's yaml_load_typed, and the station that it describes.
 
-No postponed annotations here: yaml_load_typed reads the types at run time.
+This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 """
 
 from dataclasses import dataclass, field

@@ -78,10 +78,10 @@ class TeleoperatedArms(Diagram):
         self.teleoperation = builder.AddNamedSystem(
             "teleoperation", Teleoperation(master, follower, scale=scale, R_FM=R_FM)
         )
-        carry = builder.AddNamedSystem(
+        master_controller = builder.AddNamedSystem(
             "master_controller", GravityPidController(IdentifiedModel.from_arm(master), mode="gravity")
         )
-        regulate = builder.AddNamedSystem(
+        follower_controller = builder.AddNamedSystem(
             "follower_controller", GravityPidController(IdentifiedModel.from_arm(follower))
         )
         hand = builder.AddNamedSystem("hand", Hand(master, MASTER_FRAME))
@@ -92,17 +92,17 @@ class TeleoperatedArms(Diagram):
             self.follower.GetOutputPort(f"{F}.state_estimated"),
         )
         connect = builder.Connect
-        connect(state_M, carry.GetInputPort("state_estimated"))
+        connect(state_M, master_controller.GetInputPort("state_estimated"))
         connect(state_M, hand.GetInputPort("state_estimated"))
-        connect(carry.GetOutputPort("effort"), self.master.GetInputPort(f"{M}.effort_commanded"))
+        connect(master_controller.GetOutputPort("effort"), self.master.GetInputPort(f"{M}.effort_commanded"))
         connect(hand.GetOutputPort("effort_disturbance"), self.master.GetInputPort(f"{M}.effort_disturbance"))
         connect(self.master.GetOutputPort(f"{M}.position_measured"), self.teleoperation.GetInputPort("master_position"))
         connect(
             self.follower.GetOutputPort(f"{F}.position_measured"), self.teleoperation.GetInputPort("follower_position")
         )
-        connect(self.teleoperation.GetOutputPort("desired_state"), regulate.GetInputPort("desired_state"))
-        connect(state_F, regulate.GetInputPort("state_estimated"))
-        connect(regulate.GetOutputPort("effort"), self.follower.GetInputPort(f"{F}.effort_commanded"))
+        connect(self.teleoperation.GetOutputPort("desired_state"), follower_controller.GetInputPort("desired_state"))
+        connect(state_F, follower_controller.GetInputPort("state_estimated"))
+        connect(follower_controller.GetOutputPort("effort"), self.follower.GetInputPort(f"{F}.effort_commanded"))
 
         builder.ExportInput(hand.GetInputPort("X_BG_desired"), "X_MG_desired")
         for name in ("engaged", "jaw_angle"):

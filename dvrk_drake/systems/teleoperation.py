@@ -71,8 +71,8 @@ class Teleoperation(LeafSystem):
     that was moved externally. Before the first finite follower_position, `desired_state` is NaN, which the controller
     rejects.
 
-    Ports carry no age, so a receiver of delayed messages must open the clutch. Inputs are sampled and outputs change
-    every `period` seconds and at initialization, which resets the state.
+    The ports do not contain the age of a value, so a receiver of delayed messages must open the clutch. Inputs are
+    sampled and outputs change every `period` seconds and at initialization, which resets the state.
     """
 
     def __init__(
@@ -152,10 +152,10 @@ class Teleoperation(LeafSystem):
         is_engaged = engaged[0] > 0.5
 
         lags = not np.all(np.abs(q_follower - q_d) <= self._max_lag)  # also true of NaN
-        if lags and _usable(q_follower) and (not is_engaged or np.isnan(q_d[0])):
+        if lags and _is_valid(q_follower) and (not is_engaged or np.isnan(q_d[0])):
             q_d[:] = q_follower
             lags = False
-        fault = lags or not (_usable(q_master) and _usable(jaw) and _usable(engaged))
+        fault = lags or not (_is_valid(q_master) and _is_valid(jaw) and _is_valid(engaged))
         inserted = q_d[2] + self._inverse.depth_at_zero >= MIN_DEPTH - 1e-6
         follows = is_engaged and not fault and inserted
         v_d[:] = 0.0
@@ -169,10 +169,10 @@ class Teleoperation(LeafSystem):
     def _target(self, q_master: NDArray[np.float64], q_d: NDArray[np.float64], state: DiscreteValues) -> RigidTransform:
         """Returns the desired X_FT. If the follower did not follow before, stores the poses and returns its own one."""
         X_MG = self._master.pose(q_master)
-        memory = state.get_mutable_value(_POSES).reshape(2, 3, 4)  # a view
+        poses = state.get_mutable_value(_POSES).reshape(2, 3, 4)  # a view
         if state.get_value(_FOLLOWING)[0] == 0.0:
-            memory[0], memory[1] = X_MG.GetAsMatrix34(), self._follower.pose(q_d).GetAsMatrix34()
-        R_MG0, p_MG0, R_FT0, p_FT0 = memory[0, :, :3], memory[0, :, 3], memory[1, :, :3], memory[1, :, 3]
+            poses[0], poses[1] = X_MG.GetAsMatrix34(), self._follower.pose(q_d).GetAsMatrix34()
+        R_MG0, p_MG0, R_FT0, p_FT0 = poses[0, :, :3], poses[0, :, 3], poses[1, :, :3], poses[1, :, 3]
         R_FM, scale = self._R_FM.matrix(), state.get_value(_SCALE)[0]
         R_FT = R_FM @ X_MG.rotation().matrix() @ R_MG0.T @ R_FM.T @ R_FT0
         return RigidTransform(
@@ -182,9 +182,9 @@ class Teleoperation(LeafSystem):
     def _rates(self, X_FT: RigidTransform, jaw: NDArray[np.float64], q_d: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns joint rates (n,) for one period, towards the pose and jaw angle and inside all limits."""
         solution = self._inverse.solve(X_FT, q_d)
-        wanted = np.concatenate([q_d[:6] if solution is None else solution, jaw])
-        way = np.clip(wanted, self._lower, self._upper) - q_d
-        return np.clip(way / self._period, -self._speed, self._speed)
+        target = np.concatenate([q_d[:6] if solution is None else solution, jaw])
+        change = np.clip(target, self._lower, self._upper) - q_d
+        return np.clip(change / self._period, -self._speed, self._speed)
 
     def _read(self, context: Context, port: int) -> NDArray[np.float64]:
         vector = self.EvalVectorInput(context, port)
@@ -197,7 +197,7 @@ _JAW = 3  # index of the input port
 _DESIRED, _FOLLOWING, _FAULT, _SCALE, _POSES = range(5)  # indices of the discrete state groups
 
 
-def _usable(values: NDArray[np.float64]) -> bool:
+def _is_valid(values: NDArray[np.float64]) -> bool:
     return bool(np.all(np.abs(values) < IMPLAUSIBLE))  # false for NaN
 
 

@@ -142,7 +142,7 @@ class FrozenPosition:
         self._least_time = settings.frozen_time + counts / settings.frozen_speed
 
     def begin(self, sample: Sample) -> tuple[Vector, Vector, float]:
-        """Returns effort at the last position change (n,), time of excessive difference (n,), and time since the start."""
+        """Returns effort (n,) at the last position change, time (n,) of excessive difference, and time since start."""
         return sample.net_effort, np.zeros_like(sample.q), 0.0
 
     def check(self, sample: Sample, state: tuple[Vector, Vector, float]) -> tuple[tuple[Vector, Vector, float], Mask]:

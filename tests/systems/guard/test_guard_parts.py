@@ -221,8 +221,10 @@ def test_off_requires_hold_of_the_same_sender():
 
 def test_reset_is_a_change_from_false_to_true():
     stream = Stream()
-    asked = [stream.send(k * MS, reset=reset) for k, reset in enumerate([True, True, False, True, True, False, True])]
-    assert asked == [False, False, False, True, False, False, True]
+    requested = [
+        stream.send(k * MS, reset=reset) for k, reset in enumerate([True, True, False, True, True, False, True])
+    ]
+    assert requested == [False, False, False, True, False, False, True]
     # The flag of another sender does not count.
     stream.send(8 * MS)
     assert stream.send(60 * MS, sender=6, reset=True) is False
