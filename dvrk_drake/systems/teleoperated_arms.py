@@ -1,4 +1,4 @@
-"""Simulated teleoperation: a hand moves a master arm in gravity compensation, which leads a PSM."""
+"""Simulated teleoperation: a hand moves a master arm in gravity compensation, and a PSM follows it."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ class TeleoperatedArms(Diagram):
 
     `mtml` and `psm` stand for the arms' lower-case names.
 
-    - `X_MG_desired` (RigidTransform): desired pose of the master's handle in the master's base, set by the hand.
-      Unconnected: no force acts on the master.
-    - `engaged`, `jaw_angle`, `desired_state`, `following`, `fault`: those of `Teleoperation`.
-    - `state_estimated`: those of the two stations.
+    - `X_MG_desired` (RigidTransform): desired pose of the master's handle in the master's base, towards which the hand
+      pulls. Unconnected: the hand exerts no force.
+    - `engaged`, `jaw_angle`, `desired_state`, `following`, `fault`: ports of `Teleoperation`.
+    - `state_estimated`: ports of the two stations.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -66,7 +66,8 @@ class TeleoperatedArms(Diagram):
         Args:
             master: MTM.
             follower: PSM.
-            scale, R_FM: See `Teleoperation`.
+            scale: Ratio of the displacements; see `Teleoperation`.
+            R_FM: Rotation from the master's base to the follower's base; see `Teleoperation`.
             meshcat: Meshcat in which both arms are drawn, below paths of their lower-case names. `SetTransform` places
                 them.
         """
@@ -123,11 +124,11 @@ class TeleoperatedArms(Diagram):
             station.SetPositions(self.GetMutableSubsystemContext(station, context), q)
 
     def CalcX_MG(self, context: Context) -> RigidTransform:
-        """Returns the pose of the master's handle in its base."""
+        """Returns the pose of the master's handle in the master's base."""
         return self._pose(self.master, MASTER_FRAME, context)
 
     def CalcX_FT(self, context: Context) -> RigidTransform:
-        """Returns the pose of the follower's tip in its base."""
+        """Returns the pose of the follower's tip in the follower's base."""
         return self._pose(self.follower, FOLLOWER_FRAME, context)
 
     def _pose(self, station: ArmStation, frame_name: str, context: Context) -> RigidTransform:

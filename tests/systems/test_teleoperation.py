@@ -210,5 +210,5 @@ def test_other_invalid_arguments_are_refused():
 
 def test_velocity_limits_come_from_the_sdf():
     assert np.array_equal(Loop().system._speed, SPEED)
-    with pytest.raises(ControllerError, match="no <velocity> limit"):
+    with pytest.raises(ControllerError, match="no velocity limit"):
         _velocity_limits(MTM)
