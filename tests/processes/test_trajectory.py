@@ -1,4 +1,4 @@
-"""Ways from pose to pose, and when an arm rests."""
+"""Trajectories between poses, and detection of rest."""
 
 import itertools
 
@@ -14,7 +14,7 @@ ARMS = ("mtml", "psm")
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_no_joint_is_faster_than_it_may_be_or_leaves_the_limits(name):
+def test_trajectory_respects_speed_and_position_limits(name):
     arm = load_arm(name)
     speed = (arm.position_upper - arm.position_lower) / 5.0
     poses = random_poses(arm, 20, margin=0.0)
@@ -23,7 +23,7 @@ def test_no_joint_is_faster_than_it_may_be_or_leaves_the_limits(name):
         states = np.array([trajectory.state(t) for t in np.linspace(-1.0, trajectory.duration + 1.0, 400)])
         q, v = np.split(states, 2, axis=1)
         assert np.all(np.abs(v) <= speed * (1 + 1e-9))
-        if trajectory.duration > 0.3:  # and none is slower than it need be
+        if trajectory.duration > 0.3:  # the speed limit is used
             assert np.max(np.abs(v) / speed) > 0.99
         assert not any(arm.limit_violations(pose, 1e-9) for pose in q)
         np.testing.assert_allclose(q[0], start, atol=1e-12)
@@ -31,8 +31,8 @@ def test_no_joint_is_faster_than_it_may_be_or_leaves_the_limits(name):
         assert np.abs(v[[0, -1]]).max() < 1e-12
 
 
-def test_braking_stays_on_the_way():
-    """Whenever it is stopped, a trajectory's rest is between its ends, and the speed only falls."""
+def test_braking_stays_on_the_path():
+    """After a stop at any time, the arm comes to rest between both ends of the trajectory, with decreasing speed."""
     arm = load_arm("mtml")
     start, end = random_poses(arm, 2)
     trajectory = CubicTrajectory.rest_to_rest(start, end, np.full(7, 0.5))
@@ -48,7 +48,7 @@ def test_braking_stays_on_the_way():
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_approaches_begin_inside_the_limits(name):
+def test_approaches_start_inside_limits(name):
     arm = load_arm(name)
     offset = 0.3 * arm.effort_limits / np.array(arm.gains.kp)
     for pose in random_poses(arm, 200, margin=0.0):
@@ -60,7 +60,7 @@ def test_approaches_begin_inside_the_limits(name):
     np.testing.assert_allclose(offset_pose(arm, middle, offset), middle + offset, atol=1e-12)
 
 
-def test_rest_is_all_joints_near_one_pose_for_a_while():
+def test_rest_requires_all_joints_near_one_pose():
     detector = RestDetector(np.array([0.01, 0.001]), 0.5)
     times = np.arange(0, 3, 0.01)
     q = np.column_stack([np.where(times < 1.0, times, 1.0), np.where(times < 1.8, 0.0, 0.1)])

@@ -124,6 +124,7 @@ def make_collector(path, poses, friction, both_sides=True, *, arm_type=StickyArm
 
 
 def run_collector(collector, controller, sticky, seconds, until=lambda: False):
+    """Runs a collection for at most `seconds`, until it is finished or `until` returns true."""
     end = sticky.ticks + seconds / PERIOD
     while not (collector.finished or until()) and sticky.ticks < end:
         status, time = sticky.status(), PERIOD * sticky.ticks

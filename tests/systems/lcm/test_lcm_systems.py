@@ -80,7 +80,7 @@ def test_the_status_echoes_the_last_accepted_command():
     assert command.session_id == status.session_id != 0
 
 
-def test_of_two_controllers_the_first_stays_in_command():
+def test_first_of_two_controllers_stays_in_control():
     lcm = DrakeLcm("memq://")
     arm, first, second = SimulatedArm(lcm), Controller(lcm), Controller(lcm)
     run(lcm, 300, arm, first)
