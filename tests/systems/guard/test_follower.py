@@ -84,7 +84,7 @@ def test_large_following_error_is_detected(joint, side):
     text = follower.following_fault(Q + 1.001 * away)
     assert text.startswith(f"{ARM.joint_names[joint]} is at ")
     assert text.endswith(f"(allowed difference {0.15 * RANGE[joint]:.3g} rad)")
-    # The worst one is reported.
+    # The joint with the largest error is reported.
     other = (joint + 1) % N
     assert follower.following_fault(Q + 1.1 * away + 0.5 * RANGE[other] * E[other]).startswith(ARM.joint_names[other])
 
@@ -105,7 +105,7 @@ def test_lag_up_to_following_time_is_allowed(side):
 
     assert fault_at(late - side * 0.999 * error) == fault_at(target + side * 0.999 * error) == fault_at(late) == ""
     assert fault_at(late - side * 1.001 * error) and fault_at(target + side * 1.001 * error)
-    # A step longer than the following time brings the late one to the target, not beyond.
+    # After a step longer than the following time, the filtered target equals the target.
     target = follower.follow_position(Q + side * 9.0 * E[joint], STILL, 0.2).position[joint]
     assert fault_at(target - side * 0.999 * error) == ""
     assert fault_at(target - side * 1.001 * error) and fault_at(target + side * 1.001 * error)
@@ -155,7 +155,7 @@ def test_fault_holds_valid_joints_with_bounded_effort(side):
             output = at().hold_valid_joints(Q - side * away, STILL, valid, side * gravity)
             np.testing.assert_allclose(output.effort, expected, atol=1e-12)
     assert output.control_mode == Command.EFFORT
-    # Below the bounds they are those of the arm's own gains.
+    # Below the bounds, the efforts follow from the gains of the arm.
     gravity, v = 0.02 * side * LIMIT, side * 0.01 * LIMITS.fault_effort / LIMITS.kd
     q = Q - 0.02 * side * LIMITS.fault_effort / LIMITS.kp
     output = at().hold_valid_joints(q, v, valid, gravity)
@@ -209,14 +209,14 @@ def test_start_inside_wall_increases_wall_gradually(side):
         output = follower.follow_effort(push, q, STILL, 1e-3, share)
         np.testing.assert_allclose(output.effort, np.clip(push + share * wall, -LIMIT, LIMIT), atol=1e-12)
         assert output.joint_flags[0] == Status.FLAG_POSITION_LIMIT
-    # The subtracted effort does not push an arm outward after it has left the wall.
+    # The subtracted effort does not push the arm outward after it has left the wall.
     inside = follower.follow_effort(side * LIMIT * E[0], Q, STILL, 1.0, 0.0)
     np.testing.assert_allclose(inside.effort, side * LIMIT * E[0], atol=1e-12)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_start_inside_wall_never_pulls_outward(side):
-    """Nothing is subtracted beyond the present effort of the wall, also outside it or while braking."""
+    """The subtracted effort is at most the present effort of the wall, also outside the wall or while braking."""
     q = Q.copy()
     q[0] = (ARM.position_upper if side > 0 else ARM.position_lower)[0]
     follower = at(q)

@@ -32,7 +32,7 @@ def test_reset_requires_a_change_of_the_flag():
     bench = Bench(modes=WITH_OFF)
     bench.guard.report_fault("the amplifier is hot")
     assert (bench.guard.fault_code, bench.guard.fault_text) == (Status.FAULT_DRIVER, "the amplifier is hot")
-    bench.run(Command.HOLD, 5, reset_fault=True)  # always true is no change to true
+    bench.run(Command.HOLD, 5, reset_fault=True)  # a constant flag is no change to true
     assert bench.guard.state == Status.STATE_FAULT
     bench.run(Command.HOLD, 5)
     assert bench.guard.state == Status.STATE_FAULT
@@ -73,7 +73,7 @@ BAD = GuardSettings().plausibility.bad_samples
 
 @pytest.mark.parametrize("which", ["q", "v", "effort"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e9])
-def test_bad_measurements_lead_to_hold_then_fault(which, value):
+def test_invalid_measurements_lead_to_hold_then_fault(which, value):
     bench = Bench(model=Heavy()).at_rest().started()
     good = getattr(bench, which)
     setattr(bench, which, np.where(np.arange(N) == 3, value, good))
@@ -85,12 +85,12 @@ def test_bad_measurements_lead_to_hold_then_fault(which, value):
     assert (output.control_mode, bench.guard.fault_code) == (Command.EFFORT, Status.FAULT_MEASUREMENT)
     np.testing.assert_allclose(output.effort, Heavy().gravity_effort(Q), rtol=0, atol=1e-12)
     assert np.all(output.joint_flags & Status.FLAG_IMPLAUSIBLE)
-    # A reset while it is still bad faults again.
+    # A reset while the measurement is still invalid leads to a fault again.
     healthy = {"position": list(Q), "effort": [0.0] * N}
     for reset in (False, True):
         bench.send(Command.HOLD, reset_fault=reset, **healthy)
         assert bench.tick().control_mode == Command.EFFORT
-    # Good again, at another pose: unchanged until a reset, then held where it is.
+    # Valid measurements at another pose change nothing until a reset. Then this pose is held.
     setattr(bench, which, good)
     bench.q = Q - 0.03
     output = bench.tick(100)
@@ -102,7 +102,7 @@ def test_bad_measurements_lead_to_hold_then_fault(which, value):
     np.testing.assert_array_equal(output.position, Q - 0.03)
 
 
-def test_few_bad_measurements_in_hold_are_tolerated():
+def test_few_invalid_measurements_in_hold_are_tolerated():
     bench = Bench()
     for _ in range(3):
         bench.q = Q * np.nan
@@ -116,7 +116,7 @@ def test_few_bad_measurements_in_hold_are_tolerated():
 @pytest.mark.parametrize("joint", range(N))
 @pytest.mark.parametrize("side", [-1, 1])
 def test_wrong_velocity_at_start_has_no_lasting_effect(joint, side):
-    """The speed limit brakes on that one sample, and the start does not subtract this effort later."""
+    """The speed limit brakes at this sample only. The start does not subtract this effort later."""
     bench = Bench().at_rest()
     commanded = bench.effort.copy()
     while bench.guard.state != Status.STATE_EFFORT:
@@ -132,7 +132,7 @@ def test_wrong_velocity_at_start_has_no_lasting_effect(joint, side):
 def test_reset_does_not_hold_an_unmeasured_pose():
     bench = Bench(modes=WITH_OFF, checks=True, model=Heavy()).at_rest()
     good = bench.q
-    # In OFF, neither a hold nor a reset of a fault switches the power on.
+    # In OFF, neither HOLD nor the reset of a fault switches the power on.
     bench.run(Command.HOLD, 5)
     bench.run(Command.OFF, 5)
     bench.q = good * np.nan
@@ -153,7 +153,7 @@ def test_reset_does_not_hold_an_unmeasured_pose():
         output = bench.tick()
     assert (output.control_mode, bench.guard.state) == (Command.HOLD, Status.STATE_HOLD)
     np.testing.assert_array_equal(output.position, good - 0.1)
-    # With power: where the measurements return, not where they were lost.
+    # With power, the arm is held at the first valid pose after the loss, not at the pose before it.
     bench.q = good * np.nan
     bench.tick(BAD + 5)
     bench.run(Command.HOLD, 1, **healthy)
@@ -167,7 +167,7 @@ def test_reset_does_not_hold_an_unmeasured_pose():
 
 
 def test_reset_after_invalid_position_holds_measured_pose():
-    """This also holds for a pose near the target. Until the reset, the others are held and damped."""
+    """Tests also a pose near the target. Until the reset, the other joints are held and damped."""
     bench = Bench(checks=True, model=Heavy()).at_rest()
     bench.tick(100)
     bench.q = Q + 0.015 * np.eye(N)[0]
@@ -196,7 +196,7 @@ def test_reset_without_fault_has_no_effect():
     assert (bench.guard.state, bench.guard.fault_text) == (Status.STATE_HOLD, "")
 
 
-def test_no_power_before_first_good_measurement():
+def test_no_power_before_first_valid_measurement():
     guard = CommandGuard(ARM, SESSION, Weightless())
     output = guard.step(0, 0, Q * np.nan, 0 * Q, 0 * Q)
     assert (output.control_mode, guard.fault_code) == (Command.OFF, Status.FAULT_MEASUREMENT)
@@ -222,7 +222,7 @@ def test_implausible_first_pose_is_a_fault():
     assert guard.fault_text == (
         "outer_yaw is at 40 rad, far outside its limits -0.6981..1.134 rad; check its unit (degrees?) and its zero"
     )
-    assert bench.output.control_mode == Command.OFF  # it never held a pose
+    assert bench.output.control_mode == Command.OFF  # no pose was held
     bench.q = Q
     assert bench.tick().control_mode == Command.OFF
     assert guard.state == Status.STATE_FAULT
@@ -344,7 +344,7 @@ def test_off_in_fault_requires_reset():
 
 
 @pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])
-def test_old_measurement_is_bad(mode):
+def test_old_measurement_is_invalid(mode):
     bench = Bench()
     bench.run(mode, 260)
     for _ in range(20):  # the same measurement, until it is 20 ms old
@@ -360,7 +360,7 @@ def test_old_measurement_is_bad(mode):
     assert bench.guard.fault_text == old
 
 
-def test_future_measurement_is_bad():
+def test_future_measurement_is_invalid():
     bench = Bench().started()
     bench.age = -1
     assert bench.tick().control_mode == Command.HOLD

@@ -18,7 +18,7 @@ MS, NOW = 1000, 10**9
 
 
 def measurement():
-    """Returns a good measurement of three joints, 25 ms old."""
+    """Returns a valid measurement of three joints that is 25 ms old."""
     measured = Measurement(3, 20_000)
     measured.advance(NOW - 25 * MS)
     assert measured.store(NOW - 25 * MS, GOOD, GOOD, GOOD) == ""
@@ -42,7 +42,7 @@ def test_stopped_clock_is_reported():
     measured = Measurement(3, 20_000)
     for k in range(25):
         assert (measured.advance(1000)[1] == "the arm's clock stands still") == (k >= 10)
-    for k in range(12):  # after a step the count begins anew
+    for k in range(12):  # after an advance of the clock, the count restarts
         assert (measured.advance(2000)[1] != "") == (k > 10)
 
 
@@ -72,7 +72,7 @@ def test_measurement_size_and_numbers_are_checked(which, bad):
     assert measured.num_invalid == 0
 
 
-def test_interval_is_between_good_measurements():
+def test_interval_is_between_valid_measurements():
     measured = measurement()
     measured.advance(NOW + 7 * MS)
     measured.store(NOW + 2 * MS, GOOD * np.nan, GOOD, GOOD)
@@ -87,7 +87,7 @@ def test_repeated_and_older_measurements():
     problem = measured.store(NOW - 2 * MS, GOOD + 3, GOOD, GOOD)
     assert problem == "the measurement is 0.002000 s older than the previous one" and measured.num_invalid == 1
     np.testing.assert_array_equal(measured.q, GOOD + 1)
-    # After the arm's clock went back, times begin anew.
+    # After the arm's clock went back, earlier times are not compared.
     measured.advance(NOW - 1000 * MS)
     assert measured.store(NOW - 1000 * MS, GOOD, GOOD, GOOD) == "" and measured.dt == np.inf
 
@@ -160,7 +160,7 @@ def test_sequence_order_and_jumps(step, code):
     stream.send(0)
     assert stream.send(MS, step=step) == code
     if code:
-        assert stream.send(2 * MS, step=1 - step) is False  # the refused one moved nothing
+        assert stream.send(2 * MS, step=1 - step) is False  # the refused command changed nothing
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_sender_clock_must_advance_with_arm_clock(ahead, jumps):
     stream = Stream()
     stream.send(0)
     assert stream.send(40 * MS, ahead=ahead) == (Status.REFUSAL_CLOCK_JUMP if jumps else 0)
-    if jumps:  # the refused one moved nothing
+    if jumps:  # the refused command changed nothing
         assert stream.send(41 * MS) is False
 
 

@@ -18,7 +18,7 @@ def test_slow_median_period_is_found_after_50_periods(period, slow):
     faults = [monitor.add(period) for _ in range(200)]
     assert [bool(fault) for fault in faults] == [slow and k >= 50 for k in range(200)]
     assert not slow or faults[-1] == "the median period of the guard is above the allowed 5 ms"
-    # Good periods end it.
+    # Normal periods end the fault.
     faults = [monitor.add(0.001) for _ in range(100)]
     assert [bool(fault) for fault in faults] == [slow and k < 49 for k in range(100)]
 
@@ -43,7 +43,7 @@ def test_slow_guard_holds_until_operator_resumes():
         bench.step()
         assert (bench.guard.state == Status.STATE_EFFORT) == (k < 50)
     assert bench.guard.hold_reason == "the median period of the guard is above the allowed 5 ms"
-    # No command acts while it is slow, even with an operator's reset.
+    # No command acts while the period is too long, even after a reset by an operator.
     for reset in (False, True):
         bench.utime += 20 * MS
         assert bench.send(Command.HOLD, reset_fault=reset) == Status.REFUSAL_NONE
@@ -100,7 +100,7 @@ def test_oscillating_efforts_are_found(joint, frequency):
     wave = lambda t: unit * np.sign(np.sin(2 * np.pi * frequency * (t + 1e-4)))  # noqa: E731
     time, found = reversals(OscillationMonitor(SETTINGS, ARM), wave)
     assert found == joint
-    # Each half period is a reversal, and four of them are allowed, which fade. The mean takes a while to settle.
+    # Each half period is a reversal. Four reversals are allowed, with exponential decay. The mean settles slowly.
     assert time <= 8 / (2 * frequency) + 0.11
 
 
