@@ -217,7 +217,9 @@ class ArmStation(Diagram):
         """
         q = np.asarray(q, float)
         if q.shape != (self._arm.num_joints,) or not np.all(np.isfinite(q)):
-            raise StationError(f"a pose of {self._arm.name} is {self._arm.num_joints} finite numbers; got {q.tolist()}")
+            raise StationError(
+                f"a pose of {self._arm.name} is {self._arm.num_joints} finite numbers [rad, m]; got {q.tolist()}"
+            )
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
         set_arm_positions(self.plant, plant_context, self._ground_truth_arm, q)
         q_plant = self.plant.GetPositions(plant_context)
@@ -247,7 +249,7 @@ class ArmStation(Diagram):
         plant_context = self.GetMutableSubsystemContext(self.plant, context)
         bodies = {self.plant.get_body(i).name(): i for i in self.plant.GetBodyIndices(self._instance)}
         if unknown := sorted(set(inertias) - set(bodies)):
-            raise StationError(f"unknown link {', '.join(unknown)}; links: {', '.join(bodies)}")
+            raise StationError(f"unknown link {', '.join(unknown)}; known links: {', '.join(bodies)}")
         for name, M_LLo_L in inertias.items():
             self.plant.get_body(bodies[name]).SetSpatialInertiaInBodyFrame(plant_context, M_LLo_L)
 

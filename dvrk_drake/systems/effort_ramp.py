@@ -45,7 +45,9 @@ class EffortRamp(LeafSystem):
         """
         super().__init__()
         if not (period > 0 and duration > 0):
-            raise ControllerError(f"period and duration must be positive; got {period}, {duration}")
+            raise ControllerError(
+                f"period and duration must be positive numbers of seconds; got {period} and {duration}"
+            )
         self._increment = period / duration
         self._wanted = self.DeclareVectorInputPort("effort_wanted", num_joints)
         self._measured = self.DeclareVectorInputPort("effort_measured", num_joints)

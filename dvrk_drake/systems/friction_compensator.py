@@ -75,7 +75,9 @@ class FrictionCompensator(LeafSystem):
         super().__init__()
         check_ratios(ratio, hysteresis_ratio)
         if not (1 <= widening <= 10 and 0 < period < 1):
-            raise ControllerError(f"widening must be 1..10 and period 0..1 s; got {widening:g}, {period:g}")
+            raise ControllerError(
+                f"widening must be 1..10 and period must be 0..1 s; got {widening:g} and {period:g} s"
+            )
         n = friction.arm.num_joints
         error = np.zeros(n) if holding_error is None else holding_error
         self._ratios = safe_ratios(friction, ratio, error, hysteresis_ratio)

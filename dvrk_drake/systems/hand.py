@@ -96,9 +96,9 @@ class Hand(LeafSystem):
         super().__init__()
         grip = grip or Grip()
         if fault := number_fault(grip):
-            raise StationError(f"a hand's {fault}")
+            raise StationError(f"grip of the hand: {fault}")
         if not (np.isfinite(time_step) and time_step > 0):
-            raise StationError(f"a hand's time_step must be a positive number; got {time_step}")
+            raise StationError(f"time_step of the hand must be a positive number of seconds; got {time_step}")
         self._frame = ArmFrame(arm, frame_name)
         self._grip, self._time_step = grip, time_step
         self._K = np.repeat([grip.rotational_stiffness, grip.stiffness], 3)

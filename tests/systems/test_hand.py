@@ -145,7 +145,7 @@ def test_hand_moves_handle_to_pose_with_any_stiffness(firmer):
 def test_invalid_arguments_are_refused():
     with pytest.raises(ArmError, match='MTML: its SDF has no frame "thumb"; it has dh_0'):
         Hand(ARM, "thumb")
-    with pytest.raises(StationError, match=r"a hand's stiffness is nan; allowed: 1e-06\.\."):
+    with pytest.raises(StationError, match=r"grip of the hand: stiffness is nan; allowed: 1e-06\.\."):
         Hand(ARM, grip=Grip(stiffness=np.nan))
-    with pytest.raises(StationError, match="a hand's time_step must be a positive number; got 0"):
+    with pytest.raises(StationError, match="time_step of the hand must be a positive number of seconds; got 0"):
         Hand(ARM, time_step=0)
