@@ -134,7 +134,8 @@ class DvrkCommandReceiver(LeafSystem):
       must therefore pass every message to `Receive` instead.
     - `state_estimated` (2n): measured q, then v. `effort_measured` (n): applied motor efforts.
     - `position_control_effort` (n): present effort of the position controller in the arm's driver.
-    - `gravity_effort` (n): gravity compensation of the arm's driver. If connected, it is added to commanded efforts.
+    - `gravity_effort` (n): gravity compensation of the arm's driver. If connected, it is added to commanded efforts and
+      subtracted from `effort_measured`.
     - `control_mode` (1): mode in force, lcmt_dvrk_command.OFF, HOLD, POSITION or EFFORT.
     - `desired_state` (2n): target of the position controller. While efforts act, it is the measured pose at rest.
     - `effort` (n): motor efforts to apply, inside the effort limits. Zero in OFF. In EFFORT: output of the guard plus
