@@ -243,8 +243,8 @@ def test_friction_requires_holding_error(tmp_path, capsys):
     path = str(tmp_path / "model.yaml")
     IdentifiedModel.from_arm(ARM).save(path)
     assert main(["run", "--arm", "mtml", "--model", path, "--friction-ratio", "0.5"]) == 2
-    output = capsys.readouterr().err
-    assert "--friction-ratio needs a --model from identify of poses at rest" in output and output.count("\n") == 1
+    said = capsys.readouterr().err
+    assert "--friction-ratio needs a --model from identify of poses at rest" in said and said.count("\n") == 1
 
 
 def test_live_status_has_rate_and_round_trip():
