@@ -3,7 +3,7 @@
 A test file runs itself again inside a network namespace. The tests of that run are the actual ones:
 
     @outside
-    def test_in_a_network_of_its_own(request):
+    def test_runs_in_a_separate_network(request):
         run_inside(request)
 
     @inside

@@ -20,7 +20,7 @@ POSES = 3
 
 
 @outside
-def test_in_a_network_of_its_own(request):
+def test_runs_in_a_separate_network(request):
     run_inside(request)
 
 

@@ -25,7 +25,7 @@ FORGOTTEN = 0.6
 
 
 @outside
-def test_in_a_network_of_its_own(request):
+def test_runs_in_a_separate_network(request):
     run_inside(request)
 
 

@@ -39,7 +39,7 @@ LCM_TOOLS = Path(lcm.__file__).parent / "../bin"
 
 
 @outside
-def test_in_a_network_of_its_own(request):
+def test_runs_in_a_separate_network(request):
     run_inside(request)
 
 
@@ -92,7 +92,7 @@ def send(network, status, sequence, sender_id, **fields):
 
 
 def reset(name, observer):
-    """Clears a fault by HOLD, HOLD, HOLD with the request. Repeats this if one of them was late."""
+    """Clears a fault by HOLD, HOLD, and HOLD with the request. Repeats this if a command was late."""
     network = lcm.LCM()
 
     def is_cleared():
@@ -128,7 +128,7 @@ def test_command_and_status_round_trip(arm):
 @watchdog
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_arm_holds_after_controller_is_killed(name, tmp_path):
-    """Expiry of a real arm by the arm's clock and, with real-time scheduling, by the wall clock."""
+    """Tests the expiry by the arm's clock and, with real-time scheduling, by the wall clock."""
     (tmp_path / "driver.yaml").write_text("guard: {resume_automatically: true}\n")
     observer = Observer(name, OTHER_URL)
     arm = start_arm(name, "--lcm-url", OTHER_URL, "--driver", tmp_path / "driver.yaml")
@@ -162,7 +162,7 @@ def test_arm_holds_after_controller_is_killed(name, tmp_path):
 
 
 def stop(process, seconds):
-    """Stops a process for at least that long."""
+    """Stops a process for at least the given time."""
     process.send_signal(signal.SIGSTOP)
     stat = Path(f"/proc/{process.process.pid}/stat")
     wait_until(lambda: stat.read_text().rpartition(")")[2].split()[0] == "T", "stop", process)
@@ -179,7 +179,7 @@ def waits_for_an_operator(status):
 @pytest.mark.parametrize("seconds", [0.05, 0.2, 1.0])
 @pytest.mark.parametrize("stalled", ["arm", "controller"])
 def test_arm_holds_after_stall_until_operator_resumes(stalled, seconds):
-    """Stalls by signals, with the expiry of a real arm. The test of 20 ms stalls uses a simulated clock.
+    """Stalls processes by signals, with the default expiry. Stalls of 20 ms are tested with a simulated clock.
 
     A busy computer may stop one of them before the test does: that has the same end.
     """
@@ -522,7 +522,7 @@ def test_run_ignores_foreign_statuses_and_ends_on_silence(ends):
 
 
 @inside
-def test_of_two_controllers_the_first_stays_in_command(arm):
+def test_first_of_two_controllers_stays_in_control(arm):
     name, _, observer = arm
     first = start_controller(name)
     second = None
@@ -545,7 +545,7 @@ def test_of_two_controllers_the_first_stays_in_command(arm):
 @watchdog
 @inside
 def test_key_protects_from_flood_of_foreign_commands(tmp_path):
-    """Good commands of an unknown sender, as fast as a process can publish them.
+    """Floods the arm with valid commands of an unknown sender, as fast as a process can publish them.
 
     The rate is compared with that of a peer, a process with the same period and scheduling that reads no messages:
     where the machine stands still, both do. Without real-time scheduling a flood takes computing time from all

@@ -80,7 +80,7 @@ def test_the_status_echoes_the_last_accepted_command():
     assert command.session_id == status.session_id != 0
 
 
-def test_of_two_controllers_the_first_stays_in_command():
+def test_first_of_two_controllers_stays_in_control():
     lcm = DrakeLcm("memq://")
     arm, first, second = SimulatedArm(lcm), Controller(lcm), Controller(lcm)
     run(lcm, 300, arm, first)
@@ -213,7 +213,7 @@ def test_status_receiver_outputs_nan_without_valid_status():
     lcm = DrakeLcm("memq://")
     builder = DiagramBuilder()
     statuses = StatusFilter("MTML", 7)
-    serializer = TolerantSerializer(Status, read=lambda data: statuses.take(data, 0.0))
+    serializer = TolerantSerializer(Status, read=lambda data: statuses.accept(data, 0.0))
     subscriber = builder.AddSystem(LcmSubscriberSystem("DVRK_STATUS_MTML", serializer, lcm))
     receiver = builder.AddSystem(DvrkStatusReceiver(ARM))
     builder.Connect(subscriber.get_output_port(), receiver.get_input_port())
