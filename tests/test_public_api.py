@@ -116,11 +116,11 @@ def test_a_result_replaces_a_file_only_on_request(poses, tmp_path):
     arm, model, recording = poses
     result = dvrk.identify(recording, arm, method="paper")
     result.save(tmp_path / "model.yaml")
-    with pytest.raises(dvrk.DvrkDrakeError, match=r"model.yaml: exists already; .* overwrite=True"):
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"model.yaml: already exists\. .* overwrite=True"):
         result.save(tmp_path / "model.yaml")
     result.save(tmp_path / "model.yaml", overwrite=True)
     dvrk.export_model(model, tmp_path / "arm.urdf")
-    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.urdf: exists already"):
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.urdf: already exists"):
         dvrk.export_model(model, tmp_path / "arm.urdf")
     with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.xml: its format is not clear; state one of sdf, urdf"):
         dvrk.export_model(model, tmp_path / "arm.xml")
@@ -273,7 +273,7 @@ def test_verdicts_replace_no_other_file(exact, tmp_path):
     q = arm.sample_poses(40, np.random.default_rng(1))
     tau = dvrk.IdentifiedModel.from_arm(arm).holding_torque(q)
     validation = dvrk.validate(result.model, dvrk.Recording(q=q, tau=tau, source="others.csv"))
-    with pytest.raises(DvrkDrakeError, match="exists already"):
+    with pytest.raises(DvrkDrakeError, match="already exists"):
         validation.save(other)
     assert other.read_text() == "mine"
     validation.save(own)

@@ -142,7 +142,7 @@ class Arm:
             for i, gain in enumerate(getattr(gains, name)):
                 allowed = Range(float(lowest[i]), float(highest[i]), also=() if name == "kp" else (0.0,))
                 if fault := allowed.fault(f"gains.{name}[{i}]", float(gain)):
-                    return f"{fault} for the range and effort limit of {self.joint_names[i]}"
+                    return f"{fault} for the position range and effort limit of {self.joint_names[i]}"
         return ""
 
     def _faults(self) -> Iterator[str]:
@@ -157,11 +157,11 @@ class Arm:
             yield coupled_limit_fault(self, limit)
         for name, row in self.friction_coordinates.items():
             if not np.any(row):
-                yield f"friction_coordinates.{name} has no coefficient other than 0"
+                yield f"friction_coordinates.{name}: all coefficients are 0; allowed: at least one other value"
         yield number_fault(self)
         _checked_gravity(self.gravity)
         if len(self.coupled_limits) > 1 and not can_meet_coupled_limits(self):
-            yield "coupled_limits: no pose inside position_limits meets them all"
+            yield "coupled_limits: no pose within position_limits meets all coupled limits; widen the limits"
 
     @property
     def num_joints(self) -> int:
@@ -237,7 +237,10 @@ class Arm:
         while len(poses) < count:
             tries += 1
             if tries > 100 and len(poses) < tries:
-                raise ArmError(f"{self.name}: hardly any pose inside its position limits meets its coupled limits")
+                raise ArmError(
+                    f"{self.name}: almost no pose within the position limits meets the coupled limits. Check "
+                    "coupled_limits in the arm file, or reduce the margin."
+                )
             q = generator.uniform(lower[:n], upper[:n], (2 * count + 8, n))
             value = q @ A.T
             poses = np.vstack([poses, q[np.all((value >= lower) & (value <= upper), axis=1)]])
@@ -294,7 +297,7 @@ def load_arm(name: str | Path) -> Arm:
     """
     name = os.fspath(name)
     if "\0" in name:
-        raise ArmError(f"{name!r}: is not the name of a file")
+        raise ArmError(f"{name!r} is not a valid file name")
     if not name.endswith((".yaml", ".yml")):
         return _load_arm(name.lower())
     path = Path(os.path.realpath(local_path(name)))
@@ -314,9 +317,11 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
     if not path.is_absolute():
         if name not in known_arms():
             near = meant(name, known_arms())
-            raise ArmError(f'unknown arm "{name}"; {near}known arms: {", ".join(known_arms())}; or name a YAML file')
+            raise ArmError(
+                f'unknown arm "{name}"; {near}known arms: {", ".join(known_arms())}, or the path of a YAML file'
+            )
         path = _ARMS / f"{name}.yaml"
-    description = load_typed_yaml(ArmDescription, path, ArmError, "an arm's file")
+    description = load_typed_yaml(ArmDescription, path, ArmError, "an arm file")
     mechanism = _load_part(Mechanism, path, "mechanism", description.mechanism)
     instrument = Instrument()
     if description.instrument:
@@ -333,13 +338,13 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
 
 
 def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part:
-    what = f"an arm's {kind}"
+    what = f"{'an' if kind == 'instrument' else 'a'} {kind} file"
     if name.endswith((".yaml", ".yml")):
         if "\0" in name:
-            raise ArmError(f"{arm_path}: {kind} {name!r} is not the name of a file")
+            raise ArmError(f"{arm_path}: {kind} {name!r} is not a valid file name")
         path = Path(os.path.realpath(arm_path.parent / name))
         if not os.path.lexists(path):
-            raise ArmError(f"{arm_path}: {kind} {path}: no such file")
+            raise ArmError(f"{arm_path}: {kind} {path} does not exist")
         part = load_typed_yaml(schema, path, ArmError, what)
         if part.sdf and not part.sdf.startswith(PACKAGE_URL):
             part.sdf = str(path.parent / part.sdf)
@@ -358,17 +363,17 @@ def _build_arm(
 ) -> Arm:
     joints = [*mechanism.joints, *instrument.joints]
     if not joints or len({*joints}) < len(joints):
-        raise ArmError(f"{path}: the joints of its mechanism and instrument must be different names, at least one")
+        raise ArmError(f"{path}: the mechanism and instrument must have at least one joint, and no joint name twice")
     if not mechanism.sdf:
-        raise ArmError(f"{path}: its mechanism names no sdf")
+        raise ArmError(f"{path}: the mechanism file has no sdf")
     sdf = tuple(url for url in (mechanism.sdf, instrument.sdf) if url)
     mirrored = {url: tuple(links) for url, links in description.mirrored_links.items()}
     facts = read_sdf_facts(compose_sdf(sdf, mirrored))
     position_limits = {**instrument.position_limits, **description.position_limits}
     if set(joints) != set(position_limits):
-        raise ArmError(f"{path}: position_limits must name exactly {', '.join(mechanism.joints)}")
+        raise ArmError(f"{path}: position_limits must have one entry for each of {', '.join(mechanism.joints)}")
     if missing := set(joints) - set(facts.joint_names):
-        raise ArmError(f"{path}: its SDF has no joint {', '.join(sorted(missing))}")
+        raise ArmError(f"{path}: the SDF has no joint {', '.join(sorted(missing))}")
     limits = np.array([_lower_and_upper(path, f"position_limits.{j}", position_limits[j]) for j in joints])
     gains = Gains(*(getattr(mechanism.gains, k) + getattr(instrument.gains, k) for k in ("kp", "kd", "ki")))
     G = np.zeros((len(facts.joint_names), len(joints)))
@@ -376,7 +381,7 @@ def _build_arm(
     for row, name in enumerate(facts.joint_names):
         leader, multiplier, offset = facts.mimics.get(name, (name, 1.0, 0.0))
         if leader not in joints:
-            raise ArmError(f"{path}: joint {name} of its SDF is neither independent nor a mimic of one that is")
+            raise ArmError(f"{path}: joint {name} of the SDF must be in the list joints, or a mimic of a joint in it")
         G[row, joints.index(leader)], c[row] = multiplier, offset
     return Arm(
         name=description.name,
@@ -412,7 +417,9 @@ def _identification_settings(path: Path, mechanism: Mechanism, instrument: Instr
         for part in (mechanism, instrument):
             values = getattr(part.motion, which)
             if values and len(values) != len(part.joints):
-                raise ArmError(f"{path}: motion.{which} has {len(values)} numbers for {len(part.joints)} joints")
+                raise ArmError(
+                    f"{path}: motion.{which} has {len(values)} numbers; allowed: {len(part.joints)}, one per joint"
+                )
             both[which] += values or [default] * len(part.joints)
     known = {**mechanism.motion.known_effects, **instrument.motion.known_effects}
     return IdentificationSettings(
@@ -452,13 +459,15 @@ def _checked_gravity(gravity: ArrayLike) -> NDArray[np.float64]:
     vector = np.asarray(gravity, float)
     if vector.shape != (3,) or not np.linalg.norm(vector) <= MAX_GRAVITY:
         numbers = ", ".join(f"{x:g}" for x in vector.ravel())
-        raise ArmError(f"gravity ({numbers}) must be three numbers of a size up to {MAX_GRAVITY:g} m/s^2; on Earth 9.8")
+        raise ArmError(
+            f"gravity ({numbers}) must be a vector of three numbers with a length up to {MAX_GRAVITY:g} m/s^2"
+        )
     return vector
 
 
 def _effort_limits(path: Path, joints: list[str], facts: SdfFacts) -> NDArray[np.float64]:
     if missing := [joint for joint in joints if joint not in facts.effort_limits]:
-        raise ArmError(f"{path}: joint {missing[0]} of its SDF needs a positive <axis><limit><effort> [N m, N]")
+        raise ArmError(f"{path}: joint {missing[0]} of the SDF needs a positive <axis><limit><effort> [N m, N]")
     return np.array([facts.effort_limits[joint] for joint in joints])
 
 
@@ -478,7 +487,7 @@ def _transmission(path: Path, joints: list[str], mechanism: Mechanism, instrumen
 
 def _index(path: Path, key: str, joint: str, joints: list[str]) -> int:
     if joint not in joints:
-        raise ArmError(f"{path}: {key} names {joint}; allowed: {', '.join(joints)}")
+        raise ArmError(f'{path}: {key}: unknown joint "{joint}"; allowed: {", ".join(joints)}')
     return joints.index(joint)
 
 
@@ -487,11 +496,11 @@ def _row(path: Path, key: str, terms: dict[str, float], joints: list[str]) -> ND
     for joint, coefficient in terms.items():
         row[_index(path, key, joint, joints)] = coefficient
     if not np.any(row):
-        raise ArmError(f"{path}: {key} has no coefficient other than 0; allowed: one at least")
+        raise ArmError(f"{path}: {key}: all coefficients are 0; allowed: at least one other value")
     return row
 
 
 def _inverted(path: Path, key: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     if not np.linalg.cond(matrix) < 1e9:
-        raise ArmError(f"{path}: {key}: its rows depend on each other, so that positions do not follow from it")
+        raise ArmError(f"{path}: {key}: the matrix is singular, because its rows are linearly dependent")
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)

@@ -182,10 +182,12 @@ def load_gains(path: str | Path) -> Gains:
     Raises:
         ControllerError: The file does not exist, is not a file of gains, or has a gain outside the range of `Gains`.
     """
-    gains = load_typed_yaml(Gains, path, ControllerError, "a file of gains")
+    gains = load_typed_yaml(Gains, path, ControllerError, "a gains file")
     for name, values in dataclasses.asdict(gains).items():
         if not values:
-            raise ControllerError(f"{path}: {name} is missing; a file of gains has kp, kd and ki, one number a joint")
+            raise ControllerError(
+                f"{path}: {name} is missing; a gains file has kp, kd and ki with one number per joint"
+            )
     return gains
 
 
@@ -196,5 +198,5 @@ def save_gains(gains: Gains, path: str | Path, remark: str) -> None:
         DvrkDrakeError: The file cannot be written.
     """
     with atomic_write(path) as stream:
-        stream.write(f"# {remark}\n# N m/rad, N m s/rad, N m/(rad s); N and m on a joint that slides.\n")
+        stream.write(f"# {remark}\n# N m/rad, N m s/rad, N m/(rad s); N and m for a prismatic joint.\n")
         stream.write(yaml_dump(dataclasses.asdict(gains)))

@@ -170,20 +170,22 @@ class ArmEffects:
             tables |= {f"effort.{key}": value for key, value in vars(self.effort).items()}
         for table, values in tables.items():
             if unknown := sorted(set(values) - set(joint_names)):
-                raise ArmError(f"{table}: unknown actuator {unknown[0]}; actuators: {', '.join(joint_names)}")
+                raise ArmError(f"{table}: unknown actuator {unknown[0]}; allowed: {', '.join(joint_names)}")
         for effect in self.friction:
-            where = f"friction: {effect.coordinate} {effect.kind}"
+            where = f"friction of {effect.coordinate}"
             if effect.kind not in FRICTION_KINDS:
-                raise ArmError(f'friction: kind "{effect.kind}"; allowed: {", ".join(FRICTION_KINDS)}')
+                raise ArmError(f'{where}: kind is "{effect.kind}"; allowed: {", ".join(FRICTION_KINDS)}')
             if effect.coefficient < 0 and effect.kind != "presliding forward":
-                raise ArmError(f"{where} has coefficient {effect.coefficient:g}; it must not be negative")
+                raise ArmError(f"{where}: coefficient of {effect.kind} is {effect.coefficient:g}; allowed: 0 or more")
             if effect.kind != "viscous" and effect.scale == 0:
-                raise ArmError(f"{where} has scale 0; it must be positive")
+                raise ArmError(f"{where}: scale of {effect.kind} is 0; allowed: more than 0")
             if effect.fall_speed and effect.kind != "presliding":
-                raise ArmError(f"{where} has fall_speed {effect.fall_speed:g}; allowed: 0, others only of presliding")
-        for law in [*self.cables, *self.springs]:
-            if law.kind not in POSITION_KINDS:
-                raise ArmError(f'cables, springs: kind "{law.kind}"; allowed: {", ".join(POSITION_KINDS)}')
+                raise ArmError(f"{where}: fall_speed of {effect.kind} is {effect.fall_speed:g}; allowed: 0")
+        for group, effects in (("cables", self.cables), ("springs", self.springs)):
+            for effect in effects:
+                if effect.kind not in POSITION_KINDS:
+                    where = f"{group} of {effect.coordinate}"
+                    raise ArmError(f'{where}: kind is "{effect.kind}"; allowed: {", ".join(POSITION_KINDS)}')
 
 
 #: Kinds that `friction` accepts: dissipative effects that a solver can apply at the end of a step.

@@ -45,7 +45,7 @@ class MessageKey:
             KeyFileError: The key is too short or too long.
         """
         if not _MIN_LENGTH <= len(key) <= _MAX_LENGTH:
-            raise KeyFileError(f"a key has {_MIN_LENGTH} to {_MAX_LENGTH} bytes; this one has {len(key)}")
+            raise KeyFileError(f"the key has {len(key)} bytes; allowed: {_MIN_LENGTH} to {_MAX_LENGTH}")
         self._hash = hashlib.blake2b(key=key, digest_size=MAC_SIZE)
 
     @classmethod
@@ -58,15 +58,17 @@ class MessageKey:
         with open_input(path, KeyFileError) as file:
             mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
             if mode & (stat.S_IRWXG | stat.S_IRWXO):
-                raise KeyFileError(f"{path}: other users may access this key (mode {mode:04o}); run: chmod 600 {path}")
+                raise KeyFileError(
+                    f"{path}: other users have access to this key (mode {mode:04o}). Run: chmod 600 {path}"
+                )
             key = file.read(_MAX_LENGTH + 1) or b""
         try:
             return cls(key)
         except KeyFileError as error:
-            more = "more" if len(key) > _MAX_LENGTH else str(len(key))
+            size = f"more than {_MAX_LENGTH}" if len(key) > _MAX_LENGTH else str(len(key))
             raise KeyFileError(
-                f"{path}: not a key of {_MIN_LENGTH} to {_MAX_LENGTH} bytes, it has {more}; "
-                "make one: dvrk-drake key --output FILE"
+                f"{path}: the key has {size} bytes; allowed: {_MIN_LENGTH} to {_MAX_LENGTH}. "
+                "Create a key with: dvrk-drake key --output FILE"
             ) from error
 
     def sign(self, data: bytes) -> bytes:
@@ -94,7 +96,7 @@ def create_key_file(path: str | Path) -> None:
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except FileExistsError as error:
-        raise KeyFileError(f"{path}: exists already, and a key is not overwritten; name another file") from error
+        raise KeyFileError(f"{path}: already exists, and a key is never overwritten. Choose another file.") from error
     except (OSError, ValueError) as error:
         raise KeyFileError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
     with open(descriptor, "wb") as file:
@@ -117,27 +119,27 @@ _STATE_NAMES = {
 
 _REFUSALS = {
     lcmt_dvrk_status.REFUSAL_NONE: "none",
-    lcmt_dvrk_status.REFUSAL_UNREADABLE: "unreadable",
-    lcmt_dvrk_status.REFUSAL_WRONG_ARM: "meant for another arm",
-    lcmt_dvrk_status.REFUSAL_WRONG_SIZE: "of another number of joints",
-    lcmt_dvrk_status.REFUSAL_NOT_FINITE: "not finite",
-    lcmt_dvrk_status.REFUSAL_BAD_MODE: "in a mode that is not accepted now",
-    lcmt_dvrk_status.REFUSAL_NO_SENDER: "without a sender_id",
-    lcmt_dvrk_status.REFUSAL_WRONG_SESSION: "meant for the arm before it was restarted",
-    lcmt_dvrk_status.REFUSAL_STALE: "too late: the measurement is too old",
-    lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER: "sent twice or out of order",
-    lcmt_dvrk_status.REFUSAL_CLOCK_JUMP: "after a jump of the sender's clock",
-    lcmt_dvrk_status.REFUSAL_FAULT: "in a fault",
-    lcmt_dvrk_status.REFUSAL_BAD_RESET: "a reset that is no hold",
-    lcmt_dvrk_status.REFUSAL_START_FAR: "starting too far from the present efforts or pose",
-    lcmt_dvrk_status.REFUSAL_START_OUTSIDE: "starting while the arm is beyond a position limit",
-    lcmt_dvrk_status.REFUSAL_OTHER_SENDER: "from a second sender",
-    lcmt_dvrk_status.REFUSAL_SUDDEN_OFF: "off without a hold before",
-    lcmt_dvrk_status.REFUSAL_RESUME: "before an operator resumed",
-    lcmt_dvrk_status.REFUSAL_START_GRAVITY: "starting while the measured effort is not the gravity effort",
+    lcmt_dvrk_status.REFUSAL_UNREADABLE: "unreadable message",
+    lcmt_dvrk_status.REFUSAL_WRONG_ARM: "command for another arm",
+    lcmt_dvrk_status.REFUSAL_WRONG_SIZE: "wrong number of joints",
+    lcmt_dvrk_status.REFUSAL_NOT_FINITE: "numbers that are not finite",
+    lcmt_dvrk_status.REFUSAL_BAD_MODE: "mode not accepted in the present state",
+    lcmt_dvrk_status.REFUSAL_NO_SENDER: "no sender_id",
+    lcmt_dvrk_status.REFUSAL_WRONG_SESSION: "session from before a restart of the arm",
+    lcmt_dvrk_status.REFUSAL_STALE: "answer to a measurement that is too old",
+    lcmt_dvrk_status.REFUSAL_OUT_OF_ORDER: "command sent twice or out of order",
+    lcmt_dvrk_status.REFUSAL_CLOCK_JUMP: "jump of the sender's clock",
+    lcmt_dvrk_status.REFUSAL_FAULT: "guard in a fault",
+    lcmt_dvrk_status.REFUSAL_BAD_RESET: "reset of a fault in a mode other than HOLD",
+    lcmt_dvrk_status.REFUSAL_START_FAR: "start too far from the present efforts or pose",
+    lcmt_dvrk_status.REFUSAL_START_OUTSIDE: "start while the arm is beyond a position limit",
+    lcmt_dvrk_status.REFUSAL_OTHER_SENDER: "command of a second sender",
+    lcmt_dvrk_status.REFUSAL_SUDDEN_OFF: "OFF without HOLD before",
+    lcmt_dvrk_status.REFUSAL_RESUME: "command before the operator has resumed",
+    lcmt_dvrk_status.REFUSAL_START_GRAVITY: "start while the measured effort differs from the gravity effort",
     lcmt_dvrk_status.REFUSAL_NOT_AUTHENTIC: "not signed with the arm's key (--key)",
-    lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP: "after a jump of the sequence",
-    lcmt_dvrk_status.REFUSAL_FLOOD: "too many at once",
+    lcmt_dvrk_status.REFUSAL_SEQUENCE_JUMP: "jump of the sequence number",
+    lcmt_dvrk_status.REFUSAL_FLOOD: "too many messages at once",
 }
 
 

@@ -47,10 +47,10 @@ def add_arm(
             graph needs less time per step.
 
     Raises:
-        ArmError: The closure is unknown, or Drake refuses the arm's SDF.
+        ArmError: The closure is unknown, or Drake cannot load the SDF.
     """
     if closure not in get_args(Closure):
-        raise ArmError(f'unknown closure "{closure}"; known: {", ".join(get_args(Closure))}')
+        raise ArmError(f'unknown closure "{closure}"; allowed: {", ".join(get_args(Closure))}')
     # Compared by name, because newer versions of drake have no tamsi.
     if plant.time_step() > 0 and plant.get_discrete_contact_approximation().name == "kTamsi":
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
@@ -73,7 +73,7 @@ def add_arm(
         for name, lower, upper in zip(arm.joint_names, arm.position_lower, arm.position_upper, strict=True):
             plant.GetJointByName(name, instance).set_position_limits([lower], [upper])
     except RuntimeError as error:
-        raise ArmError(f"{', '.join(arm.sdf)}: Drake refuses this model: {error}") from error
+        raise ArmError(f"{', '.join(arm.sdf)}: Drake cannot load this model: {error}") from error
     return instance
 
 
@@ -81,8 +81,8 @@ def check_plant(arm: Arm) -> None:
     """Checks that a plant of the arm can be created with each method of loop closure.
 
     Raises:
-        ArmError: Drake refuses the SDF, no joint holds a link, or the SDF lacks a frame of a loop or one of the frames
-            dh_0, dh_1, ...
+        ArmError: Drake cannot load the SDF, a link has no joint, or a frame of a loop or one of the frames dh_0, dh_1,
+            ... is missing.
     """
     for closure in get_args(Closure):
         try:
@@ -90,18 +90,18 @@ def check_plant(arm: Arm) -> None:
             _check_links_and_frames(plant, arm)
             plant.CalcMassMatrix(plant.CreateDefaultContext())
         except RuntimeError as error:
-            raise ArmError(f"{', '.join(arm.sdf)}: Drake refuses this model: {error}") from error
+            raise ArmError(f"{', '.join(arm.sdf)}: Drake cannot load this model: {error}") from error
 
 
 def _check_links_and_frames(plant: MultibodyPlant, arm: Arm) -> None:
     where = ", ".join(arm.sdf)
     if floating := [plant.get_body(index).name() for index in plant.GetFloatingBaseBodies()]:
-        raise ArmError(f"{where}: no joint holds {', '.join(sorted(floating))}")
+        raise ArmError(f"{where}: no joint connects {', '.join(sorted(floating))} to the base")
     instance = plant.GetBodyByName("base_link").model_instance()
     names = [plant.get_frame(index).name() for index in plant.GetFrameIndices(instance)]
     numbers = {int(match[1]) for name in names if (match := re.fullmatch(r"dh_(\d+)", name))}
     if missing := set(range(max(numbers, default=0))) - numbers:
-        raise ArmError(f"{where}: has a frame dh_{max(numbers)}, but no dh_{min(missing)}")
+        raise ArmError(f"{where}: has a frame dh_{max(numbers)}, but no frame dh_{min(missing)}")
 
 
 def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic") -> MultibodyPlant:

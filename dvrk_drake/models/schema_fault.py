@@ -18,8 +18,8 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-_ONE = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
-_MANY = {bool: "true or false", int: "whole numbers", float: "numbers", str: "texts"}
+_ONE = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
+_MANY = {bool: "true or false", int: "integers", float: "numbers", str: "strings"}
 #: Metadata key of a field: the `Range` of all numbers in it.
 RANGE = "range"
 #: Metadata key of a field: its name in files of earlier versions.
@@ -113,7 +113,9 @@ def with_current_keys(schema: Any, content: Any, where: str) -> Any:
     for key, value in content.items():
         name = names.get(key, key)
         if name != key and name not in content:
-            warnings.warn(f'{where}: key "{key}" is now "{name}"', FutureWarning, stacklevel=2)
+            warnings.warn(
+                f'{where}: key "{key}" was renamed to "{name}"', FutureWarning, stacklevel=2
+            )
         else:
             name = key
         current[name] = with_current_keys(hints[name], value, where) if name in hints else value
@@ -160,7 +162,7 @@ def schema_fault(schema: type, content: Any, what: str) -> str:
         what: Kind of file that is expected, e.g. "a file of gains".
     """
     if not isinstance(content, dict):
-        given = "is empty" if content is None else f"must be keys and values, not {_quoted(content)}"
+        given = "is empty" if content is None else f"must have keys and values, not {_quoted(content)}"
         return f"{given}; allowed in {what}: {_keys(schema)}"
     return next(_faults(schema, content, "", what, None), "")
 
@@ -266,9 +268,9 @@ def _described(schema: Any, number: dict[type, str]) -> str:
     if get_origin(schema) is list:
         return f"{'a list' if one else 'lists'} of {_described(arguments[0], _MANY)}"
     if get_origin(schema) is dict:
-        return f"{'a table' if one else 'tables'} of names with {_described(arguments[1], _MANY)}"
+        return f"{'a mapping' if one else 'mappings'} from names to {_described(arguments[1], _MANY)}"
     if dataclasses.is_dataclass(schema):
-        return f"{'a table' if one else 'tables'} with the keys {_keys(schema)}"
+        return f"{'a mapping' if one else 'mappings'} with the keys {_keys(schema)}"
     return number[schema]
 
 

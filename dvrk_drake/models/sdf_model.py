@@ -130,12 +130,14 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
             raise ArmError(f"joint {name} of the SDF has type {kind!r}; allowed: revolute, prismatic, fixed")
         if kind == "fixed":
             if mimic is not None:
-                raise ArmError(f"joint {name} of the SDF is fixed, so it cannot follow another joint")
+                raise ArmError(f"joint {name} of the SDF is fixed and cannot have <drake:mimic>")
             continue
         if joint.find(".//friction") is not None:
-            raise ArmError(f"joint {name} of the SDF has <friction>, which Drake drops silently; model it elsewhere")
+            raise ArmError(
+                f"joint {name} of the SDF has <friction>, which Drake ignores; use effects.friction of the YAML file"
+            )
         if name in names:
-            raise ArmError(f"the SDF has two joints called {name}")
+            raise ArmError(f"the SDF has two joints named {name}")
         names.append(name)
         if joint.get("type") == "prismatic":
             prismatic.add(name)
@@ -146,7 +148,7 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
                 float(mimic.get("offset", "0")),
             )
             if mimics[name][1] == 0:
-                raise ArmError(f"joint {name} of the SDF follows another with the multiplier 0; make it fixed instead")
+                raise ArmError(f"joint {name} of the SDF has a mimic multiplier of 0; make the joint fixed instead")
         effort = joint.findtext("axis/limit/effort")
         if effort is not None:
             efforts[name] = float(effort)
@@ -157,9 +159,9 @@ def _read(path: Path) -> ElementTree.Element:
     try:
         root = _parse(read_input(path, ArmError, MAX_TEXT))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise ArmError(f"{path}: not a readable SDF: {error}") from error
+        raise ArmError(f"{path}: is not a valid SDF: {error}") from error
     if root.find("model") is None or [e.tag for e in root.iter() if e.tag in ("model", "include")] != ["model"]:
-        raise ArmError(f"{path}: must hold one <model> in <sdf>, with no <model> or <include> in it")
+        raise ArmError(f"{path}: <sdf> must contain exactly one <model>, without a nested <model> or <include>")
     for link in root.iterfind("model/link"):
         # Required by Drake's parser, which uses 1 kg for a link without <inertial>.
         for inertial in link.findall("inertial"):
@@ -185,7 +187,7 @@ def _parse(content: bytes) -> ElementTree.Element:
             raise ValueError(f"elements are nested deeper than {_MAX_DEPTH} levels")
     parser.close()
     if root is None:
-        raise ValueError("it has no element")
+        raise ValueError("the file has no element")
     return root
 
 
@@ -247,7 +249,7 @@ def mirror_links(root: ElementTree.Element, links: Sequence[str], source: str) -
     by_name = {link.get("name", ""): link for link in root.iterfind("model/link")}
     for name in links:
         if name not in by_name:
-            raise ArmError(f'{source}: has no link "{name}" to mirror; its links: {", ".join(by_name)}')
+            raise ArmError(f'{source}: has no link "{name}" of mirrored_links; allowed: {", ".join(by_name)}')
         link = by_name[name]
         for pose in link.iterfind("*/pose"):
             _mirror_pose(f"{source}: link {name}", pose)
@@ -266,7 +268,7 @@ def mirror_links(root: ElementTree.Element, links: Sequence[str], source: str) -
 def _mirror_pose(where: str, pose: ElementTree.Element) -> None:
     numbers = (pose.text or "").split()
     if len(numbers) != 6 or pose.get("relative_to") or pose.get("rotation_format", "euler_rpy") != "euler_rpy":
-        raise ArmError(f"{where}: to be mirrored, a <pose> must be x y z roll pitch yaw in the link's frame")
+        raise ArmError(f"{where}: <pose> of a mirrored link must be x y z roll pitch yaw in the link frame")
     x, y, z, roll, pitch, yaw = map(float, numbers)
     # R = Rz(yaw) Ry(pitch) Rx(roll), and M Rx M = Rx, M Ry M = Ry', M Rz M = Rz'.
     pose.text = " ".join(f"{value + 0.0:.10g}" for value in (-x, y, z, roll, -pitch, -yaw))

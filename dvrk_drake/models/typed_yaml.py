@@ -28,7 +28,7 @@ class _Loader(_FastLoader):
         for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if isinstance(key, yaml.ScalarNode) and key.value != "<<":
                 if key.value in keys:
-                    what = f'key "{key.value}" is there twice'
+                    what = f'duplicate key "{key.value}"'
                     raise yaml.constructor.ConstructorError(None, None, what, key.start_mark)
                 keys.add(key.value)
         return super().construct_mapping(node, deep)
@@ -79,7 +79,7 @@ def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
     """
     try:
         if excess := _excess(text):
-            raise error(f"{where}: not YAML that can be read: {excess}")
+            raise error(f"{where}: is not valid YAML: {excess}")
         content = yaml.load(text, Loader=_Loader)
     except DvrkDrakeError:
         raise
@@ -88,7 +88,7 @@ def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
         mark, problem = getattr(cause, "problem_mark", None), getattr(cause, "problem", None)
         # At the end of a text libyaml reports one line too many.
         line = "" if mark is None else f"line {min(mark.line, len(text.splitlines()) - 1) + 1}: "
-        raise error(f"{where}: not YAML: {line}{problem or cause}") from cause
+        raise error(f"{where}: is not valid YAML: {line}{problem or cause}") from cause
     if isinstance(content, dict):
         return {key: value for key, value in content.items() if not str(key).startswith("_")}
     return content

@@ -133,21 +133,24 @@ def own_arm(folder, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("effort>", "ef>"), r"joint \S+ of its SDF needs a positive <axis><limit><effort>"),
+        (("effort>", "ef>"), r"joint \S+ of the SDF needs a positive <axis><limit><effort>"),
         (("<mass>", "<mass>nan "), r"link \S+: <mass> is 'nan .*'; allowed: a finite number"),
         (("<ixx>", "<ixx>inf"), r"link \S+: <ixx> is 'inf.*'; allowed: a finite number"),
         (('multiplier="', 'multiplier="x'), r"joint \S+: multiplier is 'x.*'; allowed: a finite number"),
-        (("</model>", "<model name='a'/></model>"), r"own\.sdf: must hold one <model> in <sdf>, with no <model> or"),
+        (("</model>", "<model name='a'/></model>"), r"own\.sdf: <sdf> must contain exactly one <model>"),
         (('type="revolute"', 'type="ball"'), r"own\.yaml: joint \S+ of the SDF has type 'ball'; allowed: revolute"),
         (("<mass>", "<mass>-"), r"link \S+: <mass> is -\S+; allowed: 1e-06\.\.200 kg"),
         (("<inertial>.*?</inertial>", ""), r"link \S+ of the SDF needs a positive <inertial><mass>"),
-        (('multiplier="[^"]*"', 'multiplier="0"'), r"joint \S+ of the SDF follows another with the multiplier 0"),
-        (('"dh_2"', '"dh_x"'), r"own\.sdf: has a frame dh_7, but no dh_2"),
+        (('multiplier="[^"]*"', 'multiplier="0"'), r"joint \S+ of the SDF has a mimic multiplier of 0"),
+        (('"dh_2"', '"dh_x"'), r"own\.sdf: has a frame dh_7, but no frame dh_2"),
         (
             (r'<joint name="\w+" type="revolute">(?:(?!</joint>).)*mimic.*?</joint>', ""),
-            r"own\.sdf: no joint holds \w+",
+            r"own\.sdf: no joint connects \w+",
         ),
-        (("<child>upper_arm_link", "<child>no_link"), r"own\.yaml: .*own\.sdf: Drake refuses this model: .*no_link"),
+        (
+            ("<child>upper_arm_link", "<child>no_link"),
+            r"own\.yaml: .*own\.sdf: Drake cannot load this model: .*no_link",
+        ),
         (("base_link", "bottom_link"), r"own\.yaml: the SDF has no link base_link"),
     ],
 )

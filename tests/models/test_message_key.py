@@ -59,12 +59,16 @@ def test_a_key_is_the_content_of_its_file(tmp_path, size):
 @pytest.mark.parametrize(
     ("content", "mode", "message"),
     [
-        (KEY, 0o640, r"a\.key: other users may access this key \(mode 0640\); run: chmod 600 .*a\.key"),
-        (KEY, 0o604, r"a\.key: other users may access this key \(mode 0604\)"),
-        (KEY, 0o602, r"a\.key: other users may access this key \(mode 0602\)"),
-        (KEY[:15], 0o600, r"a\.key: not a key of 16 to 64 bytes, it has 15; make one: dvrk-drake key --output FILE"),
-        (b"", 0o600, r"a\.key: not a key of 16 to 64 bytes, it has 0"),
-        (bytes(65), 0o600, r"a\.key: not a key of 16 to 64 bytes, it has more"),
+        (KEY, 0o640, r"a\.key: other users have access to this key \(mode 0640\)\. Run: chmod 600 .*a\.key"),
+        (KEY, 0o604, r"a\.key: other users have access to this key \(mode 0604\)"),
+        (KEY, 0o602, r"a\.key: other users have access to this key \(mode 0602\)"),
+        (
+            KEY[:15],
+            0o600,
+            r"a\.key: the key has 15 bytes; allowed: 16 to 64\. Create a key with: dvrk-drake key --output FILE",
+        ),
+        (b"", 0o600, r"a\.key: the key has 0 bytes"),
+        (bytes(65), 0o600, r"a\.key: the key has more than 64 bytes"),
         (None, 0o600, r"a\.key: no such file"),
     ],
 )
@@ -102,7 +106,7 @@ def test_command_creates_a_key_and_does_not_overwrite_it(tmp_path, capsys):
     assert len(content) == 32 and content != second.read_bytes()
     MessageKey.load(first)
     assert main(["key", "--output", str(first)]) == 2
-    assert "a.key: exists already, and a key is not overwritten; name another file" in capsys.readouterr().err
+    assert "a.key: already exists, and a key is never overwritten" in capsys.readouterr().err
     assert first.read_bytes() == content
     with pytest.raises(KeyFileError, match="cannot be written: No such file or directory"):
         create_key_file(tmp_path / "no" / "a.key")

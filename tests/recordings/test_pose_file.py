@@ -27,7 +27,7 @@ GOOD = "0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5"
     ("text", "message"),
     [
         ("", "is empty; allowed in a file of poses: format, arm, poses"),
-        ("just words", 'must be keys and values, not "just words"'),
+        ("just words", 'must have keys and values, not "just words"'),
         ("arm: MTML\nposes: []", "has no poses"),
         (f"arm: MTMR\nposes:\n- [{GOOD}]", 'arm is "MTMR", not MTML'),
         (f"poses:\n- [{GOOD}]", 'arm is "", not MTML'),
@@ -35,7 +35,7 @@ GOOD = "0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5"
         ("arm: MTML\nposes: 3", "poses is 3; allowed: a list of lists of numbers"),
         ("arm: MTML\nposes:\n- [a, b]", r'poses\[0\]\[0\] is "a"; allowed: a number'),
         (f"arm: MTML\nspeed: 3\nposes:\n- [{GOOD}]", 'key "speed" is unknown; allowed in a file of poses'),
-        ("arm: MTML\nposes: [[", "p.yaml: not YAML: line 2: "),
+        ("arm: MTML\nposes: [[", "p.yaml: is not valid YAML: line 2: "),
         (f"arm: MTML\nposes:\n- [{GOOD}]\n- [0.1, 0.2]", "pose 2 has 2 numbers; MTML has 7 joints: outer_yaw"),
         (f"arm: MTML\nposes:\n- [{GOOD[:-3]}.nan]", r"poses\[0\]\[6\] is nan; allowed: a finite number"),
         (f"arm: MTML\nposes:\n- [{GOOD[:-3]}.inf]", r"poses\[0\]\[6\] is inf; allowed: a finite number"),

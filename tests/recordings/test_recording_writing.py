@@ -58,7 +58,7 @@ def test_places_that_cannot_be_written(tmp_path):
     for path, match in (
         (tmp_path / "no" / "out.csv", r"no/out\.csv: cannot be written: No such file or directory"),
         (tmp_path, "is not a regular file"),
-        (os.devnull, "/dev/null: is not a regular file, so it cannot be replaced; name a file"),
+        (os.devnull, "/dev/null: is not a regular file and cannot be replaced"),
     ):
         with pytest.raises(DvrkDrakeError, match=match), atomic_write(path) as stream:
             stream.write("x")
@@ -84,7 +84,7 @@ def test_a_read_only_file_is_not_replaced():
         path.chmod(0o444)
 
         def check():
-            with pytest.raises(DvrkDrakeError, match="cannot be written: it is read-only"), atomic_write(path):
+            with pytest.raises(DvrkDrakeError, match="cannot be written: the file is read-only"), atomic_write(path):
                 pass
 
         run_unprivileged(check)

@@ -250,7 +250,7 @@ def test_model_file_round_trip_and_rejections(arm, tmp_path):
             r"joints\[1\]\.feedforward_scale is 2; allowed: 0\.\.1",
         ),
         (text.replace("arm: ", "arms: ", 1), 'key "arms" is unknown; did you mean "arm"'),
-        ("]", "not YAML: line 1"),
+        ("]", "is not valid YAML: line 1"),
     ):
         assert bad != text
         (tmp_path / "bad.yaml").write_text(bad)
@@ -277,7 +277,7 @@ def test_moved_model_files_and_version_2_files_are_loaded(tmp_path):
         old = new.replace("model 4", "model 2").replace("package://dvrk_drake/arms/mtmr.yaml", name)
         old = old.replace("coefficient:", "value:").replace("feedforward_scale:", "trust:")  # an earlier key
         (tmp_path / "old.yaml").write_text(old.replace("_included:", "_undoubted:"))
-        with pytest.warns(FutureWarning, match='key "trust" is now "feedforward_scale"'):  # an earlier key
+        with pytest.warns(FutureWarning, match='key "trust" was renamed to "feedforward_scale"'):  # an earlier key
             read = IdentifiedModel.load(tmp_path / "old.yaml")
         assert (read.arm, read.effects) == (load_arm(name), effects)
     with pytest.raises(ModelError, match=r"new\.yaml: is of MTMR, not of PSM"):

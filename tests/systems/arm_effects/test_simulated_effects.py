@@ -74,7 +74,7 @@ def test_unknown_part_is_an_error(tmp_path):
         ),
         ("measurement: 1", "measurement: -1", "effects.delay.measurement is -1; allowed: 0..100 time steps"),
         ("presliding, scale: 0.015", "stiction, scale: 0.015", 'effects.friction: kind "stiction"; allowed'),
-        ("scale: 0.015", "scale: 0.0", "has scale 0"),
+        ("scale: 0.015", "scale: 0.0", "scale of presliding is 0"),
         ("coefficient: 0.0011", "coefficient: -0.0011", "has coefficient -0.0011"),
     ):
         assert old in text
