@@ -231,7 +231,7 @@ def test_a_number_that_is_none_is_refused_with_its_row(exact, name):
     arm, recording = exact
     values = getattr(recording, name).copy()
     values[3, 1] = np.nan
-    with pytest.raises(RecordingError, match=rf"poses.csv: row 4: {name}2 = nan is no reading of an arm"):
+    with pytest.raises(RecordingError, match=rf"poses.csv, row 4: {name}2 = nan is not plausible"):
         dvrk.identify(dataclasses.replace(recording, **{name: values}), arm)
 
 

@@ -77,13 +77,13 @@ def convert(
     if coordinates is not None and coordinates not in get_args(Coordinates):
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
     if os.path.exists(output) and os.path.exists(path) and os.path.samefile(path, output):
-        raise RecordingError(f"{output}: is the recording itself; name another output")
+        raise RecordingError(f"{output}: is the input recording. Choose another output.")
     chosen = format or detect_format(path)
     defined = DEFINED_COORDINATES.get(chosen)
     if defined is not None and coordinates not in (None, defined):
-        raise RecordingError(f"{path}: {chosen} is in {defined} coordinates, not {coordinates}")
+        raise RecordingError(f"{path}: a {chosen} file is in {defined} coordinates, not in {coordinates} coordinates")
     if variable is not None and chosen in ("csv", "wpi-csv"):
-        raise RecordingError(f"{path}: --variable does not apply to {chosen}, which has no variables")
+        raise RecordingError(f"{path}: --variable does not apply to {chosen} files")
     if chosen == "lcm-log":
         if rate is not None or variable is not None or skip_invalid:
             raise RecordingError(f"{path}: --rate, --variable and --skip-invalid do not apply to an LCM log")
@@ -92,9 +92,9 @@ def convert(
         recording = read_recording(path, arm)
     elif chosen == "team-mat":
         if rate is not None:
-            raise RecordingError(f"{path}: --rate does not apply to team-mat, whose poses have no time")
+            raise RecordingError(f"{path}: --rate does not apply to team-mat files, which have no times")
         if arm is not None:
-            raise RecordingError(f"{path}: --arm does not apply to team-mat, which is in joint coordinates")
+            raise RecordingError(f"{path}: --arm does not apply to team-mat files, which are in joint coordinates")
         recording = read_team_mat(path, variable=variable, skip_invalid=skip_invalid)
     elif chosen == "wpi-csv":
         recording = read_wpi_csv(path, rate, skip_invalid=skip_invalid)
@@ -102,19 +102,19 @@ def convert(
             recording = wpi_in_joint_coordinates(recording, arm)
     elif coordinates is None:
         raise RecordingError(
-            f"{path}: its header does not say whether the numbers are of the joints or of the actuators; pass "
-            "--coordinates joint or --coordinates actuator (coordinates= in Python)"
+            f"{path}: a CSV file does not define its coordinates. Pass --coordinates joint or --coordinates actuator "
+            "(coordinates= in Python)."
         )
     else:
         recording = _read_csv(Path(path), coordinates, rate, arm, skip_invalid)
     if recording.coordinates == "actuator":
         first, *others = recording.notes
         note = (
-            "in actuator coordinates, which a CSV cannot say: pass --coordinates actuator to every command that reads "
-            "it, or convert with --arm"
+            "in actuator coordinates, which the CSV does not state: pass --coordinates actuator to every command that "
+            "reads the CSV, or convert with --arm"
         )
         if chosen == "wpi-csv":
-            note += " (of a PSM always: its roll is not the dVRK's actuator)"
+            note += " (required for a PSM, whose roll is recorded at the joint)"
         recording = dataclasses.replace(recording, notes=(first, note, *others))
     write_recording(recording, output)
     return recording
@@ -134,10 +134,12 @@ def _read_csv(
         t, note = made_times(np.arange(len(recording)), rate)
         recording, notes = dataclasses.replace(recording, t=t), [note]
     else:
-        notes = [f"{len(recording)} rows without time stamps (no column t), as poses have; --rate HZ makes them"]
+        notes = [
+            f"{len(recording)} rows without time stamps (no column t), read as static poses; --rate HZ adds time stamps"
+        ]
     kept = [name for prefix in ("t", "q", "qd", "tau") for name in column_names(prefix, recording.q.shape[1])]
     if other := [name for name in _header(read_bytes(path)) if name and name not in kept]:
-        notes.append(f"columns left out, which are not q, qd, tau or t: {', '.join(other)}")
+        notes.append(f"ignored columns: {', '.join(other)}")
     if arm is not None:
         recording = recording.in_joint_coordinates(arm)
         recording.check_fits(arm)
@@ -161,7 +163,7 @@ def detect_format(path: str | Path) -> Format:
     if looks_like_matlab(path, content):
         return "team-mat"
     if b"\0" in content[:_HEAD]:
-        raise RecordingError(f"{path}: neither an LCM log, a MATLAB file (team-mat) nor a text file in UTF-8 (CSV)")
+        raise RecordingError(f"{path}: unknown format; allowed: LCM log, MATLAB file (team-mat), UTF-8 text file (CSV)")
     return "csv" if "q1" in _header(content) else "wpi-csv"
 
 

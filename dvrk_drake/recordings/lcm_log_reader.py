@@ -85,11 +85,9 @@ class LcmLogReader:
         position = damaged
         while (position := content.find(_MAGIC, position + 1)) >= 0:
             if _end_of_event(content, position):
-                self.notes.append(f"{position - damaged} bytes from byte {damaged} on are damaged and are left out")
+                self.notes.append(f"{position - damaged} damaged bytes skipped, from byte {damaged}")
                 return position
-        self.notes.append(
-            f"the last {len(content) - damaged} bytes are no whole message, as after a kill: read up to there"
-        )
+        self.notes.append(f"incomplete message skipped at the end of the log ({len(content) - damaged} bytes)")
         return len(content)
 
 
@@ -132,11 +130,11 @@ def _event(content: mmap.mmap, start: int) -> LcmEvent:
     return LcmEvent(number, utime, name, content[data : data + data_length])
 
 
-_UNREADABLE = "no lcmt_dvrk_status, or one of another version"
+_UNREADABLE = "not an lcmt_dvrk_status of this version"
 _FOREIGN = "of another arm or number of joints"
-_LATE = "not later than the one before"
+_LATE = "not later than the previous one"
 _NOT_FINITE = "with a measurement that is not finite"
-_OFF = "with the motors off, whose efforts hold nothing"
+_OFF = "with the motors off"
 
 
 class StatusStream:
@@ -181,11 +179,11 @@ class StatusStream:
 
     def notes(self) -> list[str]:
         """Returns descriptions of omitted and lost statuses, one per line."""
-        notes = [f"messages left out, {reason}: {count}" for reason, count in self._left_out.items()]
+        notes = [f"messages omitted, {reason}: {count}" for reason, count in self._left_out.items()]
         if self.num_lost:
-            notes.append(f"messages lost on the way, missing in the sequence: {self.num_lost}")
+            notes.append(f"messages lost (gaps in the sequence numbers): {self.num_lost}")
         if len(self._sessions) > 1:
-            notes.append(f"restarts of {self.arm_name} in between: {len(self._sessions) - 1}")
+            notes.append(f"restarts of {self.arm_name} during the recording: {len(self._sessions) - 1}")
         return notes
 
     def _examine(self, status: lcmt_dvrk_status) -> str:
@@ -208,8 +206,8 @@ class StatusStream:
             return True
         if session_id in self._sessions:
             raise RecordingError(
-                f"two arms called {self.arm_name} send at the same time (sessions "
-                f"{' and '.join(map(str, self._sessions))}): end one, or give them networks of their own"
+                f"two processes send statuses of {self.arm_name} at the same time (sessions "
+                f"{' and '.join(map(str, self._sessions))}). Stop one of them, or use a separate network for each."
             )
         self._sessions.append(session_id)
         return False
@@ -287,15 +285,17 @@ def read_status_log(path: str | Path, arm: Arm | None = None) -> StatusLog:
 def _only_status_channel(log: LcmLogReader) -> str:
     channels = sorted({event.channel for event in log if event.channel.startswith(STATUS_PREFIX)})
     if len(channels) > 1:
-        raise RecordingError(f"{log.path}: has statuses of several arms, {', '.join(channels)}: name one")
+        raise RecordingError(
+            f"{log.path}: has statuses of several arms ({', '.join(channels)}). Select one with --arm (arm= in Python)."
+        )
     return channels[0] if channels else STATUS_PREFIX
 
 
 def _why_nothing(channel: str, arm: Arm | None, channels: Counter[str], notes: list[str]) -> str:
     if count := channels[channel]:
-        reasons = "; ".join(notes) or "no lcmt_dvrk_status, or one of another version"
-        return f"none of its {count} messages on channel {channel} can be used: {reasons}"
+        reasons = "; ".join(notes) or _UNREADABLE
+        return f"none of the {count} messages on channel {channel} is usable: {reasons}"
     listed = [f"{name} ({number})" for name, number in channels.most_common(_LISTED)]
     more = [f"{len(channels) - _LISTED} more"] if len(channels) > _LISTED else []
-    has = ", ".join([*listed, *more]) or "nothing that can be read"
-    return f"has no status of {arm.name if arm else 'any arm'} (channel {channel}); it has {has}"
+    has = ", ".join([*listed, *more]) or "none"
+    return f"has no status of {arm.name if arm else 'any arm'} (channel {channel}). Channels in the log: {has}."

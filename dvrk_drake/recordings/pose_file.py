@@ -41,18 +41,20 @@ def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
             `check_poses` refuses.
     """
     if not os.path.lexists(path):
-        raise CollectionError(f"{path}: no such file of poses; --teach or --random makes one")
-    content = load_typed_yaml(PoseFile, path, CollectionError, "a file of poses")
+        raise CollectionError(
+            f"{path}: the pose file does not exist. Create it with collect --teach or collect --random."
+        )
+    content = load_typed_yaml(PoseFile, path, CollectionError, "a pose file")
     if content.format != PoseFile.format:
-        raise CollectionError(f'{path}: format is "{content.format}", this version reads "{PoseFile.format}"')
+        raise CollectionError(f'{path}: format is "{content.format}"; allowed: "{PoseFile.format}"')
     if content.arm.lower() != arm.name.lower():
-        raise CollectionError(f'{path}: arm is "{content.arm}", not {arm.name}')
+        raise CollectionError(f'{path}: arm is "{content.arm}"; allowed: {arm.name}')
     if not content.poses:
         raise CollectionError(f"{path}: has no poses")
     for k, pose in enumerate(content.poses):
         if len(pose) != arm.num_joints:
             raise CollectionError(
-                f"{path}: pose {k + 1} has {len(pose)} numbers; {arm.name} has {arm.num_joints} joints: "
+                f"{path}, pose {k + 1}: {len(pose)} numbers, but {arm.name} has {arm.num_joints} joints: "
                 f"{', '.join(arm.joint_names)}"
             )
     poses = np.array(content.poses, float)
@@ -69,16 +71,19 @@ def check_poses(poses: NDArray[np.float64], arm: Arm, source: str) -> None:
     """
     for k, pose in enumerate(poses):
         if not np.all(np.isfinite(pose)):
-            raise CollectionError(f"{source}: pose {k + 1} must be finite numbers; got {pose.tolist()}")
+            raise CollectionError(f"{source}, pose {k + 1}: {pose.tolist()} has a number that is not finite")
     try:
         Recording(q=poses, source=source).check_fits(arm)  # detects degrees and millimetres
     except RecordingError as error:
-        raise CollectionError(str(error).replace(": row ", ": pose ")) from error
+        raise CollectionError(str(error).replace(", row ", ", pose ")) from error
     for k, pose in enumerate(poses):
         if violations := arm.limit_violations(pose, _ROUNDING):
-            raise CollectionError(f"{source}: pose {k + 1}: {'; '.join(violations)} [rad, m] of {arm.name}")
+            raise CollectionError(f"{source}, pose {k + 1}: {'; '.join(violations)} [rad, m] of {arm.name}")
         if (same := same_pose(poses[:k], pose, arm)) is not None:
-            raise CollectionError(f"{source}: pose {k + 1} is pose {same + 1} again, within {SAME_POSE[0]} rad")
+            raise CollectionError(
+                f"{source}, pose {k + 1}: equal to pose {same + 1}; all joints differ by less than "
+                f"{SAME_POSE[0]:g} rad or {SAME_POSE[1]:g} m"
+            )
 
 
 def same_pose(poses: NDArray[np.float64], pose: NDArray[np.float64], arm: Arm) -> int | None:
@@ -145,8 +150,8 @@ class CollectionFile:
             which = np.all(poses == pose, axis=1)
             if not which.any():
                 raise CollectionError(
-                    f"{self._path}:{line}: was collected for a pose that is none of these; name another output, or "
-                    "the poses that it was begun with (more may be added to them)"
+                    f"{self._path}, line {line}: the requested pose of this row is not in the pose file. Choose "
+                    "another output, or the pose file of this collection (poses may be added to it)."
                 )
             done |= which
         return done
@@ -194,11 +199,11 @@ class CollectionFile:
         columns = [header.index(name) for name in self._names("pose")]
         found = []
         for line, cells in rows:
-            where = f"{self._path}:{line}"
+            where = f"{self._path}, line {line}"
             if len(cells) != len(header):
-                raise RecordingError(f"{where}: has {len(cells)} cells, the header names {len(header)} columns")
+                raise RecordingError(f"{where}: the row has {len(cells)} cells, the header has {len(header)}")
             if (name := cells[header.index("arm")]) != self._arm.name:
-                raise CollectionError(f"{where}: is of {name}, not of {self._arm.name}; name another output")
+                raise CollectionError(f"{where}: the row is of {name}, not of {self._arm.name}. Choose another output.")
             found.append((line, np.array([parse_finite(cells[j], f"{where}: {header[j]}") for j in columns])))
         return found
 
@@ -207,7 +212,7 @@ class CollectionFile:
             return
         if "pose1" in header and ("friction1" in header) != self._both_sides:
             sides = "one side (--no-both-sides)" if self._both_sides else "both sides (--both-sides)"
-            raise CollectionError(f"{self._path}: was collected from {sides}; go on in the same way")
+            raise CollectionError(f"{self._path}: was collected from {sides}. Continue with the same option.")
         raise CollectionError(
-            f"{self._path}: is there and was not collected from {self._arm.name}; name another output"
+            f"{self._path}: already exists and is not a collection of {self._arm.name}. Choose another output."
         )

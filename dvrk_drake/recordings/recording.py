@@ -52,9 +52,11 @@ class Recording:
         t: Times (m,), or None for poses.
         coordinates: Coordinates of q, qd and tau: "joint" or "actuator".
         source: Source of the data, for messages.
-        lines: Line (m,) of each row in the source, for messages; the event number for an LCM log.
+        lines: Line number (m,) of each row in the source, or None. For an LCM log it is the number of the event, for a
+            MATLAB array the number of the pose.
         sha256: SHA-256 of the source, or "".
-        notes: Notes for the user on how the source was read, one per line: damage, omitted messages.
+        notes: Notes for the user on damaged and omitted parts of the source, one per line.
+        line_label: Name of the numbers in `lines`, for messages: "line", "event" or "pose".
 
     Example:
         >>> import dvrk_drake as dvrk, numpy as np
@@ -73,6 +75,7 @@ class Recording:
     lines: NDArray[np.int_] | None = None
     sha256: str = ""
     notes: tuple[str, ...] = ()
+    line_label: str = "line"
     # Cache of this recording in the other coordinates, by transmission.
     _converted: dict[LinearMap, Recording] = field(default_factory=dict, init=False, repr=False)
 
@@ -98,9 +101,9 @@ class Recording:
         return len(self.q)
 
     def where(self, row: int) -> str:
-        """Returns `file:line` of a row, or the number of the row if there is no file."""
+        """Returns the source and the line of a row, "poses.csv, line 2", or its row number if there are no lines."""
         source = self.source or "recording"
-        return f"{source}:{self.lines[row]}" if self.lines is not None else f"{source}: row {row + 1}"
+        return f"{source}, row {row + 1}" if self.lines is None else f"{source}, {self.line_label} {self.lines[row]}"
 
     @property
     def is_motion(self) -> bool:
@@ -195,7 +198,7 @@ class Recording:
         lower, upper = arm.position_lower[joint], arm.position_upper[joint]
         message = (
             f"{self.where(int(row))}: {arm.joint_names[joint]} (q{joint + 1}) = {q[row, joint]:.4g} "
-            f"is outside {lower:.4g}..{upper:.4g}{' m' if arm.prismatic[joint] else ''} of {arm.name}"
+            f"is outside {lower:.4g}..{upper:.4g} {'m' if arm.prismatic[joint] else 'rad'} of {arm.name}."
         )
         outside = np.mean(np.any(excess > 1, axis=1))
         shares = np.max(np.abs(q) / np.maximum(-arm.position_lower, arm.position_upper), axis=0)
@@ -203,13 +206,13 @@ class Recording:
         # With another arm or other coordinates, positions exceed the limits by a factor of 2 or 3; in degrees by up to
         # 57.
         if outside > 0.3 and turning > 4 and np.radians(turning) <= 1.2:
-            message += "; are these degrees, or is it another arm? Positions must be in rad (m on a prismatic joint)"
+            message += " Are the positions in degrees instead of rad, or of another arm?"
         elif arm.prismatic[joint] and shares[joint] > 4:
-            message += "; are these millimetres or centimetres? A prismatic joint must be in m, its effort in N"
+            message += " Are the positions in millimetres or centimetres instead of m?"
         else:
-            message += "; is this the right arm, and are the coordinates (joint or actuator) right?"
+            message += " Is the arm or the choice of coordinates (joint or actuator) wrong?"
         if pairs := self._exchanges_within_limits(arm):
-            message += f" Or are columns exchanged? Within the limits with {', '.join(pairs)} exchanged"
+            message += f" All poses are within the limits if columns are exchanged: {', '.join(pairs)}."
         raise RecordingError(message)
 
     def _exchanges_within_limits(self, arm: Arm) -> list[str]:
@@ -229,15 +232,16 @@ class Recording:
                 continue
             row, joint = np.argwhere(~plausible)[0]
             raise RecordingError(
-                f"{self.where(int(row))}: {name}{joint + 1} = {values[row, joint]:g} is no reading of an arm; "
-                f"at most {IMPLAUSIBLE:g}"
+                f"{self.where(int(row))}: {name}{joint + 1} = {values[row, joint]:g} is not plausible; "
+                f"allowed: absolute values up to {IMPLAUSIBLE:g}"
             )
 
     def _check_joint_count(self, arm: Arm) -> None:
         if self.q.shape[1] != arm.num_joints:
             source = self.source or "recording"
             raise RecordingError(
-                f"{source}: has {self.q.shape[1]} joints, {arm.name} has {arm.num_joints}: {', '.join(arm.joint_names)}"
+                f"{source}: has {self.q.shape[1]} joints, but {arm.name} has {arm.num_joints}: "
+                f"{', '.join(arm.joint_names)}"
             )
 
 
@@ -275,16 +279,16 @@ def read_recording(
         >>> dvrk.write_recording(dvrk.Recording(q=np.zeros((8, 7)), tau=np.ones((8, 7))), "poses.csv")
         >>> recording = dvrk.read_recording("poses.csv", arm)
         >>> len(recording), recording.coordinates, recording.where(0)
-        (8, 'joint', 'poses.csv:2')
+        (8, 'joint', 'poses.csv, line 2')
     """
     if coordinates not in get_args(Coordinates):
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
     path = Path(path)
     if is_lcm_log(path):
         if coordinates != "joint":
-            raise RecordingError(f"{path}: an LCM log is in joint coordinates, not {coordinates}")
+            raise RecordingError(f"{path}: an LCM log is in joint coordinates, not in {coordinates} coordinates")
         log = read_status_log(path, arm)
-        return Recording(log.q, log.tau, log.qd, log.t, "joint", str(path), log.events, log.sha256, log.notes)
+        return Recording(log.q, log.tau, log.qd, log.t, "joint", str(path), log.events, log.sha256, log.notes, "event")
     return _read_csv(path, arm, coordinates, step_progress(progress, "reading"), skip_invalid)
 
 
@@ -301,7 +305,7 @@ def _read_csv(
         if not cells:
             raise RecordingError(f"{path}: is empty; needs a header with {_wanted(num_joints)}")
         header = [cell.strip() for cell in cells]
-        blocks = _columns_of_blocks(f"{path}:{header_line}", header, arm, num_joints)
+        blocks = _columns_of_blocks(f"{path}, line {header_line}", header, arm, num_joints)
         values, lines, skipped = _read_numbers(path, reader, header, blocks, skip_invalid)
         sha256 = reader.sha256()
     if not lines:
@@ -321,11 +325,11 @@ def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joint
     """Returns a mapping from a prefix (q, qd, tau, t) to its columns in the header."""
     if all(is_number(cell) for cell in header):
         raise RecordingError(
-            f"{where}: has no header; the first line must name the columns, "
-            f"{_wanted(num_joints)} (dvrk-drake convert reads headerless public formats)"
+            f"{where}: the header is missing. The first line must contain the column names {_wanted(num_joints)}. "
+            "dvrk-drake convert reads public recordings without a header."
         )
     if twice := next((name for name, count in Counter(header).items() if name and count > 1), ""):
-        raise RecordingError(f"{where}: column {twice[:30]} is named twice")
+        raise RecordingError(f"{where}: column {twice[:30]} occurs twice")
     blocks = {}
     for prefix, needed in (("q", True), ("qd", False), ("tau", False)):
         names = column_names(prefix, num_joints)
@@ -339,7 +343,8 @@ def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joint
             )
         if f"{prefix}{num_joints + 1}" in header:
             raise RecordingError(
-                f"{where}: has {prefix}{num_joints + 1}, but the arm has {num_joints} joints{_joint_list(arm)}"
+                f"{where}: unexpected column {prefix}{num_joints + 1}; "
+                f"the arm has {num_joints} joints{_joint_list(arm)}"
             )
         blocks[prefix] = [header.index(name) for name in names]
     if "t" in header:
@@ -357,11 +362,11 @@ def _read_numbers(
     width = len(header)
     for line, cells in reader:
         if len(cells) != width:
-            raise RecordingError(f"{path}:{line}: has {len(cells)} cells, the header names {width} columns")
+            raise RecordingError(f"{path}, line {line}: the row has {len(cells)} cells, the header has {width}")
         if len(lines) == MAX_COUNT:
-            raise RecordingError(f"{path}:{line}: has more than {MAX_COUNT} rows; cut the recording into parts")
+            raise RecordingError(f"{path}, line {line}: the file has more than {MAX_COUNT} rows. Split the recording.")
         if skip_invalid and not all(
-            math.isfinite(parse_or_nan(cells[column].strip(), f"{path}:{line}: {header[column]}"))
+            math.isfinite(parse_or_nan(cells[column].strip(), f"{path}, line {line}: {header[column]}"))
             for _, columns in parts
             for column in columns
         ):
@@ -376,7 +381,7 @@ def _read_numbers(
                 is_good = False
             if not is_good:
                 numbers = [
-                    parse_finite(cells[column].strip(), f"{path}:{line}: {header[column]}") for column in columns
+                    parse_finite(cells[column].strip(), f"{path}, line {line}: {header[column]}") for column in columns
                 ]
             part.extend(numbers)
     return values, lines, skipped
@@ -429,7 +434,7 @@ def write_csv(path: str | Path, header: list[str], values: NDArray[np.float64]) 
 
 
 def _joint_list(arm: Arm | None) -> str:
-    return f"; of {arm.name} these are {', '.join(arm.joint_names)}" if arm else ""
+    return f"; joints of {arm.name}: {', '.join(arm.joint_names)}" if arm else ""
 
 
 def _wanted(num_joints: int) -> str:

@@ -50,9 +50,9 @@ def check_stream_output(path: str | Path) -> None:
     """
     path = Path(path)
     if path.suffix not in (".csv", ".log"):
-        raise RecordingError(f"{path}: must end in .csv or .log (LCM log)")
+        raise RecordingError(f"{path}: the file name must end in .csv or .log (LCM log)")
     if os.path.lexists(path):
-        raise RecordingError(f"{path}: exists already, and a recording is not overwritten; name another file")
+        raise RecordingError(f"{path}: already exists, and a recording is never overwritten. Choose another file.")
     if not path.parent.is_dir():
         raise RecordingError(f"{path}: cannot be written: its folder does not exist")
     try:

@@ -252,7 +252,7 @@ def test_block_size_does_not_change_the_rows(block, end, tmp_path, monkeypatch):
         np.testing.assert_array_equal(getattr(read, name), getattr(original, name))
     np.testing.assert_array_equal(read.lines, np.arange(2, 11))
     path.write_bytes(path.read_bytes() + "0,\u00e4".encode()[:-1])
-    with pytest.raises(RecordingError, match=f"not a CSV text file in UTF-8: .* at byte {path.stat().st_size - 1}"):
+    with pytest.raises(RecordingError, match=f"is not a UTF-8 text file: .* at byte {path.stat().st_size - 1}"):
         read_recording(path)
 
 
@@ -260,8 +260,8 @@ def test_csv_with_too_many_rows_or_too_long_lines_is_refused(tmp_path, monkeypat
     path = tmp_path / "recording.csv"
     path.write_text(f"{HEADER}\n" + f"{ROW}\n" * 4)
     monkeypatch.setattr(recording, "MAX_COUNT", 3)
-    with pytest.raises(RecordingError, match=r":5: has more than 3 rows; cut the recording into parts"):
+    with pytest.raises(RecordingError, match=r", line 5: the file has more than 3 rows\. Split"):
         read_recording(path)
     path.write_text(f"{HEADER}\n" + "1" * 3_000_000)
-    with pytest.raises(RecordingError, match="has a line of more than 1048576 characters"):
+    with pytest.raises(RecordingError, match="a line has more than 1048576 characters"):
         read_recording(path)

@@ -40,7 +40,7 @@ def test_convert_wpi_csv_round_trip_is_exact(tmp_path):
     np.testing.assert_array_equal(np.hstack([again.q, again.qd, again.tau]), rows)
     assert notes[0] == "50 samples; the file has no time stamps, so t = row / 100 Hz"
     assert "--coordinates actuator" in notes[1]
-    assert notes[2].startswith("2 of 50 rows repeat the row before")
+    assert notes[2].startswith("2 of 50 rows repeat the previous row")
 
 
 def test_detect_format(tmp_path):
@@ -51,7 +51,9 @@ def test_detect_format(tmp_path):
     assert detect_format(write_text(tmp_path, f'\ufeff\n "tau1" ,"q1",x\n{NUMBERS}\n')) == "csv"
     binary = tmp_path / "model.pkl"
     binary.write_bytes(b"\x80\x04\x95\0\0\0")
-    assert_refused(r"model\.pkl: neither an LCM log, a MATLAB file .* nor a text file", detect_format, binary)
+    assert_refused(
+        r"model\.pkl: unknown format; allowed: LCM log, MATLAB file .*, UTF-8 text file", detect_format, binary
+    )
     assert_refused("nowhere: no such file", detect_format, tmp_path / "nowhere")
     assert_refused("is not a file", detect_format, tmp_path)
 
@@ -84,7 +86,7 @@ def test_convert_refuses_unsuitable_options_and_unknown_formats(tmp_path):
 def test_convert_does_not_overwrite_its_input(tmp_path):
     path = write_wpi(tmp_path, wpi_rows())
     before = path.read_bytes()
-    assert_refused("is the recording itself", convert, path, tmp_path / "." / "motion.csv")
+    assert_refused("is the input recording", convert, path, tmp_path / "." / "motion.csv")
     assert path.read_bytes() == before
 
 
@@ -137,7 +139,7 @@ def test_coordinates_are_required_if_undefined(tmp_path):
     path, _ = write_timed(tmp_path, [0, 0.01])
     for format in (None, "csv"):
         assert_refused(
-            r"motion\.csv: .*does not say.*--coordinates joint or --coordinates actuator",
+            r"motion\.csv: .*does not define.*--coordinates joint or --coordinates actuator",
             convert,
             path,
             tmp_path / "out.csv",
@@ -149,8 +151,10 @@ def test_coordinates_are_required_if_undefined(tmp_path):
 
 def test_a_format_that_defines_its_coordinates_keeps_them(tmp_path):
     mat, text, output = write_mat(tmp_path, a=team_array()), write_wpi(tmp_path, wpi_rows()), tmp_path / "out.csv"
-    assert_refused("team-mat is in joint coordinates, not actuator", convert, mat, output, coordinates="actuator")
-    assert_refused("wpi-csv is in actuator coordinates, not joint", convert, text, output, coordinates="joint")
+    assert_refused(
+        "team-mat file is in joint coordinates, not in actuator", convert, mat, output, coordinates="actuator"
+    )
+    assert_refused("wpi-csv file is in actuator coordinates, not in joint", convert, text, output, coordinates="joint")
     assert convert(mat, output, coordinates="joint").coordinates == "joint"
     assert convert(text, output, coordinates="actuator").coordinates == "actuator"
 
@@ -166,7 +170,7 @@ def test_a_rate_is_refused_where_the_file_has_time_stamps(tmp_path):
     recording = convert(path, output, coordinates="joint", rate=50.0)
     np.testing.assert_array_equal(read_recording(output).t, [0, 0.02, 0.04])
     assert "the file has no time stamps, so t = row / 50 Hz" in recording.notes[0]
-    assert_refused("rate must be a positive number", convert, path, output, coordinates="joint", rate=0.0)
+    assert_refused("rate is 0 Hz; allowed: a positive number", convert, path, output, coordinates="joint", rate=0.0)
     recording = convert(path, output, coordinates="joint")
     assert read_recording(output).t is None
     assert "no column t" in recording.notes[0]
@@ -188,8 +192,8 @@ def test_irregular_time_stamps_are_kept_and_counted(tmp_path):
         recording = convert(path, tmp_path / "out.csv", **options)
         np.testing.assert_array_equal(recording.t, [0, 0.01, 0.01, 0.013, 0.005, 0.02, 0.02])
         assert (
-            "t does not always increase: 2 rows repeat the t before them, 1 goes back, first at line 4; kept, but a "
-            "motion with such times is refused by identify" in recording.notes
+            "t does not increase in all rows (2 equal, 1 smaller than the previous t; first at line 4). The rows are "
+            "kept, but identify refuses a motion with such times." in recording.notes
         )
 
 
@@ -197,7 +201,11 @@ def test_time_stamps_that_are_no_numbers(tmp_path):
     path, rows = write_timed(tmp_path, ["0", "nan", "0.02", "0.03"])
     for options in ({"coordinates": "joint"}, {"format": "wpi-csv"}):
         assert_refused(
-            r"motion\.csv:3: t( \(column 1\))? is nan; only finite", convert, path, tmp_path / "out.csv", **options
+            r"motion\.csv, line 3: t( \(column 1\))? is nan; only finite",
+            convert,
+            path,
+            tmp_path / "out.csv",
+            **options,
         )
         recording = convert(path, tmp_path / "out.csv", skip_invalid=True, **options)
         np.testing.assert_array_equal(recording.t, [0, 0.02, 0.03])
@@ -210,7 +218,7 @@ def test_positions_alone_and_columns_that_are_not_kept(tmp_path):
     path = write_text(tmp_path, f"{header}\n0,1,2,3,4,5,6,7,40\n1,2,3,4,5,6,7,8,41\n")
     recording = convert(path, tmp_path / "out.csv", coordinates="joint")
     assert (tmp_path / "out.csv").read_text().splitlines()[0] == "q1,q2,q3,q4,q5,q6,q7"
-    assert "columns left out, which are not q, qd, tau or t: time, temperature" in recording.notes
+    assert "ignored columns: time, temperature" in recording.notes
 
 
 def test_actuator_coordinates_become_joint_coordinates_of_an_arm(tmp_path):

@@ -23,7 +23,7 @@ def test_reads_columns_by_name_in_any_order_and_ignores_others(tmp_path):
     np.testing.assert_array_equal(recording.t, [2.5])
     assert recording.qd is None
     assert recording.coordinates == "joint"
-    assert recording.where(0) == f"{path}:2"
+    assert recording.where(0) == f"{path}, line 2"
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_blank_lines_do_not_shift_line_numbers(tmp_path):
     path = write_text(tmp_path, f"\n{HEADER}\n\n , ,\n{ROW}\n\n{ROW}\n\n")
     np.testing.assert_array_equal(read_recording(path).lines, [5, 7])
     path = write_text(tmp_path, f"\n{HEADER}\n\n{ROW}\n\n{ROW.replace('0.1,', 'x,')}\n")
-    with pytest.raises(RecordingError, match=r"recording\.csv:6: q1 is not a number: 'x'"):
+    with pytest.raises(RecordingError, match=r"recording\.csv, line 6: q1 is not a number: 'x'"):
         read_recording(path)
 
 
@@ -63,8 +63,8 @@ def test_missing_efforts_are_reported_when_required(tmp_path):
 
 
 def test_the_source_of_a_row_without_a_file():
-    assert random_recording().where(2) == "recording: row 3"
-    assert random_recording(source="simulated").where(2) == "simulated: row 3"
+    assert random_recording().where(2) == "recording, row 3"
+    assert random_recording(source="simulated").where(2) == "simulated, row 3"
 
 
 WANTED = r"needs (a header with )?q1\.\.q7 and tau1\.\.tau7 \(t and qd1\.\.qd7 optional\)"
@@ -73,38 +73,38 @@ ERRORS = {
     "empty": ("", r"recording\.csv: is empty; " + WANTED),
     "blank": ("\n\n  \n", r"recording\.csv: is empty; " + WANTED),
     "header only": (HEADER + "\n", r"recording\.csv: has a header but no rows"),
-    "no header": (f"{ROW}\n{ROW}\n", r":1: has no header; .*q1\.\.q7 .*dvrk-drake convert"),
-    "missing q": (f"{HEADER.replace('q3', 'p3')}\n{ROW}", r":1: missing column q3; " + WANTED),
+    "no header": (f"{ROW}\n{ROW}\n", r", line 1: the header is missing\. .*q1\.\.q7 .*dvrk-drake convert"),
+    "missing q": (f"{HEADER.replace('q3', 'p3')}\n{ROW}", r", line 1: missing column q3; " + WANTED),
     "missing taus": (
         f"{HEADER.replace('tau4', 'x').replace('tau6', 'y')}\n{ROW}",
-        r":1: missing columns tau4, tau6; " + WANTED,
+        r", line 1: missing columns tau4, tau6; " + WANTED,
     ),
-    "some qd": (f"{HEADER},qd1,qd2\n{ROW},0,0", r":1: missing columns qd3, qd4, qd5, qd6, qd7; "),
-    "other names": ("a,b\n1,2\n", r":1: missing columns q1, q2, q3, q4, q5, q6, q7; "),
-    "duplicate": (f"{HEADER},q2\n{ROW},0", r":1: column q2 is named twice"),
-    "q8": (f"{HEADER},q8\n{ROW},0", r":1: has q8, but the arm has 7 joints"),
-    "tau8": (f"{HEADER},tau8\n{ROW},0", r":1: has tau8, but the arm has 7 joints"),
-    "NaN": (f"{HEADER}\n{ROW}\n{ROW.replace('0.11', 'NaN')}\n", r":3: tau4 is NaN; only finite numbers"),
-    "inf": (f"{HEADER}\n{ROW.replace('0.11', '-inf')}\n", r":2: tau4 is -inf; only finite numbers"),
-    "overflow": (f"{HEADER}\n{ROW.replace('0.11', '1e999')}\n", r":2: tau4 is 1e999; only finite numbers"),
-    "text": (f"{HEADER}\n{ROW.replace('0.11', 'off')}\n", r":2: tau4 is not a number: 'off'"),
-    "underscore": (f"{HEADER}\n{ROW.replace('0.11', '1_1')}\n", r":2: tau4 is not a number: '1_1'"),
-    "empty cell": (f"{HEADER}\n{ROW.replace('0.11', '')}\n", r":2: tau4 is empty"),
-    "line break": (f"{HEADER}\n{ROW.replace('0.11', MULTI_LINE)}\n", r":3: tau4 is not a number: 'a\\nb'"),
-    "time": (f"t,{HEADER}\nnow,{ROW}\n", r":2: t is not a number: 'now'"),
-    "too few": (f"{HEADER}\n{ROW}\n{ROW[:-5]}\n", r":3: has 13 cells, the header names 14 columns"),
-    "too many": (f"{HEADER}\n{ROW},\n", r":2: has 15 cells, the header names 14 columns"),
+    "some qd": (f"{HEADER},qd1,qd2\n{ROW},0,0", r", line 1: missing columns qd3, qd4, qd5, qd6, qd7; "),
+    "other names": ("a,b\n1,2\n", r", line 1: missing columns q1, q2, q3, q4, q5, q6, q7; "),
+    "duplicate": (f"{HEADER},q2\n{ROW},0", r", line 1: column q2 occurs twice"),
+    "q8": (f"{HEADER},q8\n{ROW},0", r", line 1: unexpected column q8; the arm has 7 joints"),
+    "tau8": (f"{HEADER},tau8\n{ROW},0", r", line 1: unexpected column tau8; the arm has 7 joints"),
+    "NaN": (f"{HEADER}\n{ROW}\n{ROW.replace('0.11', 'NaN')}\n", r", line 3: tau4 is NaN; only finite numbers"),
+    "inf": (f"{HEADER}\n{ROW.replace('0.11', '-inf')}\n", r", line 2: tau4 is -inf; only finite numbers"),
+    "overflow": (f"{HEADER}\n{ROW.replace('0.11', '1e999')}\n", r", line 2: tau4 is 1e999; only finite numbers"),
+    "text": (f"{HEADER}\n{ROW.replace('0.11', 'off')}\n", r", line 2: tau4 is not a number: 'off'"),
+    "underscore": (f"{HEADER}\n{ROW.replace('0.11', '1_1')}\n", r", line 2: tau4 is not a number: '1_1'"),
+    "empty cell": (f"{HEADER}\n{ROW.replace('0.11', '')}\n", r", line 2: tau4 is empty"),
+    "line break": (f"{HEADER}\n{ROW.replace('0.11', MULTI_LINE)}\n", r", line 3: tau4 is not a number: 'a\\nb'"),
+    "time": (f"t,{HEADER}\nnow,{ROW}\n", r", line 2: t is not a number: 'now'"),
+    "too few": (f"{HEADER}\n{ROW}\n{ROW[:-5]}\n", r", line 3: the row has 13 cells, the header has 14"),
+    "too many": (f"{HEADER}\n{ROW},\n", r", line 2: the row has 15 cells, the header has 14"),
     "semicolons": (
         f"{HEADER}\n{ROW}".replace(",", ";"),
-        r":1: no comma in the first row; cells must be separated by",
+        r", line 1: the first row has no comma\. Separate cells by commas",
     ),
-    "tabs": (f"{HEADER}\n{ROW}".replace(",", "\t"), r":1: no comma in the first row"),
-    "open quote": (f'{HEADER}\n"{ROW}\n{ROW}\n', r":3: not CSV: unexpected end of data"),
+    "tabs": (f"{HEADER}\n{ROW}".replace(",", "\t"), r", line 1: the first row has no comma"),
+    "open quote": (f'{HEADER}\n"{ROW}\n{ROW}\n', r", line 3: invalid CSV: unexpected end of data"),
     "UTF-16": (
         f"{HEADER}\n{ROW}\n".encode("utf-16"),
-        r"recording\.csv: not a CSV text file in UTF-8: .* at byte 0",
+        r"recording\.csv: is not a UTF-8 text file: .* at byte 0",
     ),
-    "binary": (bytes(range(256)), r"recording\.csv: not a CSV text file in UTF-8: .* at byte 128"),
+    "binary": (bytes(range(256)), r"recording\.csv: is not a UTF-8 text file: .* at byte 128"),
 }
 
 
@@ -122,7 +122,7 @@ def test_six_joints(tmp_path):
     assert read_recording(path, arm=six_joint_arm()).q.shape == (1, 6)
     with pytest.raises(RecordingError, match="missing column q7"):
         read_recording(path)
-    with pytest.raises(RecordingError, match="has q7, but the arm has 6 joints; of PSM these are yaw, pitch"):
+    with pytest.raises(RecordingError, match="unexpected column q7; the arm has 6 joints; joints of PSM: yaw, pitch"):
         read_recording(write_text(tmp_path, f"{HEADER}\n{ROW}"), arm=six_joint_arm())
 
 

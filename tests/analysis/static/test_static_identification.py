@@ -339,6 +339,6 @@ def test_prediction_of_another_day_beats_zero_torque(arm, shared_data):
 def test_poses_at_a_stop_are_named_in_a_real_recording(arm, shared_data):
     result = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"), arm)
     # Line numbers of the file. Line 72 repeats the pose of line 62.
-    line = {d: int(d.where.rpartition(":")[2]) for d in result.excluded}
+    line = {d: int(d.where.rpartition(" ")[2]) for d in result.excluded}
     assert {62, 64, 68, 74, 78} <= {line[d] for d in result.excluded if "parallelogram" in d.reason}
     assert 47 in line.values()
