@@ -81,7 +81,7 @@ class Controller:
     def period(self) -> None:
         """A status in, a command out."""
         self.time += 1e-3
-        self.statuses.take(self.arm.status_data, self.time)
+        self.statuses.accept(self.arm.status_data, self.time)
         self.arm.signed(self.arm.command)
 
 

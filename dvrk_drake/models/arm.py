@@ -30,18 +30,18 @@ from dvrk_drake.models.arm_schema import (
 from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_limit_fault, limits_fault
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.schema_fault import RANGE, Range, meant, number_fault, within
+from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, suggestion, within
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, local_path, read_sdf_facts
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 _ARMS = MODELS_FOLDER / "arms"
 #: Maximum length of the gravity vector [m/s^2].
 MAX_GRAVITY = 30.0
-#: Position errors [rad, m] that define the maximum gains. A gain is too large if this error demands the whole effort
-#: limit of the joint: for kp immediately, for kd if the error arises within 0.1 s, for ki if it lasts for 0.1 s.
+#: Position errors [rad, m] that define the maximum gains. A gain is too large if this error causes the maximum effort of
+#: the joint: for kp immediately, for kd if the error arises within 0.1 s, for ki if it lasts for 0.1 s.
 _MIN_ERROR = (1e-4, 1e-5)
 #: Shares of the effort limit that define the minimum gains. A gain is too small if an error as large as the range of
-#: the joint demands less than this share: for kp immediately, for kd if the error arises within 1 s, for ki if it lasts
+#: the joint causes less than this share: for kp immediately, for kd if the error arises within 1 s, for ki if it lasts
 #: for 1 s.
 _MIN_SHARE = {"kp": 1e-2, "kd": 1e-4, "ki": 1e-4}
 
@@ -60,7 +60,7 @@ class Arm:
         source: Argument with which `load_arm` loads the arm: "mtml", or the absolute path of its YAML file.
         joint_names: Names of the n independent joints.
         tree_joint_names: Names of all joints of the SDF tree, including the linkage.
-        sdf: Package URLs or paths of the model files: the arm, then its instrument if it has one.
+        sdf: Package URLs or paths of the SDF files: first the arm, then its instrument if there is one.
         mirrored_links: Mapping from a URL in `sdf` to the links of that file that are mirrored for this arm.
         position_lower, position_upper: Position limits (n,) of this arm.
         effort_limits: Limits (n,) of the joint torques, from the SDF.
@@ -68,7 +68,7 @@ class Arm:
         coupled_limits: Limits of sums of joint positions.
         linkage: Map q_tree = G q + c, from the `drake:mimic` tags of the SDF.
         transmission: Map a = J q from joint positions q to actuator positions a.
-        loop_closures: Pairs of frames whose origins must coincide.
+        loop_closures: Pairs of frames whose origins coincide at every pose of the linkage.
         gravity: Gravity vector (3,) in the base frame [m/s^2].
         gains: Default gains of the controller.
         friction_coordinates: Mapping from a name to the joint coefficients (n,) of an additional friction coordinate,
@@ -127,8 +127,8 @@ class Arm:
     def gains_fault(self, gains: Gains) -> str:
         """Returns a message on the first gain that is not accepted for this arm and the accepted values, or "".
 
-        A gain must be large enough to move its joint. It must be so small that the resolution of the position
-        measurement does not demand the whole effort limit. See `_MIN_SHARE` and `_MIN_ERROR`.
+        A gain must be large enough to move its joint. It must be small enough that a position error of the size of
+        the sensor resolution does not cause the maximum effort. See `_MIN_SHARE` and `_MIN_ERROR`.
         """
         if fault := _count_fault("gains.", vars(gains), self.joint_names):
             return fault
@@ -279,14 +279,14 @@ def known_arms() -> list[str]:
 def load_arm(name: str | Path) -> Arm:
     """Loads an arm. Repeated calls return the same Arm object until the file changes.
 
-    Changes of the files that it refers to (mechanism, instrument, SDF) require a new process.
+    Changes of other files of the arm (mechanism, instrument, SDF) take effect in a new process.
 
     Args:
-        name: Name of an arm of this package, e.g. "mtml" (not case-sensitive), or path or package URL of an arm's YAML
-            file.
+        name: Name of an arm of this package, e.g. "mtml" (not case-sensitive), or path or package URL of the YAML file
+            of an arm.
 
     Raises:
-        ArmError: The arm does not exist, or its files contradict each other.
+        ArmError: The arm does not exist, or its files are invalid or inconsistent.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -316,7 +316,7 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
     path = Path(name)
     if not path.is_absolute():
         if name not in known_arms():
-            near = meant(name, known_arms())
+            near = suggestion(name, known_arms())
             raise ArmError(
                 f'unknown arm "{name}"; {near}known arms: {", ".join(known_arms())}, or the path of a YAML file'
             )

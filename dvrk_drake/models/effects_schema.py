@@ -20,7 +20,7 @@ _EFFORT_STEPS = within(1e-9, 100.0, "N m or N")
 
 @dataclass
 class DriveEffect:
-    """One effect along a coordinate of the drive, specified in an arm's file or identified.
+    """One effect along a coordinate of the drive, read from an arm file or identified.
 
     Attributes:
         coordinate: "actuator.<name>", "joint.<name>", or one of the arm's `friction_coordinates`.

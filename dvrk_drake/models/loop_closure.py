@@ -1,4 +1,4 @@
-"""Closes the kinematic loops of an arm's plant: the parallelogram of an MTM, the remote centre linkage of a PSM."""
+"""Closes the kinematic loops of a plant: the parallelogram of an MTM, the remote centre linkage of a PSM."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import LoopClosure
 from dvrk_drake.models.sdf_model import DRAKE
 
-#: Methods of closing the loops of a linkage: "mimic" couples the joints of a tree, "ball" constrains the cut loops.
+#: Methods of closing the loops of a linkage: "mimic" couples joints of the tree, "ball" adds constraints at the cuts.
 Closure = Literal["mimic", "ball"]
 
 

@@ -125,7 +125,7 @@ def set_joint_damping(plant: MultibodyPlant, arm: Arm, damping: ArrayLike) -> No
 
 
 def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex | None = None) -> NDArray[np.int_]:
-    """Returns the index of each of `arm.tree_joint_names` in the plant's q.
+    """Returns the index in the positions of the plant of each joint in `arm.tree_joint_names`.
 
     The indices are also valid for v, because all joints have one degree of freedom.
     """
@@ -134,7 +134,7 @@ def tree_selector(plant: MultibodyPlant, arm: Arm, instance: ModelInstanceIndex 
 
 
 def set_arm_positions(plant: MultibodyPlant, context: Context, arm: Arm, q: ArrayLike) -> None:
-    """Sets the whole tree, including the linkage, to the pose of the independent joints q (n,)."""
+    """Sets the positions of all joints, including those of the linkage, from the independent joint positions q (n,)."""
     q_plant = plant.GetPositions(context)
     q_plant[tree_selector(plant, arm)] = arm.linkage.position(q)
     plant.SetPositions(context, q_plant)
@@ -152,7 +152,7 @@ def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray
 def holding_torques(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the torques (m, n) that compensate gravity at poses (m, n) of the independent joints [N m, N].
 
-    They are computed from the arm's SDF.
+    The inertial parameters are those of the SDF files.
     """
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()

@@ -1,4 +1,4 @@
-"""Combines an arm's SDF files into one model, and reads properties that Drake parses but does not expose."""
+"""Combines the SDF files of an arm into one model, and reads properties that Drake parses but does not expose."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PACKAGE_URL = "package://dvrk_drake/"
 DRAKE = "{http://drake.mit.edu}"
 #: Maximum nesting of elements; the SDF of an arm has 7 levels.
 _MAX_DEPTH = 50
-#: Numbers that SDF files contain for joints without a limit.
+#: Limits of joints without a limit in SDF files.
 _NO_LIMIT = (-1e16, 1e16, -math.inf, math.inf)
 _MOMENTS, _PRODUCTS = Range(0.0, 50.0, "kg m^2"), Range(-50.0, 50.0, "kg m^2")
 _LENGTHS = Range(1e-6, 10.0, "m")
@@ -75,15 +75,14 @@ def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | Non
     """Returns the model of the first file, extended by the links, joints and frames of the others (an instrument).
 
     Relative paths of meshes become absolute. If a file repeats a link of an earlier file, only the shapes of that link
-    are added. In this way an instrument's housing is drawn on the arm's carriage without being a body of its own.
+    are added. This draws the housing of an instrument on the carriage of the arm without a body of its own.
 
     Args:
         urls: Package URLs or paths.
         mirrored: Mapping from a URL to the links of that file that are mirrored (`mirror_links`).
 
     Raises:
-        ArmError: A file is not an SDF with one model, gives an existing link more than shapes and a mass of 0, or lacks
-            a link that is to be mirrored.
+        ArmError: A file is not an SDF with one model, repeats a link with inertia, or lacks a link in `mirrored`.
     """
     root, *others = (_read(local_path(url)) for url in urls)
     for url, part in zip(urls, (root, *others), strict=True):
@@ -226,8 +225,8 @@ def _number(word: str) -> float:
         return math.nan
 
 
-def _add_shapes(link: ElementTree.Element, again: ElementTree.Element) -> None:
-    for shape in again:
+def _add_shapes(link: ElementTree.Element, repeated: ElementTree.Element) -> None:
+    for shape in repeated:
         if shape.tag not in ("visual", "collision"):
             raise ArmError(f"link {link.get('name')} has <{shape.tag}> in two files; allowed: <visual>, <collision>")
         link.append(shape)

@@ -1,4 +1,4 @@
-"""Reads a YAML file into a schema; an error message names the key, its value and the accepted values."""
+"""Reads YAML files into dataclasses. Error messages name the key, its value and the accepted values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_FastLoader):
-    """YAML loader that refuses duplicate keys in a table. By default YAML uses the last one."""
+    """YAML loader that refuses duplicate keys in a mapping. By default YAML uses the last one."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         keys: set[str] = set()
@@ -35,13 +35,13 @@ class _Loader(_FastLoader):
 
 
 def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrakeError], what: str) -> Schema:
-    """Returns the content of the file at `path` as the type of the schema.
+    """Returns the content of the file at `path` as an object of the schema.
 
     Args:
         schema: Dataclass, see `schema_fault`.
         path: Path of the file.
         error: Type of error to raise.
-        what: Kind of file that is expected, for the message: "a file of gains".
+        what: Kind of file that is expected, for the message: "a gains file".
 
     Raises:
         DvrkDrakeError: Error of type `error`: the file cannot be read, is not YAML, or does not match the schema.
@@ -50,7 +50,7 @@ def load_typed_yaml(schema: type[Schema], path: str | Path, error: type[DvrkDrak
 
 
 def typed_content(schema: type[Schema], content: Any, where: str, error: type[DvrkDrakeError], what: str) -> Schema:
-    """Converts content that was read already, see `load_typed_yaml`; `where` names its source."""
+    """Converts parsed content as `load_typed_yaml` does; `where` names the source of the content."""
     content = with_current_keys(schema, content, where)
     if fault := schema_fault(schema, content, what):
         raise error(f"{where}: {fault}")
@@ -97,7 +97,7 @@ def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
 def _excess(text: str) -> str:
     """Returns a description of excessive nesting or excessive aliases in a text, or "".
 
-    The parser's events are examined one by one, so that the check stops as soon as a maximum is exceeded.
+    The check processes the events of the parser one by one, and stops as soon as a maximum is exceeded.
     """
     # Number of values so far and anchor of each open collection.
     open_values: list[int] = [0]

@@ -126,7 +126,7 @@ class ArmLink:
             status = decode(lcmt_dvrk_status, data)
             if status is None or (status.arm_name, status.num_joints) != (self.arm.name, self.arm.num_joints):
                 return
-        elif (status := self._filter.take(data, self.now(), settle=False)) is None:
+        elif (status := self._filter.accept(data, self.now(), settle=False)) is None:
             return
         elif self._last is not None:
             self.lost += status.sequence - self._last.sequence - 1

@@ -98,9 +98,9 @@ class Recorder:
         if status is None:
             return f"waiting for {self._channel}"
         if not self._arrivals or self._arrivals[-1] < now - SILENCE:
-            return f"{self._arm.name}: no status any more; {self.stream.num_taken} rows"
+            return f"{self._arm.name}: no status any more; {self.stream.num_used} rows"
         parts = [
-            f"{self._arm.name}: {self.stream.num_taken} rows",
+            f"{self._arm.name}: {self.stream.num_used} rows",
             f"{len(self._arrivals)} Hz",
             f"{self.stream.num_lost} lost",
             describe_state(status.guard_state, status.fault_text),
@@ -123,7 +123,7 @@ class Recorder:
             self.foreign[reason] += 1
             return
         self._arrivals.append(now)
-        status = self.stream.take(data)
+        status = self.stream.accept(data)
         if self._file is None:
             if self.stream.last is None:
                 return

@@ -1,4 +1,4 @@
-"""Converts recordings to this project's CSV: CSV files with a header, LCM logs, and public recordings of real arms.
+"""Converts CSV files with a header, LCM logs and public recordings of real arms to the CSV format of this project.
 
 The public recordings are from the WPI AIM lab and have two layouts; `docs/public_recordings.md` explains how to obtain
 them.
@@ -22,8 +22,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.csv_rows import read_bytes
 from dvrk_drake.recordings.lcm_log_reader import is_lcm_log
 from dvrk_drake.recordings.public_formats import (
+    generated_times,
     looks_like_matlab,
-    made_times,
     read_team_mat,
     read_wpi_csv,
     refuse_rate,
@@ -34,7 +34,7 @@ from dvrk_drake.recordings.recording import Coordinates, Recording, column_names
 
 Format = Literal["csv", "team-mat", "wpi-csv", "lcm-log"]
 
-#: Coordinates of the formats that define them. A CSV with a header does not.
+#: Mapping from a format to its coordinates. A CSV with a header has no defined coordinates.
 DEFINED_COORDINATES: dict[str, Coordinates] = {"team-mat": "joint", "wpi-csv": "actuator", "lcm-log": "joint"}
 
 
@@ -57,15 +57,15 @@ def convert(
         path: Path of the recording.
         output: Path of the CSV to write; an existing file is replaced.
         format: Format of the recording; None to detect it.
-        coordinates: Coordinates of q, qd and tau, for "csv", which does not define them. Other formats do.
+        coordinates: Coordinates of q, qd and tau, required for "csv". Other formats define their coordinates.
         variable: Name of the variable, for "team-mat"; required if several variables match.
-        rate: Sampling rate [Hz] of a CSV without time stamps. Default: 200 for "wpi-csv", no times for "csv".
+        rate: Sampling rate [Hz] of a CSV without time stamps. None: 200 Hz for "wpi-csv", no times for "csv".
         arm: For "csv" and "wpi-csv": arm whose joint coordinates are written; None for the coordinates of the file. For
             "lcm-log": arm whose statuses are read; required if there are several.
         skip_invalid: Whether to omit and count invalid rows (or poses) instead of refusing the file.
 
     Returns:
-        The recording as written; `source`, `lines` and `notes` refer to the original.
+        Written recording. Its `source`, `lines` and `notes` refer to the original file.
 
     Raises:
         RecordingError: The file does not have the layout of the format, its coordinates are unknown, or an option does
@@ -131,7 +131,7 @@ def _read_csv(
         notes = time_notes(recording.t, recording.lines)
     elif rate is not None:
         assert recording.lines is not None
-        t, note = made_times(np.arange(len(recording)), rate)
+        t, note = generated_times(np.arange(len(recording)), rate)
         recording, notes = dataclasses.replace(recording, t=t), [note]
     else:
         notes = [

@@ -35,11 +35,11 @@ def read_bytes(path: Path) -> bytes:
 class CsvReader:
     """Reads the rows of a CSV file in blocks, so that a large file needs little memory.
 
-    The file is UTF-8 with or without a byte-order mark. Lines end in LF, CRLF or CR. Each iteration continues where the
-    previous one stopped. It yields (line number, unmodified cells) of the rows that are not blank.
+    The file is UTF-8 with or without a byte-order mark. Lines end in LF, CRLF or CR. Iteration yields (line number,
+    unmodified cells) of the rows that are not blank. A new iteration continues after the last row that was read.
 
     Attributes:
-        has_underscore: Whether an underscore was read so far; Python accepts underscores in numbers.
+        has_underscore: Whether the text read so far contains an underscore, which Python accepts in numbers.
     """
 
     def __init__(self, path: Path, progress: Callable[[float], object] = lambda share: None) -> None:

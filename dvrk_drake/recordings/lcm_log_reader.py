@@ -42,7 +42,7 @@ class LcmEvent(NamedTuple):
 
 
 class LcmLogReader:
-    """Iterates over the events of a log in their order, and skips damaged ones.
+    """Iterates over the events of a log in order, and skips damaged ones.
 
     Attributes:
         path: Path of the log.
@@ -145,7 +145,7 @@ class StatusStream:
         num_joints: Number of joints that the statuses must have.
         last: Last status of the arm, usable or not, or None.
         num_lost: Number of statuses missing in the sequence.
-        num_taken: Number of used statuses.
+        num_used: Number of used statuses.
         first_utime: Time of the first used status [us], which is the zero of a recording's t.
     """
 
@@ -153,11 +153,11 @@ class StatusStream:
         """Creates a stream for the named arm."""
         self.arm_name, self.num_joints = arm_name, num_joints
         self.last: lcmt_dvrk_status | None = None
-        self.num_lost, self.num_taken, self.first_utime = 0, 0, 0
+        self.num_lost, self.num_used, self.first_utime = 0, 0, 0
         self._sessions: list[int] = []
-        self._left_out: Counter[str] = Counter()
+        self._omitted: Counter[str] = Counter()
 
-    def take(self, data: bytes) -> lcmt_dvrk_status | None:
+    def accept(self, data: bytes) -> lcmt_dvrk_status | None:
         """Returns the status in a message, or None if it cannot be used as a measurement.
 
         Raises:
@@ -166,11 +166,11 @@ class StatusStream:
         status = decode(lcmt_dvrk_status, data)
         reason = _UNREADABLE if status is None else self._examine(status)
         if status is None or reason:
-            self._left_out[reason] += 1
+            self._omitted[reason] += 1
             return None
-        if not self.num_taken:
+        if not self.num_used:
             self.first_utime = status.utime
-        self.num_taken += 1
+        self.num_used += 1
         return status
 
     def time(self, status: lcmt_dvrk_status) -> float:
@@ -179,7 +179,7 @@ class StatusStream:
 
     def notes(self) -> list[str]:
         """Returns descriptions of omitted and lost statuses, one per line."""
-        notes = [f"messages omitted, {reason}: {count}" for reason, count in self._left_out.items()]
+        notes = [f"messages omitted, {reason}: {count}" for reason, count in self._omitted.items()]
         if self.num_lost:
             notes.append(f"messages lost (gaps in the sequence numbers): {self.num_lost}")
         if len(self._sessions) > 1:
@@ -187,7 +187,7 @@ class StatusStream:
         return notes
 
     def _examine(self, status: lcmt_dvrk_status) -> str:
-        """Returns the reason why a status cannot be used, or "". Unusable statuses also advance the sequence."""
+        """Returns the reason why a status is not usable, or "". Unusable statuses also advance the sequence number."""
         if status.arm_name != self.arm_name or status.num_joints != self.num_joints:
             return _FOREIGN
         continues = self._follow_session(status.session_id)
@@ -201,7 +201,7 @@ class StatusStream:
         return _OFF if status.guard_state == lcmt_dvrk_status.STATE_OFF else ""
 
     def _follow_session(self, session_id: int) -> bool:
-        """Returns whether the session is that of the previous message. A session that reappears had not ended."""
+        """Returns whether the session is that of the previous message. Raises an error if an earlier one reappears."""
         if self._sessions and self._sessions[-1] == session_id:
             return True
         if session_id in self._sessions:
@@ -268,7 +268,7 @@ def read_status_log(path: str | Path, arm: Arm | None = None) -> StatusLog:
         if stream is None and (first := decode(lcmt_dvrk_status, event.data)):
             stream = StatusStream(first.arm_name, first.num_joints)
         try:
-            status = stream.take(event.data) if stream else None
+            status = stream.accept(event.data) if stream else None
         except RecordingError as error:
             raise RecordingError(f"{path}: event {event.number}: {error}") from error
         if status is not None and stream is not None:
@@ -277,7 +277,7 @@ def read_status_log(path: str | Path, arm: Arm | None = None) -> StatusLog:
             events.append(event.number)
     notes = [*log.notes, *(stream.notes() if stream else [])]
     if not events:
-        raise RecordingError(f"{path}: {_why_nothing(channel, arm, channels, notes)}")
+        raise RecordingError(f"{path}: {_no_usable_status(channel, arm, channels, notes)}")
     q, qd, tau = np.array(rows).reshape(len(events), 3, -1).transpose(1, 0, 2)
     return StatusLog(np.array(times), q, qd, tau, np.array(events), tuple(notes), log.sha256())
 
@@ -291,7 +291,7 @@ def _only_status_channel(log: LcmLogReader) -> str:
     return channels[0] if channels else STATUS_PREFIX
 
 
-def _why_nothing(channel: str, arm: Arm | None, channels: Counter[str], notes: list[str]) -> str:
+def _no_usable_status(channel: str, arm: Arm | None, channels: Counter[str], notes: list[str]) -> str:
     if count := channels[channel]:
         reasons = "; ".join(notes) or _UNREADABLE
         return f"none of the {count} messages on channel {channel} is usable: {reasons}"

@@ -25,7 +25,7 @@ _ROUNDING = 1e-9
 
 @dataclass
 class PoseFile:
-    """Schema of a file of poses: the name of the arm, and one list of n joint positions [rad, m] per pose."""
+    """Schema of a pose file: the name of the arm, and one list of n joint positions [rad, m] per pose."""
 
     format: str = "dvrk_drake poses 1"
     arm: str = ""
@@ -37,7 +37,7 @@ def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
     """Returns the poses (m, n) in a file after checking them.
 
     Raises:
-        CollectionError: The file does not exist, is not a file of poses, is of another arm, or has a pose that
+        CollectionError: The file does not exist, is not a pose file, is of another arm, or has a pose that
             `check_poses` refuses.
     """
     if not os.path.lexists(path):
@@ -114,17 +114,21 @@ def load_poses_if_any(path: str | Path, arm: Arm) -> NDArray[np.float64]:
 class CollectionFile:
     """CSV file with one row per finished pose. A row is on the disk when `append` returns.
 
-    The columns are q1..qn and tau1..taun, as measured and as in every Recording; friction1..n, half of the difference
-    between the efforts of the two approach directions, if both are used; pose1..n, the requested pose; arm; utime, when
-    the row was written [us since 1970]. Joints are in the arm's order [rad, N m; m, N for a prismatic joint].
+    Units are rad and N m, or m and N for a prismatic joint. The columns are:
+
+    - q1..qn and tau1..taun: measured positions and efforts, as in every Recording.
+    - pose1..posen: requested pose.
+    - arm: name of the arm.
+    - utime: time when the row was written [us since 1970].
+    - friction1..frictionn: half of the difference between the efforts of the two approach directions, if both are used.
     """
 
     def __init__(self, path: str | Path, arm: Arm, both_sides: bool) -> None:
-        """Opens the file at `path`. If it exists, it must have rows of this kind.
+        """Opens the file at `path`, or prepares a new one.
 
         Args:
             path: Path of a CSV that is created or continued.
-            arm: Arm of the poses.
+            arm: Measured arm.
             both_sides: Whether each pose is measured from both approach directions.
 
         Raises:
@@ -136,8 +140,8 @@ class CollectionFile:
         if both_sides:
             self._header += self._names("friction")
         self._file: GrowingFile | None = None
-        self._is_there, self._has_header = os.path.lexists(path), False
-        self._rows = self._read() if self._is_there else []
+        self._exists, self._has_header = os.path.lexists(path), False
+        self._rows = self._read() if self._exists else []
 
     def finished(self, poses: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Returns an array (m,) of bool that marks which of `poses` (m, n) are already in the file.
@@ -169,7 +173,7 @@ class CollectionFile:
             RecordingError: The row cannot be written; the previous rows are complete.
         """
         if self._file is None:
-            self._file = GrowingFile(self._path, resume=self._is_there, sync=True)
+            self._file = GrowingFile(self._path, resume=self._exists, sync=True)
             if not self._has_header:
                 self._file.append((",".join(self._header) + "\n").encode())
         numbers = [*map(repr, [*q.tolist(), *tau.tolist(), *pose.tolist()])]

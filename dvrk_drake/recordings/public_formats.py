@@ -35,7 +35,7 @@ from dvrk_drake.recordings.recording import Recording
 #: Nominal sampling rate of the recordings [Hz].
 WPI_RATE = 200.0
 
-#: Joints whose recorded coordinates are those of the joint itself, although a disc drives them.
+#: Joints that are recorded in joint coordinates, although a disc drives them.
 WPI_DIRECT_JOINTS = ("roll",)
 
 _NUM_JOINTS = 7
@@ -95,7 +95,7 @@ def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: b
         t, kept = kept[:, 0], kept[:, 1:]
         notes = time_notes(t, lines[valid])
     else:
-        t, note = made_times(np.flatnonzero(valid), WPI_RATE if rate is None else rate)
+        t, note = generated_times(np.flatnonzero(valid), WPI_RATE if rate is None else rate)
         notes = [note]
     if len(kept) < len(values):
         notes.append(skipped_note(lines[~valid], len(values)))
@@ -124,7 +124,7 @@ def refuse_rate(path: Path, rate: float | None) -> None:
         raise RecordingError(f"{path}: --rate does not apply: the file has time stamps (column t), which are kept")
 
 
-def made_times(rows: NDArray[np.intp], rate: float) -> tuple[NDArray[np.float64], str]:
+def generated_times(rows: NDArray[np.intp], rate: float) -> tuple[NDArray[np.float64], str]:
     """Returns times [s] for the row numbers of a file without time stamps, and a note on them.
 
     Raises:
@@ -152,8 +152,8 @@ def time_notes(t: NDArray[np.float64], lines: NDArray[np.int_]) -> list[str]:
 def wpi_in_joint_coordinates(recording: Recording, arm: Arm) -> Recording:
     """Converts a "wpi-csv" recording of `arm` from actuator to joint coordinates.
 
-    Its actuators are those of the dVRK, except for the roll of a PSM, which is recorded at the joint (Wang et al. 2019,
-    table of the PSM).
+    The recorded coordinates are those of the actuators of the dVRK. The roll of a PSM is recorded at the joint instead
+    (Wang et al. 2019, table of the PSM).
 
     Raises:
         RecordingError: The number of joints is wrong, or the arm cannot reach the poses.

@@ -202,10 +202,10 @@ class Recording:
         )
         outside = np.mean(np.any(excess > 1, axis=1))
         shares = np.max(np.abs(q) / np.maximum(-arm.position_lower, arm.position_upper), axis=0)
-        turning = np.max(shares[~arm.prismatic])
+        revolute = np.max(shares[~arm.prismatic])
         # With another arm or other coordinates, positions exceed the limits by a factor of 2 or 3; in degrees by up to
         # 57.
-        if outside > 0.3 and turning > 4 and np.radians(turning) <= 1.2:
+        if outside > 0.3 and revolute > 4 and np.radians(revolute) <= 1.2:
             message += " Are the positions in degrees instead of rad, or of another arm?"
         elif arm.prismatic[joint] and shares[joint] > 4:
             message += " Are the positions in millimetres or centimetres instead of m?"
@@ -256,7 +256,7 @@ def read_recording(
     """Reads a CSV, or an LCM log with the DVRK_STATUS messages of an arm; the file content selects the format.
 
     A CSV has a header with q1..qn and optionally t, qd1..qdn and tau1..taun, in any order. Other columns are ignored.
-    `read_status_log` describes what is read from a log.
+    For the content of a log, see `read_status_log`.
 
     Args:
         path: Path of the CSV or log.
@@ -268,7 +268,7 @@ def read_recording(
         progress: Callback that receives the step, "reading", and the completed share 0..1 of a CSV.
 
     Returns:
-        The recording, with its SHA-256 and with line numbers for messages; `notes` list what was omitted.
+        Recording with SHA-256 and line numbers. Its `notes` list omitted rows and messages.
 
     Raises:
         RecordingError: The file cannot be read as a recording. The message names the file, line and column.
@@ -303,7 +303,7 @@ def _read_csv(
     with CsvReader(path, progress) as reader:
         header_line, cells = next(iter(reader), (0, []))
         if not cells:
-            raise RecordingError(f"{path}: is empty; needs a header with {_wanted(num_joints)}")
+            raise RecordingError(f"{path}: is empty; needs a header with {_expected_columns(num_joints)}")
         header = [cell.strip() for cell in cells]
         blocks = _columns_of_blocks(f"{path}, line {header_line}", header, arm, num_joints)
         values, lines, skipped = _read_numbers(path, reader, header, blocks, skip_invalid)
@@ -325,11 +325,11 @@ def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joint
     """Returns a mapping from a prefix (q, qd, tau, t) to its columns in the header."""
     if all(is_number(cell) for cell in header):
         raise RecordingError(
-            f"{where}: the header is missing. The first line must contain the column names {_wanted(num_joints)}. "
-            "dvrk-drake convert reads public recordings without a header."
+            f"{where}: the header is missing. The first line must contain the column names "
+            f"{_expected_columns(num_joints)}. dvrk-drake convert reads public recordings without a header."
         )
-    if twice := next((name for name, count in Counter(header).items() if name and count > 1), ""):
-        raise RecordingError(f"{where}: column {twice[:30]} occurs twice")
+    if duplicate := next((name for name, count in Counter(header).items() if name and count > 1), ""):
+        raise RecordingError(f"{where}: column {duplicate[:30]} occurs twice")
     blocks = {}
     for prefix, needed in (("q", True), ("qd", False), ("tau", False)):
         names = column_names(prefix, num_joints)
@@ -339,7 +339,7 @@ def _columns_of_blocks(where: str, header: list[str], arm: Arm | None, num_joint
         if missing:
             raise RecordingError(
                 f"{where}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; "
-                f"needs {_wanted(num_joints)}{_joint_list(arm)}"
+                f"needs {_expected_columns(num_joints)}{_joint_list(arm)}"
             )
         if f"{prefix}{num_joints + 1}" in header:
             raise RecordingError(
@@ -376,10 +376,10 @@ def _read_numbers(
         for part, columns in parts:
             try:
                 numbers = [float(cells[column]) for column in columns]
-                is_good = math.isfinite(sum(numbers)) and not reader.has_underscore
+                valid = math.isfinite(sum(numbers)) and not reader.has_underscore
             except ValueError:
-                is_good = False
-            if not is_good:
+                valid = False
+            if not valid:
                 numbers = [
                     parse_finite(cells[column].strip(), f"{path}, line {line}: {header[column]}") for column in columns
                 ]
@@ -437,5 +437,5 @@ def _joint_list(arm: Arm | None) -> str:
     return f"; joints of {arm.name}: {', '.join(arm.joint_names)}" if arm else ""
 
 
-def _wanted(num_joints: int) -> str:
+def _expected_columns(num_joints: int) -> str:
     return f"q1..q{num_joints} and tau1..tau{num_joints} (t and qd1..qd{num_joints} optional)"

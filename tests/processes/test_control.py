@@ -357,7 +357,7 @@ def test_with_a_key_statuses_must_be_signed_and_commands_are():
     signed = key.sign(status_bytes(100))
     corrupted = [signed[:k] + bytes([signed[k] ^ 1]) + signed[k + 1 :] for k in range(32, len(signed))]
     for message in (status_bytes(100), MessageKey(bytes([1] * 32)).sign(status_bytes(100)), *corrupted):
-        assert linked.link._filter.take(message, 0.0) is None
+        assert linked.link._filter.accept(message, 0.0) is None
     assert linked.hear(status_bytes(101)) is None
     assert linked.said.endswith("both sides need the same key (--key)")
     assert linked.hear(signed).sequence == 100
