@@ -37,8 +37,8 @@ from dvrk_drake.models.typed_yaml import load_typed_yaml
 _ARMS = MODELS_FOLDER / "arms"
 #: Maximum length of the gravity vector [m/s^2].
 MAX_GRAVITY = 30.0
-#: Position errors [rad, m] that define the maximum gains. A gain is too large if this error causes the maximum effort of
-#: the joint: for kp immediately, for kd if the error arises within 0.1 s, for ki if it lasts for 0.1 s.
+#: Position errors [rad, m] that define the maximum gains. A gain is too large if this error causes the maximum effort
+#: of the joint: for kp immediately, for kd if the error arises within 0.1 s, for ki if it lasts for 0.1 s.
 _MIN_ERROR = (1e-4, 1e-5)
 #: Shares of the effort limit that define the minimum gains. A gain is too small if an error as large as the range of
 #: the joint causes less than this share: for kp immediately, for kd if the error arises within 1 s, for ki if it lasts
