@@ -1,4 +1,4 @@
-"""Tests input files that are missing, too large, too deeply nested or unreadable: each reader fails with one line."""
+"""Tests that each reader refuses missing, too large, deeply nested and unreadable files with a message of one line."""
 
 import math
 import os
@@ -63,7 +63,7 @@ def test_non_files_are_refused_in_one_line(name, kind, tmp_path):
     NO_FILES[kind](path)
     with pytest.raises(DvrkDrakeError) as refusal:
         READERS[name](path)
-    assert name in str(refusal.value) or kind == "device"  # the name by which an arm is loaded
+    assert name in str(refusal.value) or kind == "device"
     assert "\n" not in str(refusal.value)
     assert not os.path.exists(f"{path}.out")
 
@@ -117,7 +117,7 @@ def test_aliases_of_aliases_are_refused():
 
 
 def own_arm(folder, change):
-    """Writes the files of an MTM whose SDF is changed everywhere by `change` (regular expression, new text)."""
+    """Writes the files of an MTM. `change` (regular expression, new text) is applied to all matches in the SDF."""
     mechanism = (MODELS_FOLDER / "mechanisms/mtm.yaml").read_text()
     url = next(line.split()[1] for line in mechanism.splitlines() if line.startswith("sdf:"))
     (folder / "mechanism.yaml").write_text(mechanism.replace(url, "own.sdf"))

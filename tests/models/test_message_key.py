@@ -1,4 +1,4 @@
-"""Tests keys of messages: accepted key files, signatures, and rejected messages."""
+"""Tests message keys: key files, signatures, and rejected messages."""
 
 import hashlib
 import os
@@ -30,7 +30,7 @@ def test_signed_message_is_verified_and_decoded(message):
     assert key.verify(signed) and not key.verify(data)
     back = type(message).decode(signed)
     assert (back.utime, back.arm_name, back.mac_size) == (12345, "MTML", 16)
-    # Independent computation, as in a bridge in another language.
+    # Independent computation of the code, as in a bridge in another language.
     assert back.mac == hashlib.blake2b(data[:-1], key=KEY, digest_size=16).digest()
     assert back.encode() == signed
 
@@ -50,7 +50,7 @@ def test_any_other_byte_length_or_key_is_not_authentic():
 
 
 @pytest.mark.parametrize("size", [16, 32, 64])
-def test_a_key_is_the_content_of_its_file(tmp_path, size):
+def test_key_is_the_content_of_its_file(tmp_path, size):
     content = os.urandom(size)
     signed = MessageKey.load(write(tmp_path / "a.key", content)).sign(Command().encode())
     assert MessageKey(content).verify(signed)
@@ -72,7 +72,7 @@ def test_a_key_is_the_content_of_its_file(tmp_path, size):
         (None, 0o600, r"a\.key: no such file"),
     ],
 )
-def test_bad_keys_are_refused_in_one_line(tmp_path, content, mode, message, capsys):
+def test_invalid_keys_are_refused_in_one_line(tmp_path, content, mode, message, capsys):
     path = tmp_path / "a.key"
     if content is not None:
         write(path, content, mode)

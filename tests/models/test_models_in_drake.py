@@ -1,4 +1,4 @@
-"""Tests the model files with Drake's own parser against the arms that `load_arm` composes."""
+"""Compares models read by the parser of Drake with the arms of `load_arm`."""
 
 import re
 import runpy
@@ -40,7 +40,7 @@ def plain_plant(name: str) -> MultibodyPlant:
 
 
 def positions(plant: MultibodyPlant, arm: Arm, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns positions of the plant at the arm's pose, and the index of each of the arm's tree joints."""
+    """Returns the positions of the plant at pose q (n,), and the index of each tree joint of the arm."""
     index = np.array([plant.GetJointByName(joint).position_start() for joint in arm.tree_joint_names])
     q_plant = np.zeros(plant.num_positions())
     q_plant[index] = arm.linkage.position(q)
@@ -110,7 +110,7 @@ def test_mtm_files_equal_the_output_of_the_tool(name):
     assert (MODELS_FOLDER / "sdf" / f"{name}.sdf").read_text() == tool["master_sdf"](load_arm(name))
 
 
-def test_the_page_about_drake_runs(capsys):
+def test_code_of_the_page_about_drake_runs(capsys):
     page = (ROOT / "docs/models_in_drake.md").read_text()
     for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         exec(code, {})

@@ -50,7 +50,7 @@ OBJECTS = (Arm, GravityCompensationFile, CollectionSettings, Grip)
 
 
 def numbers_of(schema: type, path: tuple = ()):
-    """Yields (path, field, type) of each field with numbers; path: the names, [0] of a list and "x" of a table."""
+    """Yields (path, field, type) of each field with numbers. A path has names, 0 for a list and "x" for a mapping."""
     hints = get_type_hints(schema)
     for field in dataclasses.fields(schema):
         yield from numbers_in(hints[field.name], (*path, field.name), field)
@@ -155,7 +155,7 @@ def changed(owner, path, value):
     [(gain, value) for gain in ("kp", "kd", "ki") for value in (1e-9, 1e9, math.nan, math.inf, -1.0)],
 )
 @pytest.mark.parametrize("arm", ["mtml", "psm"])
-def test_absurd_gains_are_refused_in_files_and_in_python(arm, gain, value, tmp_path, capsys):
+def test_implausible_gains_are_refused_in_files_and_python(arm, gain, value, tmp_path, capsys):
     arm = load_arm(arm)
     gains = dataclasses.asdict(arm.gains)
     gains[gain][2] = value
@@ -272,7 +272,7 @@ LIMITS, COUPLED = "position_limits", "coupled_limits"
         ("mechanism", ("gains", "ki"), [9.5, 9.5, 1e8], r"gains\.ki\[2\] is 1e\+08; .* effort limit of insertion"),
     ],
 )
-def test_absurd_numbers_in_the_files_of_an_arm_are_refused(file, keys, value, message, own_psm, capsys):
+def test_implausible_numbers_in_arm_files_are_refused(file, keys, value, message, own_psm, capsys):
     path = own_psm([(file, keys, value)])
     with pytest.raises(ArmError, match=message) as refused:
         load_arm(str(path))
@@ -299,7 +299,7 @@ def test_absurd_numbers_in_the_files_of_an_arm_are_refused(file, keys, value, me
         ('offset="[^"]*', 'offset="90', r"offset is 90; allowed: .*; is it in degrees or mm\?"),
     ],
 )
-def test_absurd_numbers_in_an_sdf_are_refused(element, value, message, own_psm, capsys):
+def test_implausible_numbers_in_an_sdf_are_refused(element, value, message, own_psm, capsys):
     path = own_psm(sdf=(element, value))
     with pytest.raises(ArmError, match=message):
         load_arm(str(path))
@@ -323,7 +323,7 @@ def test_pose_with_degrees_attribute_is_read(own_psm):
         ("gravity[2]", -1e300, r"allowed: -30\.\.30 m/s\^2"),
     ],
 )
-def test_absurd_numbers_in_a_model_are_refused(key, value, message, tmp_path, capsys):
+def test_implausible_numbers_in_a_model_are_refused(key, value, message, tmp_path, capsys):
     path = tmp_path / "model.yaml"
     IdentifiedModel.from_arm(load_arm("mtml")).save(path)
     content = yaml.safe_load(path.read_text())

@@ -1,4 +1,4 @@
-"""Tests settings files: errors name the key, its value and the accepted values at any depth."""
+"""Tests YAML files. Errors name the key, its value and the accepted values at any depth."""
 
 from dataclasses import dataclass, field
 
@@ -110,7 +110,7 @@ class Outer:
     ],
 )
 def test_accepts_the_same_content_as_drake(line):
-    """Checks that the same content is accepted as by Drake, except that numbers must be finite."""
+    """Checks that the schema accepts the same content as Drake, except for numbers that are not finite."""
     try:
         expected = yaml_load_typed(schema=Outer, data=line)
     except Exception:
@@ -163,7 +163,7 @@ def test_keys_of_earlier_versions_are_read_with_a_warning(tmp_path):
     ]
 
 
-def test_an_earlier_key_beside_its_new_one_is_refused(tmp_path):
+def test_earlier_and_new_key_together_are_refused(tmp_path):
     (tmp_path / "scenario.yaml").write_text("arm: mtml\nreal_arm: [stops]\nsimulated_effects: [stops]\n")
     with pytest.raises(ScenarioError, match='key "real_arm" is unknown'):
         load_scenario(str(tmp_path / "scenario.yaml"), [])

@@ -1,4 +1,4 @@
-"""Tests that the file of a collection grows by complete rows and can be continued after any interruption."""
+"""Tests that a collection file always has complete rows and can be continued after an interruption."""
 
 import signal
 import subprocess
@@ -26,7 +26,7 @@ def append_all(path, arm, poses, both_sides=True):
 
 @pytest.mark.parametrize("both_sides", [True, False])
 @pytest.mark.parametrize("name", ARMS)
-def test_a_collection_is_a_recording_and_goes_on(name, both_sides, tmp_path):
+def test_collection_is_a_recording_and_can_be_continued(name, both_sides, tmp_path):
     arm, path = load_arm(name), tmp_path / "o.csv"
     poses = random_poses(arm, 6)
     append_all(path, arm, poses[:2], both_sides)
@@ -98,7 +98,7 @@ def test_written_rows_survive_kill(tmp_path):
     assert len(rows) >= last_row
 
 
-def test_a_full_disk_leaves_whole_rows(tmp_path):
+def test_full_disk_leaves_complete_rows(tmp_path):
     code = (
         "import resource, signal, sys\nfrom dvrk_drake.recordings.csv_rows import GrowingFile\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"

@@ -64,7 +64,7 @@ def test_an_empty_file_has_no_format(tmp_path, content):
     assert_refused(r"motion\.csv: is empty", convert, path, tmp_path / "out.csv", coordinates="joint")
 
 
-def test_an_explicit_format_wins_over_the_name(tmp_path):
+def test_explicit_format_overrides_the_file_name(tmp_path):
     path = write_wpi(tmp_path, wpi_rows()).rename(tmp_path / "motion.mat")
     assert len(convert(path, tmp_path / "out.csv", format="wpi-csv")) == 4
 
@@ -90,7 +90,7 @@ def test_convert_does_not_overwrite_its_input(tmp_path):
     assert path.read_bytes() == before
 
 
-def test_convert_leaves_an_old_output_alone_when_it_fails(tmp_path):
+def test_failed_conversion_keeps_the_old_output(tmp_path):
     output = tmp_path / "out.csv"
     output.write_text("old")
     assert_refused("has 1 valid row", convert, write_text(tmp_path, NUMBERS), output)
@@ -99,7 +99,7 @@ def test_convert_leaves_an_old_output_alone_when_it_fails(tmp_path):
         convert(write_wpi(tmp_path, wpi_rows()), tmp_path / "no" / "out.csv")
 
 
-def test_a_real_motion_without_its_header_and_time_converts_back(shared_data, tmp_path):
+def test_real_motion_without_header_and_time_is_restored(shared_data, tmp_path):
     original = (shared_data / "trajectories" / "mtm_one.csv").read_text().splitlines()[1:]
     path = write_text(tmp_path, "\n".join(line.split(",", 1)[1] for line in original))
     notes = convert(path, tmp_path / "out.csv").notes
@@ -115,15 +115,15 @@ TIMED = "t,q1,q2,q3,q4,q5,q6,q7,qd1,qd2,qd3,qd4,qd5,qd6,qd7,tau1,tau2,tau3,tau4,
 
 
 def write_timed(folder, times, header=TIMED):
-    """Writes a CSV with a header, one row for each text in `times`; all other numbers are known."""
+    """Writes a CSV with a header and one row per element of `times`. Returns its path and the other numbers."""
     rows = wpi_rows(len(times))
     lines = [",".join([str(t), *(repr(float(x)) for x in row)]) for t, row in zip(times, rows, strict=True)]
     return write_text(folder, "\n".join([header, *lines]) + "\n"), rows
 
 
 @pytest.mark.parametrize("coordinates", ["joint", "actuator"])
-def test_our_csv_keeps_time_stamps_columns_and_coordinates(tmp_path, coordinates):
-    """Checks a minute at 100 Hz: 59.98 s remains 59.98 s."""
+def test_csv_keeps_time_stamps_columns_and_coordinates(tmp_path, coordinates):
+    """Checks one minute at 100 Hz."""
     path, rows = write_timed(tmp_path, [0.01 * k for k in range(5999)])
     recording = convert(path, tmp_path / "out.csv", coordinates=coordinates)
     assert recording.coordinates == coordinates
@@ -159,7 +159,7 @@ def test_a_format_that_defines_its_coordinates_keeps_them(tmp_path):
     assert convert(text, output, coordinates="actuator").coordinates == "actuator"
 
 
-def test_a_rate_is_refused_where_the_file_has_time_stamps(tmp_path):
+def test_rate_is_refused_if_the_file_has_time_stamps(tmp_path):
     path, _ = write_timed(tmp_path, [0, 0.01, 0.02])
     output = tmp_path / "out.csv"
     for options in ({"coordinates": "joint"}, {"format": "wpi-csv"}):
@@ -176,8 +176,8 @@ def test_a_rate_is_refused_where_the_file_has_time_stamps(tmp_path):
     assert "no column t" in recording.notes[0]
 
 
-def test_our_csv_is_read_as_wpi_csv_with_its_times(tmp_path):
-    """Reads a file converted without --arm. For a PSM only this format defines the coordinate of the roll."""
+def test_converted_csv_is_read_as_wpi_csv_with_times(tmp_path):
+    """Reads a file converted without --arm. Only this format defines the recorded coordinate of the roll of a PSM."""
     path, rows = write_timed(tmp_path, [0, 0.011, 0.019])
     recording = convert(path, tmp_path / "out.csv", format="wpi-csv")
     assert recording.coordinates == "actuator"
@@ -197,7 +197,7 @@ def test_irregular_time_stamps_are_kept_and_counted(tmp_path):
         )
 
 
-def test_time_stamps_that_are_no_numbers(tmp_path):
+def test_invalid_time_stamps_are_refused_or_skipped(tmp_path):
     path, rows = write_timed(tmp_path, ["0", "nan", "0.02", "0.03"])
     for options in ({"coordinates": "joint"}, {"format": "wpi-csv"}):
         assert_refused(
@@ -213,7 +213,7 @@ def test_time_stamps_that_are_no_numbers(tmp_path):
         assert any("1 of 4 rows skipped (empty, NaN or infinite): lines 3" in note for note in recording.notes)
 
 
-def test_positions_alone_and_columns_that_are_not_kept(tmp_path):
+def test_positions_without_efforts_and_ignored_columns(tmp_path):
     header = "time,q1,q2,q3,q4,q5,q6,q7,temperature"
     path = write_text(tmp_path, f"{header}\n0,1,2,3,4,5,6,7,40\n1,2,3,4,5,6,7,8,41\n")
     recording = convert(path, tmp_path / "out.csv", coordinates="joint")

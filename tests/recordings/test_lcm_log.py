@@ -31,10 +31,10 @@ def assert_same_numbers(recording, expected):
     np.testing.assert_allclose(recording.t, [1e-6 * (s.utime - expected[0].utime) for s in expected], atol=1e-12)
 
 
-# The project's reader and LCM's reader agree.
+# Comparison with the reader of LCM.
 
 
-def test_reads_what_lcm_writes(tmp_path):
+def test_reads_logs_written_by_lcm(tmp_path):
     log = lcm.EventLog(str(tmp_path / "lcm.log"), "w")
     for status in statuses():
         log.write_event(status.utime + 300, "OTHER", b"noise")
@@ -48,7 +48,7 @@ def test_reads_what_lcm_writes(tmp_path):
     assert_same_numbers(read_recording(tmp_path / "lcm.log"), statuses())
 
 
-def test_lcm_reads_what_we_write(tmp_path):
+def test_lcm_reads_logs_of_this_package(tmp_path):
     path = write_log(tmp_path / "ours.log", statuses())
     events = list(lcm.EventLog(str(path)))
     ours = list(LcmLogReader(path))
@@ -59,7 +59,7 @@ def test_lcm_reads_what_we_write(tmp_path):
 # Damage.
 
 
-def test_a_log_cut_anywhere_is_read_up_to_there(tmp_path):
+def test_truncated_log_is_read_up_to_its_end(tmp_path):
     whole = log_bytes(statuses(4))
     size = len(whole) // 4
     for length in range(2 * size, 4 * size):
@@ -80,11 +80,11 @@ def test_a_log_cut_anywhere_is_read_up_to_there(tmp_path):
     ],
     ids=["bytes missing", "long channel", "long data", "negative length", "no magic"],
 )
-def test_a_damaged_event_is_left_out_and_the_rest_is_read(tmp_path, begin, replaced, inserted):
+def test_damaged_event_is_skipped(tmp_path, begin, replaced, inserted):
     whole = log_bytes(statuses(10))
     at = 5 * len(whole) // 10 + begin
     recording = read_recording(write_log(tmp_path / "a.log", whole[:at], inserted, whole[at + replaced :]), ARM)
-    # An event is accepted only if another one follows. Without its magic number the previous event is lost too.
+    # An event is accepted only if another one follows. If the magic number is damaged, the previous event is lost too.
     kept = [k for k in range(10) if k != 5 and not (begin == 0 and k == 4)]
     assert_same_numbers(recording, [statuses(10)[k] for k in kept])
     assert "damaged bytes skipped" in recording.notes[0]
@@ -92,7 +92,7 @@ def test_a_damaged_event_is_left_out_and_the_rest_is_read(tmp_path, begin, repla
 
 
 def test_damaged_logs_are_read_or_refused(tmp_path):
-    """Damages logs. Changed numbers can go undetected without a checksum, but rows stay in order and of one arm."""
+    """Damages logs. Without a checksum, changed numbers are not detected, but the rows are in order and of one arm."""
     whole = log_bytes(statuses(12))
     generator, read = np.random.default_rng(3), 0
     for _ in range(300):
@@ -118,7 +118,7 @@ def test_damaged_logs_are_read_or_refused(tmp_path):
 
 
 def changed(k, **changes):
-    """Returns statuses of which the k-th is changed."""
+    """Returns statuses in which fields of the k-th status are changed."""
     result = statuses()
     for name, value in changes.items():
         setattr(result[k], name, value)
@@ -148,7 +148,7 @@ def test_unusable_statuses_are_omitted_and_noted(tmp_path, messages, note):
     assert any(n.startswith(note) for n in recording.notes), recording.notes
 
 
-def test_a_restart_is_noted_and_two_arms_of_one_name_are_refused(tmp_path):
+def test_restart_is_noted_and_duplicate_arms_are_refused(tmp_path):
     first, second = statuses(20), statuses(20, session_id=78)
     recording = read_recording(write_log(tmp_path / "restart.log", [*first[:9], *second[12:]]), ARM)
     assert_same_numbers(recording, [*first[:9], *second[12:]])
@@ -158,7 +158,7 @@ def test_a_restart_is_noted_and_two_arms_of_one_name_are_refused(tmp_path):
         read_recording(write_log(tmp_path / "a.log", mixed), ARM)
 
 
-def test_the_arm_is_chosen_among_several(tmp_path):
+def test_arm_is_selected_from_several(tmp_path):
     other = log_bytes(statuses(5, arm_name="MTMR"), "DVRK_STATUS_MTMR")
     path = write_log(tmp_path / "both.log", other, statuses(), other)
     assert_same_numbers(read_recording(path, ARM), statuses())
@@ -193,8 +193,8 @@ def test_a_log_is_in_joint_coordinates(tmp_path):
 # Commands that read a recording.
 
 
-def test_commands_read_a_log_as_they_read_a_csv(tmp_path, capsys):
-    """Uses one status per pose, one second apart: a log of static poses."""
+def test_commands_read_logs_like_csv_files(tmp_path, capsys):
+    """Uses a log of static poses with one status per pose, at intervals of 1 s."""
     truth = IdentifiedModel.from_arm(ARM)
     messages = statuses(40)
     for k, status in enumerate(messages):
@@ -223,7 +223,7 @@ def test_commands_read_a_log_as_they_read_a_csv(tmp_path, capsys):
 
 
 def test_log_of_a_moving_arm_is_identified_by_static_segments(tmp_path, capsys):
-    """Identifies from a log at 1 kHz with motions between poses, whose friction would falsify a model."""
+    """Identifies a model from a log at 1 kHz. Friction during the motions between poses must not affect the model."""
     generator = np.random.default_rng(5)
     recording = motion_with_pauses(ARM, ARM.sample_poses(16, generator, margin=0.05), generator, 1.0, 1.0, 1000.0)
     messages = []
@@ -255,7 +255,7 @@ def test_convert_refuses_options_of_other_formats(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".log"])
-def test_a_growing_file_is_whole_after_every_message(tmp_path, suffix):
+def test_file_is_complete_after_each_message(tmp_path, suffix):
     stream = StatusStream("MTML", N)
     path = tmp_path / f"a{suffix}"
     file = open_recording_file(path, ARM, stream)
@@ -278,7 +278,7 @@ def test_unwritable_outputs_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".log"])
-def test_a_full_disk_ends_the_file_with_a_whole_row(tmp_path, suffix):
+def test_full_disk_ends_the_file_with_a_complete_row(tmp_path, suffix):
     stream = StatusStream("MTML", N)
     path = tmp_path / f"a{suffix}"
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

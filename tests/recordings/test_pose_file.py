@@ -1,4 +1,4 @@
-"""Tests files of poses: exact round trip, and errors of one line."""
+"""Tests pose files: exact round trip, and error messages of one line."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ ARMS = ("mtml", "psm")
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_poses_come_back_bit_for_bit(name, tmp_path):
+def test_pose_file_round_trip_is_exact(name, tmp_path):
     arm = load_arm(name)
     poses = random_poses(arm, 30)
     save_poses(poses, arm, tmp_path / "p.yaml")
@@ -45,12 +45,12 @@ GOOD = "0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5"
         ("arm: MTML\nposes:\n- [0.1, 0.7, 0.3, 0, 0, 0, 0]", "pose 1: parallelogram = 1 is outside"),
     ],
 )
-def test_bad_files_of_poses_are_refused_in_one_line(text, message, tmp_path, capsys):
+def test_invalid_pose_files_are_refused_in_one_line(text, message, tmp_path, capsys):
     path, output = tmp_path / "p.yaml", tmp_path / "o.csv"
     path.write_text(text)
     with pytest.raises(CollectionError, match=message):
         load_poses(path, load_arm("mtml"))
-    # The command refuses the file before it connects to an arm, for every task.
+    # With every option, the command refuses the file before it connects to an arm.
     for task in (["--output", str(output)], ["--teach"], ["--random", "2"]):
         assert main(["collect", "--arm", "mtml", "--poses", str(path), *task]) == 2
         error = capsys.readouterr().err
@@ -60,7 +60,7 @@ def test_bad_files_of_poses_are_refused_in_one_line(text, message, tmp_path, cap
     assert not output.exists()
 
 
-def test_millimetres_are_suspected(tmp_path):
+def test_poses_in_millimetres_are_refused(tmp_path):
     (tmp_path / "p.yaml").write_text("arm: PSM\nposes:\n- [0.1, 0.1, 120.0, 0, 0, 0, 0.2]")
     with pytest.raises(CollectionError, match=r"pose 1: .*millimetres"):
         load_poses(tmp_path / "p.yaml", load_arm("psm"))

@@ -39,7 +39,7 @@ def test_reads_columns_by_name_in_any_order_and_ignores_others(tmp_path):
     ],
     ids=["plain", "BOM", "CRLF", "CR", "spaces", "empty columns", "quotes"],
 )
-def test_reads_what_other_programs_write(tmp_path, text):
+def test_reads_csv_variants_of_other_programs(tmp_path, text):
     recording = read_recording(write_text(tmp_path, text))
     np.testing.assert_array_equal(recording.lines, [2, 3])
     np.testing.assert_array_equal(recording.tau[1], [0.8, 0.9, 0.10, 0.11, 0.12, 0.13, 0.14])
@@ -62,7 +62,7 @@ def test_missing_efforts_are_reported_when_required(tmp_path):
         replace(recording, source="").measured_effort()
 
 
-def test_the_source_of_a_row_without_a_file():
+def test_row_without_a_file_is_named_by_its_number():
     assert random_recording().where(2) == "recording, row 3"
     assert random_recording(source="simulated").where(2) == "simulated, row 3"
 
@@ -117,7 +117,7 @@ def test_errors_name_file_line_and_column_in_one_line(tmp_path, case):
     assert str(caught.value).startswith(str(tmp_path))
 
 
-def test_six_joints(tmp_path):
+def test_recording_with_six_joints(tmp_path):
     path = write_text(tmp_path, f"{SIX}\n" + ",".join(["0"] * 12))
     assert read_recording(path, arm=six_joint_arm()).q.shape == (1, 6)
     with pytest.raises(RecordingError, match="missing column q7"):
@@ -133,7 +133,7 @@ def test_non_files_are_refused(tmp_path):
         read_recording(tmp_path)
 
 
-def test_a_file_that_may_not_be_read():
+def test_file_without_read_permission_is_refused():
     with public_folder() as folder:
         path = write_text(folder, HEADER)
         path.chmod(0)
@@ -145,6 +145,6 @@ def test_a_file_that_may_not_be_read():
         run_unprivileged(check)
 
 
-def test_unknown_coordinates(tmp_path):
+def test_unknown_coordinates_are_refused(tmp_path):
     with pytest.raises(RecordingError, match='unknown coordinates "motor"; allowed: joint, actuator'):
         read_recording(tmp_path / "any.csv", coordinates="motor")

@@ -19,20 +19,20 @@ def test_poses_inside_the_limits_fit():
     Recording(q=q).check_fits(arm)
 
 
-def test_degrees_are_suspected():
+def test_positions_in_degrees_are_refused():
     arm = load_arm("mtml")
     q = np.degrees(arm.sample_poses(20, np.random.default_rng(0)))
     with pytest.raises(RecordingError, match=r"of MTML\. Are the positions in degrees instead of rad"):
         Recording(q=q).check_fits(arm)
 
 
-def test_a_psm_counts_six_joints_and_the_jaw(tmp_path):
+def test_psm_has_six_joints_and_the_jaw(tmp_path):
     path = write_text(tmp_path, f"{SIX}\n" + ",".join(["0"] * 12))
     with pytest.raises(RecordingError, match=r"missing column q7; .*joints of PSM: yaw, pitch, .*, wrist_yaw, jaw"):
         read_recording(path, load_arm("psm"))
 
 
-def test_a_prismatic_joint_in_millimetres_is_suspected():
+def test_prismatic_joint_in_millimetres_is_refused():
     arm = load_arm("psm")
     q = arm.sample_poses(20, np.random.default_rng(0))
     Recording(q=q).check_fits(arm)
@@ -53,7 +53,7 @@ def test_tolerance_of_a_prismatic_joint_is_in_millimetres():
         Recording(q=q).check_fits(arm)
 
 
-def test_motion_is_judged_by_the_joints_own_kind():
+def test_rest_speed_depends_on_the_joint_type():
     arm = load_arm("psm")
     qd = np.zeros((10, 7))
     qd[:, 2] = 0.01
@@ -92,7 +92,7 @@ def test_exchanged_columns_that_exceed_the_limits_are_named(pair):
 
 
 @pytest.mark.parametrize("coordinates", ["joint", "actuator"])
-def test_the_number_of_joints_must_be_the_arms(coordinates):
+def test_wrong_number_of_joints_is_refused(coordinates):
     recording = Recording(q=np.zeros((2, 6)), source="psm.csv", coordinates=coordinates)
     for function in (recording.check_fits, recording.in_joint_coordinates):
         with pytest.raises(RecordingError, match=r"psm\.csv: has 6 joints, but MTMR has 7"):
@@ -111,7 +111,7 @@ def test_actuator_coordinates_become_joint_coordinates(arm):
     np.testing.assert_array_equal(joint.t, actuator.t)
 
 
-def test_a_pose_in_actuator_coordinates_by_hand():
+def test_actuator_coordinates_of_one_pose():
     q = np.array([[0.1, 0.2, 0.5, 0.3, -0.1, 0.4, 1.0]])
     tau = np.array([[1, 2, 3, 4, 5, 6, 7.0]])
     joint = Recording(q=q, tau=tau, coordinates="actuator").in_joint_coordinates(load_arm("mtmr"))
@@ -127,7 +127,7 @@ def test_power_does_not_depend_on_the_coordinates():
     np.testing.assert_allclose(np.einsum("ij,ij->i", joint.qd, joint.tau), power, atol=1e-12)
 
 
-def test_joint_coordinates_stay():
+def test_joint_coordinates_are_unchanged():
     recording = random_recording()
     assert recording.in_joint_coordinates(load_arm("mtmr")) is recording
 

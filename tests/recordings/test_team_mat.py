@@ -40,7 +40,7 @@ def test_team_mat_of_other_real_types(tmp_path, kind):
     np.testing.assert_array_equal(read_team_mat(write_mat(tmp_path, a=array)).tau, array[:7, 1].T)
 
 
-def test_team_mat_of_matlab_4_has_no_signature_but_its_name(tmp_path):
+def test_matlab_4_file_is_detected_by_its_name(tmp_path):
     path = tmp_path / "old.mat"
     scipy.io.savemat(path, {"a": team_array(1)[:, :, 0]}, format="4")
     assert detect_format(path) == "team-mat"
@@ -97,8 +97,8 @@ def test_team_mat_of_version_7_3_is_refused_with_a_remedy(tmp_path):
         assert_refused(r"new\.mat: is a MATLAB v7\.3 \(HDF5\) file.*-v7'", read_team_mat, path)
 
 
-def test_team_mat_with_numbers_of_another_machine_is_refused(tmp_path):
-    """Uses the MATLAB 4 format of a VAX, for which scipy warns that returned data may be corrupt."""
+def test_team_mat_with_foreign_number_format_is_refused(tmp_path):
+    """Uses a MATLAB 4 file of a VAX. scipy warns that the data may be corrupt."""
     path = tmp_path / "data.mat"
     path.write_bytes(struct.pack("<5i", 2000, 8, 2, 0, 2) + b"a\0" + bytes(8 * 2 * 8))
     with warnings.catch_warnings():
@@ -107,7 +107,7 @@ def test_team_mat_with_numbers_of_another_machine_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "short", "text", "noise"])
-def test_team_mat_that_is_damaged_is_refused(tmp_path, damage):
+def test_damaged_team_mat_is_refused(tmp_path, damage):
     path = tmp_path / "poses.mat"
     scipy.io.savemat(path, {"a": team_array(50)}, do_compression=True)
     whole = path.read_bytes()
