@@ -116,11 +116,11 @@ def test_a_result_replaces_a_file_only_on_request(poses, tmp_path):
     arm, model, recording = poses
     result = dvrk.identify(recording, arm, method="paper")
     result.save(tmp_path / "model.yaml")
-    with pytest.raises(dvrk.DvrkDrakeError, match=r"model.yaml: already exists\. .* overwrite=True"):
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"model.yaml already exists\. .* overwrite=True"):
         result.save(tmp_path / "model.yaml")
     result.save(tmp_path / "model.yaml", overwrite=True)
     dvrk.export_model(model, tmp_path / "arm.urdf")
-    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.urdf: already exists"):
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.urdf already exists"):
         dvrk.export_model(model, tmp_path / "arm.urdf")
     with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.xml: its format is not clear; state one of sdf, urdf"):
         dvrk.export_model(model, tmp_path / "arm.xml")

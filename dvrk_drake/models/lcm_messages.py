@@ -93,9 +93,9 @@ def create_key_file(path: str | Path) -> None:
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except FileExistsError as error:
-        raise KeyFileError(f"{path}: already exists, and a key is never overwritten. Choose another file.") from error
+        raise KeyFileError(f"{path} already exists, and a key is never overwritten. Choose another file.") from error
     except (OSError, ValueError) as error:
-        raise KeyFileError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
+        raise KeyFileError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}") from error
     with open(descriptor, "wb") as file:
         file.write(secrets.token_bytes(_NEW_LENGTH))
 

@@ -101,7 +101,7 @@ def _check_links_and_frames(plant: MultibodyPlant, arm: Arm) -> None:
     names = [plant.get_frame(index).name() for index in plant.GetFrameIndices(instance)]
     numbers = {int(match[1]) for name in names if (match := re.fullmatch(r"dh_(\d+)", name))}
     if missing := set(range(max(numbers, default=0))) - numbers:
-        raise ArmError(f"{where}: has a frame dh_{max(numbers)}, but no frame dh_{min(missing)}")
+        raise ArmError(f"{where}: frame dh_{min(missing)} is missing, but there is a frame dh_{max(numbers)}")
 
 
 def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic") -> MultibodyPlant:

@@ -158,7 +158,7 @@ def _read(path: Path) -> ElementTree.Element:
     try:
         root = _parse(read_input(path, ArmError, MAX_TEXT))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise ArmError(f"{path}: is not a valid SDF: {error}") from error
+        raise ArmError(f"{path}: invalid SDF: {error}") from error
     if root.find("model") is None or [e.tag for e in root.iter() if e.tag in ("model", "include")] != ["model"]:
         raise ArmError(f"{path}: <sdf> must contain exactly one <model>, without a nested <model> or <include>")
     for link in root.iterfind("model/link"):
@@ -248,7 +248,7 @@ def mirror_links(root: ElementTree.Element, links: Sequence[str], source: str) -
     by_name = {link.get("name", ""): link for link in root.iterfind("model/link")}
     for name in links:
         if name not in by_name:
-            raise ArmError(f'{source}: has no link "{name}" of mirrored_links; allowed: {", ".join(by_name)}')
+            raise ArmError(f'{source} has no link "{name}" of mirrored_links; allowed: {", ".join(by_name)}')
         link = by_name[name]
         for pose in link.iterfind("*/pose"):
             _mirror_pose(f"{source}: link {name}", pose)

@@ -79,7 +79,7 @@ def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
     """
     try:
         if excess := _excess(text):
-            raise error(f"{where}: is not valid YAML: {excess}")
+            raise error(f"{where}: invalid YAML: {excess}")
         content = yaml.load(text, Loader=_Loader)
     except DvrkDrakeError:
         raise
@@ -88,7 +88,7 @@ def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
         mark, problem = getattr(cause, "problem_mark", None), getattr(cause, "problem", None)
         # At the end of a text libyaml reports one line too many.
         line = "" if mark is None else f"line {min(mark.line, len(text.splitlines()) - 1) + 1}: "
-        raise error(f"{where}: is not valid YAML: {line}{problem or cause}") from cause
+        raise error(f"{where}: invalid YAML: {line}{problem or cause}") from cause
     if isinstance(content, dict):
         return {key: value for key, value in content.items() if not str(key).startswith("_")}
     return content

@@ -77,7 +77,7 @@ def convert(
     if coordinates is not None and coordinates not in get_args(Coordinates):
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {", ".join(get_args(Coordinates))}')
     if os.path.exists(output) and os.path.exists(path) and os.path.samefile(path, output):
-        raise RecordingError(f"{output}: is the input recording. Choose another output.")
+        raise RecordingError(f"{output} is the input recording. Choose another output.")
     chosen = format or detect_format(path)
     defined = DEFINED_COORDINATES.get(chosen)
     if defined is not None and coordinates not in (None, defined):
@@ -88,7 +88,7 @@ def convert(
         if rate is not None or variable is not None or skip_invalid:
             raise RecordingError(f"{path}: --rate, --variable and --skip-invalid do not apply to an LCM log")
         if not is_lcm_log(Path(path)):
-            raise RecordingError(f"{path}: is not an LCM log")
+            raise RecordingError(f"{path} is not an LCM log")
         recording = read_recording(path, arm)
     elif chosen == "team-mat":
         if rate is not None:
@@ -159,7 +159,7 @@ def detect_format(path: str | Path) -> Format:
         return "lcm-log"
     content = read_bytes(path)
     if not content.strip():
-        raise RecordingError(f"{path}: is empty")
+        raise RecordingError(f"{path} is empty")
     if looks_like_matlab(path, content):
         return "team-mat"
     if b"\0" in content[:_HEAD]:

@@ -94,14 +94,14 @@ class CsvReader:
             try:
                 block = self._file.read(_BLOCK)
             except OSError as error:
-                raise RecordingError(f"{self._path}: cannot be read: {error.strerror}") from error
+                raise RecordingError(f"{self._path} cannot be read: {error.strerror}") from error
             self._digest.update(block)
             undecoded = len(decoder.getstate()[0])
             try:
                 text = decoder.decode(block, final=not block)
             except UnicodeDecodeError as error:
                 at = num_read - undecoded + error.start
-                raise RecordingError(f"{self._path}: is not a UTF-8 text file: {error.reason} at byte {at}") from error
+                raise RecordingError(f"{self._path} is not a UTF-8 text file: {error.reason} at byte {at}") from error
             if is_start and text:
                 text, is_start = text.removeprefix("\ufeff"), False
             text = rest + text
@@ -207,7 +207,7 @@ class GrowingFile:
                 self._file.truncate(self._file.read().rfind(b"\n") + 1)
                 self._file.seek(0, os.SEEK_END)
         except OSError as error:
-            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+            raise RecordingError(f"{path} cannot be written: {error.strerror}") from error
 
     def append(self, row: bytes) -> None:
         """Writes one row.
@@ -222,12 +222,12 @@ class GrowingFile:
                 os.fsync(self._file.fileno())
         except OSError as error:
             raise RecordingError(
-                f"{self._path}: cannot be written: {error.strerror}. The file ends with its last complete row."
+                f"{self._path} cannot be written: {error.strerror}. The file ends with its last complete row."
             ) from error
         if written != len(row):
             self._file.truncate(end)
             raise RecordingError(
-                f"{self._path}: cannot be written: no space left. The file ends with its last complete row."
+                f"{self._path} cannot be written: no space left. The file ends with its last complete row."
             )
 
     def close(self) -> None:

@@ -56,7 +56,7 @@ class LcmLogReader:
             RecordingError: The file cannot be read, or does not begin like an LCM log.
         """
         if not is_lcm_log(path):
-            raise RecordingError(f"{path}: is not an LCM log")
+            raise RecordingError(f"{path} is not an LCM log")
         self.path = path
         self.notes: list[str] = []
 
@@ -286,7 +286,7 @@ def _only_status_channel(log: LcmLogReader) -> str:
     channels = sorted({event.channel for event in log if event.channel.startswith(STATUS_PREFIX)})
     if len(channels) > 1:
         raise RecordingError(
-            f"{log.path}: has statuses of several arms ({', '.join(channels)}). Select one with --arm (arm= in Python)."
+            f"{log.path} has statuses of several arms ({', '.join(channels)}). Select one with --arm (arm= in Python)."
         )
     return channels[0] if channels else STATUS_PREFIX
 
@@ -298,4 +298,4 @@ def _no_usable_status(channel: str, arm: Arm | None, channels: Counter[str], not
     listed = [f"{name} ({number})" for name, number in channels.most_common(_LISTED)]
     more = [f"{len(channels) - _LISTED} more"] if len(channels) > _LISTED else []
     has = ", ".join([*listed, *more]) or "none"
-    return f"has no status of {arm.name if arm else 'any arm'} (channel {channel}). Channels in the log: {has}."
+    return f"no status of {arm.name if arm else 'any arm'} (channel {channel}). Channels in the log: {has}."

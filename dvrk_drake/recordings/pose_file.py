@@ -48,9 +48,9 @@ def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
     if content.format != PoseFile.format:
         raise CollectionError(f'{path}: format is "{content.format}"; allowed: "{PoseFile.format}"')
     if content.arm.lower() != arm.name.lower():
-        raise CollectionError(f'{path}: arm is "{content.arm}"; allowed: {arm.name}')
+        raise CollectionError(f'{path}: arm is "{content.arm}", but the selected arm is {arm.name}')
     if not content.poses:
-        raise CollectionError(f"{path}: has no poses")
+        raise CollectionError(f"{path} has no poses")
     for k, pose in enumerate(content.poses):
         if len(pose) != arm.num_joints:
             raise CollectionError(
@@ -216,7 +216,7 @@ class CollectionFile:
             return
         if "pose1" in header and ("friction1" in header) != self._both_sides:
             sides = "one side (--no-both-sides)" if self._both_sides else "both sides (--both-sides)"
-            raise CollectionError(f"{self._path}: was collected from {sides}. Continue with the same option.")
+            raise CollectionError(f"{self._path} was collected from {sides}. Continue with the same option.")
         raise CollectionError(
-            f"{self._path}: already exists and is not a collection of {self._arm.name}. Choose another output."
+            f"{self._path} already exists and is not a collection of {self._arm.name}. Choose another output."
         )

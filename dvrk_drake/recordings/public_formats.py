@@ -66,7 +66,7 @@ def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: b
     path = Path(path)
     rows, sha256 = read_rows(path)
     if not rows:
-        raise RecordingError(f"{path}: is empty; needs {_WPI_LAYOUT}")
+        raise RecordingError(f"{path} is empty; needs {_WPI_LAYOUT}")
     first_line, first = rows[0]
     timed = first == ["t", *_WPI_COLUMNS]
     names = ["t", *_WPI_COLUMNS] if timed else _WPI_COLUMNS
@@ -90,7 +90,7 @@ def read_wpi_csv(path: str | Path, rate: float | None = None, *, skip_invalid: b
     lines = np.array([line for line, _ in rows])
     kept = values[valid]
     if len(kept) < 2:
-        raise RecordingError(f"{path}: has {len(kept)} valid row{'s' * (len(kept) != 1)}; a motion needs at least 2")
+        raise RecordingError(f"{path} has {len(kept)} valid row{'s' * (len(kept) != 1)}; a motion needs at least 2")
     if timed:
         t, kept = kept[:, 0], kept[:, 1:]
         notes = time_notes(t, lines[valid])
@@ -233,7 +233,7 @@ def _team_array(path: Path, content: bytes, variable: str | None) -> tuple[str, 
     """Returns the selected variable as (8, 2, N), and its name."""
     if content[:8] == _HDF5_MAGIC or content[124:128] in _MATLAB_73:
         raise RecordingError(
-            f"{path}: is a MATLAB v7.3 (HDF5) file, which is not supported. Load it in MATLAB and save it with '-v7'."
+            f"{path} is a MATLAB v7.3 (HDF5) file, which is not supported. Load it in MATLAB and save it with '-v7'."
         )
     listed = _matlab(path, lambda: scipy.io.whosmat(io.BytesIO(content)))
     found = ", ".join(f"{n} ({' x '.join(map(str, s))} {kind})" for n, s, kind in listed) or "no variables"
@@ -241,7 +241,7 @@ def _team_array(path: Path, content: bytes, variable: str | None) -> tuple[str, 
     layout = "8 x 2 x N real numbers (joint; position or effort; pose)"
     if variable is not None:
         if variable not in (n for n, _, _ in listed):
-            raise RecordingError(f"{path}: has no variable {variable}. Variables in the file: {found}.")
+            raise RecordingError(f"{path} has no variable {variable}. Variables in the file: {found}.")
         if variable not in fitting:
             raise RecordingError(f"{path}: variable {variable} must be {layout}. Variables in the file: {found}.")
     elif not fitting:
@@ -269,7 +269,7 @@ def _matlab(path: Path, read: Callable[[], _T]) -> _T:
     except Exception as error:
         # For a damaged file scipy may raise any error: ValueError, OSError, MatReadError, zlib.error, ...
         text = " ".join(str(error).split())
-        raise RecordingError(f"{path}: is not a valid MATLAB file: {text}") from error
+        raise RecordingError(f"{path}: invalid MATLAB file: {text}") from error
 
 
 def _first_invalid_pose(path: Path, joints: NDArray[np.float64], invalid: NDArray[np.bool_]) -> str:

@@ -145,7 +145,7 @@ class Recording:
         """
         if self.tau is None:
             raise RecordingError(
-                f"{self.source or 'recording'}: has no efforts; needs columns tau1..tau{self.q.shape[1]}"
+                f"{self.source or 'recording'} has no efforts; needs columns tau1..tau{self.q.shape[1]}"
             )
         return self.tau
 
@@ -240,7 +240,7 @@ class Recording:
         if self.q.shape[1] != arm.num_joints:
             source = self.source or "recording"
             raise RecordingError(
-                f"{source}: has {self.q.shape[1]} joints, but {arm.name} has {arm.num_joints}: "
+                f"{source} has {self.q.shape[1]} joints, but {arm.name} has {arm.num_joints}: "
                 f"{', '.join(arm.joint_names)}"
             )
 
@@ -303,14 +303,14 @@ def _read_csv(
     with CsvReader(path, progress) as reader:
         header_line, cells = next(iter(reader), (0, []))
         if not cells:
-            raise RecordingError(f"{path}: is empty; needs a header with {_expected_columns(num_joints)}")
+            raise RecordingError(f"{path} is empty; needs a header with {_expected_columns(num_joints)}")
         header = [cell.strip() for cell in cells]
         blocks = _columns_of_blocks(f"{path}, line {header_line}", header, arm, num_joints)
         values, lines, skipped = _read_numbers(path, reader, header, blocks, skip_invalid)
         sha256 = reader.sha256()
     if not lines:
         rows = "no row of finite numbers" if skipped else "a header but no rows"
-        raise RecordingError(f"{path}: has {rows}")
+        raise RecordingError(f"{path} has {rows}")
     q, qd, tau, t = (
         np.frombuffer(values[prefix]).reshape(len(lines), -1) if prefix in values else None
         for prefix in ("q", "qd", "tau", "t")

@@ -52,14 +52,14 @@ def check_stream_output(path: str | Path) -> None:
     if path.suffix not in (".csv", ".log"):
         raise RecordingError(f"{path}: the file name must end in .csv or .log (LCM log)")
     if os.path.lexists(path):
-        raise RecordingError(f"{path}: already exists, and a recording is never overwritten. Choose another file.")
+        raise RecordingError(f"{path} already exists, and a recording is never overwritten. Choose another file.")
     if not path.parent.is_dir():
-        raise RecordingError(f"{path}: cannot be written: its folder does not exist")
+        raise RecordingError(f"{path} cannot be written: its folder does not exist")
     try:
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
-        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+        raise RecordingError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def open_recording_file(path: str | Path, arm: Arm, stream: StatusStream) -> RecordingFile:

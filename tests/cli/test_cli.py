@@ -199,7 +199,7 @@ def test_an_existing_file_is_kept_without_overwrite(command, tmp_path, monkeypat
     mine = tmp_path / "mine.csv"
     mine.write_text("mine")
     error = fails(capsys, *command.split(), "mine.csv")
-    assert error.startswith("dvrk-drake: error: mine.csv: ") and "exists" in error
+    assert error.startswith("dvrk-drake: error: mine.csv") and "exists" in error
     if not command.startswith(KEEP_ALWAYS):
         assert error.endswith("name another file, or replace it with --overwrite")
     if "none" in command:
@@ -383,7 +383,7 @@ def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
         ([text[0].replace("tau4", "torque4"), *text[1:]], f"{bad}, line 1: missing column tau4"),
         ([text[0], text[1].replace(text[1].split(",")[9], "nan"), *text[2:]], f"{bad}, line 2: tau3 is nan"),
         ([text[0], *text[1:3], text[3] + ",1"], f"{bad}, line 4: the row has 15 cells, the header has 14"),
-        ([], f"{bad}: is empty"),
+        ([], f"{bad} is empty"),
         (text[:4], f"{bad}: has 3 distinct poses, too few"),
     ):
         bad.write_text("\n".join(lines))

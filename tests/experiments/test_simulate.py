@@ -181,7 +181,7 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
         ("seed=-1", "seed is -1"),
         ("arm=psm9", 'unknown arm "psm9"; did you mean "psm"? known arms: mtml, mtmr, psm'),
         ("duration", "--set duration: must be key=value"),
-        ("start=[0,", "--set start=[0,: is not valid YAML"),
+        ("start=[0,", "--set start=[0,: invalid YAML"),
     ],
 )
 def test_invalid_settings_give_one_line_error(setting, message, capsys, tmp_path):
@@ -197,7 +197,7 @@ def test_rejects_files_that_are_not_scenarios(tmp_path):
         load_scenario(str(path))
     for text, message in (
         ("[1, 2]", "must have keys and values"),
-        ("arm: [", "is not valid YAML"),
+        ("arm: [", "invalid YAML"),
         ("duration: 2", "arm is missing"),
     ):
         path.write_text(text)

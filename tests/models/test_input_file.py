@@ -142,7 +142,7 @@ def own_arm(folder, change):
         (("<mass>", "<mass>-"), r"link \S+: <mass> is -\S+; allowed: 1e-06\.\.200 kg"),
         (("<inertial>.*?</inertial>", ""), r"link \S+ of the SDF needs a positive <inertial><mass>"),
         (('multiplier="[^"]*"', 'multiplier="0"'), r"joint \S+ of the SDF has a mimic multiplier of 0"),
-        (('"dh_2"', '"dh_x"'), r"own\.sdf: has a frame dh_7, but no frame dh_2"),
+        (('"dh_2"', '"dh_x"'), r"own\.sdf: frame dh_2 is missing"),
         (
             (r'<joint name="\w+" type="revolute">(?:(?!</joint>).)*mimic.*?</joint>', ""),
             r"own\.sdf: no joint connects \w+",

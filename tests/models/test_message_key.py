@@ -106,7 +106,7 @@ def test_command_creates_a_key_and_does_not_overwrite_it(tmp_path, capsys):
     assert len(content) == 32 and content != second.read_bytes()
     MessageKey.load(first)
     assert main(["key", "--output", str(first)]) == 2
-    assert "a.key: already exists, and a key is never overwritten" in capsys.readouterr().err
+    assert "a.key already exists, and a key is never overwritten" in capsys.readouterr().err
     assert first.read_bytes() == content
     with pytest.raises(KeyFileError, match="cannot be written: No such file or directory"):
         create_key_file(tmp_path / "no" / "a.key")

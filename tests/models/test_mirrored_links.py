@@ -157,7 +157,7 @@ def test_mirroring_twice_is_identity_and_mirrors_shapes():
 
 def test_links_that_cannot_be_mirrored_are_named():
     root = ElementTree.fromstring('<sdf><model><link name="a"><visual><pose>1 2 3</pose></visual></link></model></sdf>')
-    with pytest.raises(ArmError, match=r'x\.sdf: has no link "b" of mirrored_links; allowed: a'):
+    with pytest.raises(ArmError, match=r'x\.sdf has no link "b" of mirrored_links; allowed: a'):
         mirror_links(root, ["b"], "x.sdf")
     with pytest.raises(ArmError, match=r"x\.sdf: link a: <pose> of a mirrored link must be x y z roll pitch yaw"):
         mirror_links(root, ["a"], "x.sdf")

@@ -61,7 +61,7 @@ def test_detect_format(tmp_path):
 @pytest.mark.parametrize("content", ["", " \n"])
 def test_an_empty_file_has_no_format(tmp_path, content):
     path = write_text(tmp_path, content)
-    assert_refused(r"motion\.csv: is empty", convert, path, tmp_path / "out.csv", coordinates="joint")
+    assert_refused(r"motion\.csv is empty", convert, path, tmp_path / "out.csv", coordinates="joint")
 
 
 def test_explicit_format_overrides_the_file_name(tmp_path):

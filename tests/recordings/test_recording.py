@@ -56,9 +56,9 @@ def test_blank_lines_do_not_shift_line_numbers(tmp_path):
 def test_missing_efforts_are_reported_when_required(tmp_path):
     path = write_text(tmp_path, ",".join(Q_NAMES) + "\n" + ",".join(["0"] * 7) + "\n")
     recording = read_recording(path)
-    with pytest.raises(RecordingError, match=r"recording\.csv: has no efforts; needs columns tau1\.\.tau7"):
+    with pytest.raises(RecordingError, match=r"recording\.csv has no efforts; needs columns tau1\.\.tau7"):
         recording.measured_effort()
-    with pytest.raises(RecordingError, match=r"^recording: has no efforts"):
+    with pytest.raises(RecordingError, match=r"^recording has no efforts"):
         replace(recording, source="").measured_effort()
 
 
@@ -70,9 +70,9 @@ def test_row_without_a_file_is_named_by_its_number():
 WANTED = r"needs (a header with )?q1\.\.q7 and tau1\.\.tau7 \(t and qd1\.\.qd7 optional\)"
 MULTI_LINE = '"a\nb"'
 ERRORS = {
-    "empty": ("", r"recording\.csv: is empty; " + WANTED),
-    "blank": ("\n\n  \n", r"recording\.csv: is empty; " + WANTED),
-    "header only": (HEADER + "\n", r"recording\.csv: has a header but no rows"),
+    "empty": ("", r"recording\.csv is empty; " + WANTED),
+    "blank": ("\n\n  \n", r"recording\.csv is empty; " + WANTED),
+    "header only": (HEADER + "\n", r"recording\.csv has a header but no rows"),
     "no header": (f"{ROW}\n{ROW}\n", r", line 1: the header is missing\. .*q1\.\.q7 .*dvrk-drake convert"),
     "missing q": (f"{HEADER.replace('q3', 'p3')}\n{ROW}", r", line 1: missing column q3; " + WANTED),
     "missing taus": (
@@ -102,9 +102,9 @@ ERRORS = {
     "open quote": (f'{HEADER}\n"{ROW}\n{ROW}\n', r", line 3: invalid CSV: unexpected end of data"),
     "UTF-16": (
         f"{HEADER}\n{ROW}\n".encode("utf-16"),
-        r"recording\.csv: is not a UTF-8 text file: .* at byte 0",
+        r"recording\.csv is not a UTF-8 text file: .* at byte 0",
     ),
-    "binary": (bytes(range(256)), r"recording\.csv: is not a UTF-8 text file: .* at byte 128"),
+    "binary": (bytes(range(256)), r"recording\.csv is not a UTF-8 text file: .* at byte 128"),
 }
 
 

@@ -56,9 +56,9 @@ def test_failed_write_creates_no_file(tmp_path):
 
 def test_unwritable_paths_are_refused(tmp_path):
     for path, match in (
-        (tmp_path / "no" / "out.csv", r"no/out\.csv: cannot be written: No such file or directory"),
+        (tmp_path / "no" / "out.csv", r"no/out\.csv cannot be written: No such file or directory"),
         (tmp_path, "is not a regular file"),
-        (os.devnull, "/dev/null: is not a regular file and cannot be replaced"),
+        (os.devnull, "/dev/null is not a regular file and cannot be replaced"),
     ):
         with pytest.raises(DvrkDrakeError, match=match), atomic_write(path) as stream:
             stream.write("x")
@@ -67,7 +67,7 @@ def test_unwritable_paths_are_refused(tmp_path):
 
 
 def test_full_disk_raises_a_package_error(tmp_path):
-    match = r"out\.csv: cannot be written: No space left"
+    match = r"out\.csv cannot be written: No space left"
     with pytest.raises(DvrkDrakeError, match=match), atomic_write(tmp_path / "out.csv"):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert list(tmp_path.iterdir()) == []

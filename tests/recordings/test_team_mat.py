@@ -94,7 +94,7 @@ def test_team_mat_of_version_7_3_is_refused_with_a_remedy(tmp_path):
     for content in (header.ljust(512, b"\0") + b"\x89HDF\r\n\x1a\n", b"\x89HDF\r\n\x1a\n" + b"\0" * 600):
         path.write_bytes(content)
         assert detect_format(path) == "team-mat"
-        assert_refused(r"new\.mat: is a MATLAB v7\.3 \(HDF5\) file.*-v7'", read_team_mat, path)
+        assert_refused(r"new\.mat is a MATLAB v7\.3 \(HDF5\) file.*-v7'", read_team_mat, path)
 
 
 def test_team_mat_with_foreign_number_format_is_refused(tmp_path):
@@ -103,7 +103,7 @@ def test_team_mat_with_foreign_number_format_is_refused(tmp_path):
     path.write_bytes(struct.pack("<5i", 2000, 8, 2, 0, 2) + b"a\0" + bytes(8 * 2 * 8))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert_refused("is not a valid MATLAB file: .*may be corrupt", read_team_mat, path)
+        assert_refused("invalid MATLAB file: .*may be corrupt", read_team_mat, path)
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "short", "text", "noise"])
@@ -121,7 +121,7 @@ def test_damaged_team_mat_is_refused(tmp_path, damage):
             "noise": whole[:200] + noise,
         }[damage]
     )
-    assert_refused(r"poses\.mat: (is not a valid MATLAB file|no variable)", read_team_mat, path)
+    assert_refused(r"poses\.mat: (invalid MATLAB file|no variable)", read_team_mat, path)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

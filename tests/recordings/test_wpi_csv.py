@@ -32,8 +32,8 @@ def test_wpi_csv_with_crlf_bom_blank_lines_and_spaces(tmp_path):
 
 
 WPI_ERRORS = {
-    "empty": ("", r"motion\.csv: is empty; needs 21 numbers per row"),
-    "blank": ("\n \n,,\n", r"motion\.csv: is empty"),
+    "empty": ("", r"motion\.csv is empty; needs 21 numbers per row"),
+    "blank": ("\n \n,,\n", r"motion\.csv is empty"),
     "header": (
         ",".join(f"q{i}" for i in range(21)) + f"\n{NUMBERS}\n",
         r", line 1: unexpected header; .*needs no conv",
@@ -51,7 +51,7 @@ WPI_ERRORS = {
     "underscore": (f"{NUMBERS}_0\n", r", line 1: tau7 \(column 21\) is not a number: '1_0'"),
     "nan": (f"{NUMBERS}\n{NUMBERS}\nnan{NUMBERS[1:]}\n", r", line 3: q1 \(column 1\) is nan; only finite"),
     "inf": (f"{NUMBERS[:-1]}-inf\n", r", line 1: tau7 \(column 21\) is -inf; only finite"),
-    "one row": (NUMBERS, r"motion\.csv: has 1 valid row; a motion needs at least 2"),
+    "one row": (NUMBERS, r"motion\.csv has 1 valid row; a motion needs at least 2"),
     "semicolons": (
         NUMBERS.replace(",", ";"),
         r", line 1: the first row has no comma\. Separate cells by commas",

@@ -250,7 +250,7 @@ def test_model_file_round_trip_and_rejections(arm, tmp_path):
             r"joints\[1\]\.feedforward_scale is 2; allowed: 0\.\.1",
         ),
         (text.replace("arm: ", "arms: ", 1), 'key "arms" is unknown; did you mean "arm"'),
-        ("]", "is not valid YAML: line 1"),
+        ("]", "invalid YAML: line 1"),
     ):
         assert bad != text
         (tmp_path / "bad.yaml").write_text(bad)
