@@ -57,7 +57,7 @@ class Arm:
 
     Attributes:
         name: Name of the arm in the dVRK, e.g. "MTML".
-        source: Argument with which `load_arm` loads the arm: "mtml", or the absolute path of its YAML file.
+        source: Argument of `load_arm` for this arm: a name such as "mtml", or the absolute path of the YAML file.
         joint_names: Names of the n independent joints.
         tree_joint_names: Names of all joints of the SDF tree, including the linkage.
         sdf: Package URLs or paths of the SDF files: first the arm, then its instrument if there is one.
@@ -73,7 +73,7 @@ class Arm:
         gains: Default gains of the controller.
         friction_coordinates: Mapping from a name to the joint coefficients (n,) of an additional friction coordinate,
             for friction that acts neither at a joint nor at an actuator.
-        identification: Settings for recordings of the arm, and bounds of its links.
+        identification: Settings for recordings of the arm, and bounds of the mass distribution of the links.
         effects: Friction, cable and sensor effects of the real arm. A simulation includes them only on request.
 
     Example:
@@ -247,7 +247,7 @@ class Arm:
         return poses[:count]
 
     def with_gravity(self, gravity: Sequence[float]) -> Arm:
-        """Returns the same arm, mounted so that `gravity` (3,) [m/s^2] is the gravity vector in its base frame.
+        """Returns the same arm with the gravity vector `gravity` (3,) in the base frame [m/s^2].
 
         Raises:
             ArmError: `gravity` is not three numbers, or its length exceeds 30 m/s^2.
@@ -312,7 +312,7 @@ def load_arm(name: str | Path) -> Arm:
 
 @cache
 def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
-    """Loads an arm by name or absolute path; `state` identifies the version of its file in the cache."""
+    """Loads an arm by name or absolute path. `state` identifies the version of the YAML file in the cache."""
     path = Path(name)
     if not path.is_absolute():
         if name not in known_arms():
@@ -410,7 +410,7 @@ def _build_arm(
 
 
 def _identification_settings(path: Path, mechanism: Mechanism, instrument: Instrument) -> IdentificationSettings:
-    """Returns the settings of the mechanism, extended by those of the instrument. Defaults are 20 Hz and no delay."""
+    """Returns the settings of the mechanism and the instrument. The defaults are 20 Hz and no delay."""
     both: dict[str, list[float]] = {}
     for which, default in (("acceleration_cut_off", 20.0), ("effort_delay", 0.0)):
         both[which] = []

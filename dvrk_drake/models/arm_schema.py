@@ -18,7 +18,7 @@ ANGLES, TRAVELS = Range(-12.6, 12.6, "rad"), Range(-2.0, 2.0, "m")
 ANGLE_WIDTHS, TRAVEL_WIDTHS = Range(0.01, 25.2, "rad"), Range(0.001, 2.0, "m")
 #: Accepted efforts of a joint: 0.023 N m at the roll joint of an MTM, 330 N m at the shoulder of a UR10e.
 EFFORTS = Range(0.001, 2000.0, "N m or N")
-#: Accepted positions if the joint type is not known yet. `Arm` checks them with `ANGLES` or `TRAVELS`.
+#: Accepted positions in files, for any joint type. `Arm` checks the narrower range `ANGLES` or `TRAVELS`.
 _POSITIONS = within(-1e4, 1e4, "rad or m")
 #: Accepted coefficients that relate joint and actuator positions: 0.6..1.6 on a dVRK, 32..48 with the gears of a TX40.
 COUPLINGS = within(0.001, 1000.0, also=(0.0,), either_sign=True)
@@ -105,7 +105,7 @@ class BoundingShapes:
 
 @dataclass(kw_only=True)
 class IdentificationSettings(MotionSettings):
-    """Settings for recordings of an arm, and bounds of its links.
+    """Settings for recordings of an arm, and bounds of the mass distribution of the links.
 
     Attributes:
         effort_cut_off: Cut-off frequency of the low-pass filter for measured and modelled efforts [Hz].

@@ -28,7 +28,7 @@ class DriveEffect:
         scale: Shape parameter of the kind: width of the smoothed sign function [rad/s, m/s], breakaway displacement
             [rad, m], or periods per revolution.
         coefficient: Size of the effect [N m; N m s/rad, ...; N and m for a prismatic coordinate].
-        standard_error: Standard error of the coefficient, in its unit; 0 if it was not identified.
+        standard_error: Standard error of the coefficient, in the same unit; 0 if the effect was not identified.
     """
 
     coordinate: str = ""
@@ -103,7 +103,7 @@ class DelayEffect:
 
 @dataclass
 class ArmEffects:
-    """Effects of a real arm. Each field is an effect group that can be switched on or off by its name.
+    """Effects of a real arm. Each field is an effect group that a simulation can include by name.
 
     Attributes:
         friction: Dry and viscous friction, as elements of the plant's own solver.
@@ -151,7 +151,7 @@ class ArmEffects:
         return self.only([other for other in EFFECT_NAMES if other != name])
 
     def joined(self, other: "ArmEffects") -> "ArmEffects":
-        """Returns the effects with lists and tables extended by those of an instrument. Scalars are unchanged."""
+        """Returns the effects, extended by the lists and mappings in the effects of an instrument."""
         return ArmEffects(**{name: _joined(getattr(self, name), getattr(other, name)) for name in EFFECT_NAMES})
 
     def check(self, joint_names: Sequence[str]) -> None:

@@ -254,7 +254,7 @@ class StatusFilter:
             self._reference = (self.last.sequence, self.last.utime, now)
 
     def _reason(self, data: bytes, now: float) -> str:
-        """Returns the reason to ignore a message, from its first bytes and its authentication code, or ""."""
+        """Returns the reason to ignore a message, or "". Only the header and the authentication code are examined."""
         if len(data) < 32 or data[:8] != self._fingerprint:
             return self.UNREADABLE
         utime, sequence, session_id = struct.unpack_from(">qqq", data, 8)

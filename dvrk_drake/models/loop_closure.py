@@ -40,7 +40,7 @@ def pin_loop(plant: MultibodyPlant, instance: ModelInstanceIndex, loop: LoopClos
 
 
 def remove_loop_mimics(root: ElementTree.Element, arm: Arm) -> None:
-    """Removes the mimic tags of the joints in a loop, and no others.
+    """Removes the mimic tags of the joints in a loop.
 
     The mimic of a rotor or counterweight that follows another joint is kept, because it represents a cable and closes
     no loop.

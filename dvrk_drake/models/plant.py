@@ -114,7 +114,7 @@ def make_arm_plant(arm: Arm, time_step: float = 1e-3, closure: Closure = "mimic"
 
 @cache
 def shared_plant(arm: Arm) -> MultibodyPlant:
-    """Returns the finalized plant of an arm for read-only use; it is created once per Arm object."""
+    """Returns the finalized plant of an arm, which is created once per Arm object. Do not modify the plant."""
     return make_arm_plant(arm)
 
 
@@ -143,7 +143,7 @@ def set_arm_positions(plant: MultibodyPlant, context: Context, arm: Arm, q: Arra
 def holding_torque(plant: MultibodyPlant, context: Context, arm: Arm) -> NDArray[np.float64]:
     """Returns the torque (n,) on the independent joints that compensates gravity at the context's pose.
 
-    Drake's gravity forces do not include constraints, so they are projected through the linkage: tau = -G' tau_g.
+    The gravity forces of Drake do not include constraints. They are projected through the linkage: tau = -G' tau_g.
     """
     tau_g = plant.CalcGravityGeneralizedForces(context)[tree_selector(plant, arm)]
     return -arm.linkage.pull_back_effort(tau_g)

@@ -72,7 +72,7 @@ def local_path(url: str) -> Path:
 
 
 def compose_sdf(urls: Sequence[str], mirrored: Mapping[str, Sequence[str]] | None = None) -> ElementTree.Element:
-    """Returns the model of the first file, extended by the links, joints and frames of the others (an instrument).
+    """Returns the model of the first file, extended by the links, joints and frames of further files (an instrument).
 
     Relative paths of meshes become absolute. If a file repeats a link of an earlier file, only the shapes of that link
     are added. This draws the housing of an instrument on the carriage of the arm without a body of its own.

@@ -16,7 +16,7 @@ Schema = TypeVar("Schema")
 
 #: Maximum nesting and maximum number of values of a file, with expanded aliases. The files of a PSM have 6 and 6000.
 MAX_DEPTH, MAX_VALUES = 50, 1_000_000
-# libyaml's parser is ten times as fast as the Python parser, and its speed does not depend on the nesting.
+# The parser of libyaml is faster than the Python parser, and its speed does not depend on the nesting.
 _FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -70,7 +70,7 @@ def load_yaml(path: str | Path, error: type[DvrkDrakeError]) -> Any:
 
 
 def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
-    """Returns the content of a YAML text, None if it is empty; `where` names its source.
+    """Returns the content of a YAML text, None for an empty text; `where` names the source of the text.
 
     Keys that begin with "_" are omitted, because they may hold anchors.
 
@@ -84,7 +84,7 @@ def parse_yaml(text: str, where: str, error: type[DvrkDrakeError]) -> Any:
     except DvrkDrakeError:
         raise
     except Exception as cause:
-        # Errors of various types; only those of YAML contain the line.
+        # The parser raises errors of various types. Only YAML errors contain the line.
         mark, problem = getattr(cause, "problem_mark", None), getattr(cause, "problem", None)
         # At the end of a text libyaml reports one line too many.
         line = "" if mark is None else f"line {min(mark.line, len(text.splitlines()) - 1) + 1}: "
@@ -128,7 +128,7 @@ def _excess(text: str) -> str:
 
 
 def _converted(schema: Any, value: Any) -> Any:
-    """Converts a value in which `schema_fault` found no fault to the type of the schema."""
+    """Converts a value that `schema_fault` accepts to the type of the schema."""
     origin, arguments = get_origin(schema), get_args(schema)
     if origin in (Union, types.UnionType):
         (inner,) = (argument for argument in arguments if argument is not types.NoneType)

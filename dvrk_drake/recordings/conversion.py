@@ -49,7 +49,7 @@ def convert(
     arm: Arm | None = None,
     skip_invalid: bool = False,
 ) -> Recording:
-    """Reads a recording and writes it atomically as a CSV that `read_recording` reads.
+    """Converts a recording to a CSV for `read_recording`. The CSV is written atomically.
 
     Time stamps of the recording are kept unchanged.
 
@@ -123,7 +123,7 @@ def convert(
 def _read_csv(
     path: Path, coordinates: Coordinates, rate: float | None, arm: Arm | None, skip_invalid: bool
 ) -> Recording:
-    """Reads a CSV with a header that contains q1, and adds notes on its times and its omitted columns."""
+    """Reads a CSV with a header, and adds notes on times and ignored columns."""
     recording = read_recording(path, arm, coordinates, skip_invalid=skip_invalid)
     if recording.t is not None:
         refuse_rate(path, rate)

@@ -62,7 +62,7 @@ class CsvReader:
         self._file.close()
 
     def __iter__(self) -> Iterator[tuple[int, list[str]]]:
-        """Raises RecordingError if the file is not text, or its cells are not separated by commas."""
+        """Iterates over rows. Raises RecordingError if the file is not text or cells are not separated by commas."""
         reader = self._reader
         try:
             for cells in reader:

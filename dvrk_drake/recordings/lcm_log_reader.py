@@ -1,7 +1,7 @@
 """Reads LCM logs, including damaged ones, and the measurements of one arm in them.
 
 The format is described at https://lcm-proj.github.io/lcm/content/log-file-format.html. A log is a sequence of events.
-Each event is big-endian and consists of a magic number, its number, a time, two lengths, the channel and the data.
+Each event is big-endian and consists of a magic number, the event number, a time, two lengths, channel and data.
 `EventLog` of the `lcm` package is not used. It crashes on a damaged length (segmentation fault in lcm 1.5.3), and does
 not write the last events before the log is closed.
 """
@@ -107,9 +107,9 @@ def event_bytes(event: LcmEvent) -> bytes:
 
 
 def _end_of_event(content: mmap.mmap, start: int) -> int:
-    """Returns the end of the event that begins at `start`, or 0.
+    """Returns the end of the event that begins at `start`.
 
-    The result is 0 if there is no event at `start`, or if it is not followed by another event.
+    The result is 0 if there is no event at `start`, or if neither an event nor the end of the file follows.
     """
     if start + _HEADER.size > len(content):
         return 0
@@ -125,7 +125,7 @@ def _event(content: mmap.mmap, start: int) -> LcmEvent:
     _, number, utime, channel_length, data_length = _HEADER.unpack_from(content, start)
     channel = start + _HEADER.size
     data = channel + channel_length
-    # A channel that is not UTF-8 is not used here, and must not prevent reading others.
+    # Channels that are not UTF-8 are not used, but must not raise an error.
     name = content[channel:data].decode("utf-8", "replace")
     return LcmEvent(number, utime, name, content[data : data + data_length])
 
@@ -146,7 +146,7 @@ class StatusStream:
         last: Last status of the arm, usable or not, or None.
         num_lost: Number of statuses missing in the sequence.
         num_used: Number of used statuses.
-        first_utime: Time of the first used status [us], which is the zero of a recording's t.
+        first_utime: Time of the first used status [us], at which t of the recording is 0.
     """
 
     def __init__(self, arm_name: str, num_joints: int) -> None:

@@ -34,7 +34,7 @@ class PoseFile:
 
 
 def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
-    """Returns the poses (m, n) in a file after checking them.
+    """Reads and checks the poses (m, n) in a file.
 
     Raises:
         CollectionError: The file does not exist, is not a pose file, is of another arm, or has a pose that
@@ -144,7 +144,7 @@ class CollectionFile:
         self._rows = self._read() if self._exists else []
 
     def finished(self, poses: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Returns an array (m,) of bool that marks which of `poses` (m, n) are already in the file.
+        """Returns a mask (m,) of the `poses` (m, n) that are already in the file.
 
         Raises:
             CollectionError: The file contains a pose that is not in `poses`.

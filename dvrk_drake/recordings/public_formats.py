@@ -176,7 +176,7 @@ _T = TypeVar("_T")
 
 
 def looks_like_matlab(path: Path, content: bytes) -> bool:
-    """Returns whether a file with this content is a MATLAB file, from its first bytes or its name."""
+    """Returns whether a file is a MATLAB file, according to its first bytes or its name."""
     return content[126:128] in (b"IM", b"MI") or content[:8] == _HDF5_MAGIC or path.suffix.lower() == ".mat"
 
 
@@ -230,7 +230,7 @@ def read_team_mat(path: str | Path, *, variable: str | None = None, skip_invalid
 
 
 def _team_array(path: Path, content: bytes, variable: str | None) -> tuple[str, NDArray[np.float64]]:
-    """Returns the selected variable as (8, 2, N), and its name."""
+    """Returns the name and the array (8, 2, N) of the selected variable."""
     if content[:8] == _HDF5_MAGIC or content[124:128] in _MATLAB_73:
         raise RecordingError(
             f"{path} is a MATLAB v7.3 (HDF5) file, which is not supported. Load it in MATLAB and save it with '-v7'."

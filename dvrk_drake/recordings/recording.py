@@ -120,7 +120,7 @@ class Recording:
         return self.t is not None and bool(np.all(np.diff(self.t) > 0))
 
     def motion(self, arm: Arm) -> str:
-        """Returns the joint that moves most and its speed, e.g. "joint 1 at 0.2 rad/s RMS".
+        """Returns a text with the fastest joint and its speed, e.g. "joint 1 at 0.2 rad/s RMS".
 
         The text is empty if all joints are at rest, or if the speed is unknown. The speed is computed from qd, or from
         q and t if samples are less than 0.1 s apart. At longer intervals the speed between poses is unknown.
@@ -261,7 +261,7 @@ def read_recording(
     Args:
         path: Path of the CSV or log.
         arm: Arm that defines the number and the names of the joints, and whose statuses are read from a log. Without
-            it, a CSV must have 7 joints, and a log must have statuses of only one arm.
+            an arm, a CSV must have 7 joints, and a log must have statuses of only one arm.
         coordinates: Coordinates of q, qd and tau in a CSV. A log contains joint coordinates.
         skip_invalid: Whether to omit and note rows of a CSV with an empty cell, a NaN or an infinity, instead of
             refusing the file.
@@ -396,7 +396,7 @@ def write_recording(recording: Recording, path: str | Path) -> None:
     """Writes the CSV that `read_recording` reads, atomically and with full precision.
 
     Args:
-        recording: Recording in the coordinates to write; a CSV does not state them.
+        recording: Recording in the coordinates to write. A CSV does not state the coordinates.
         path: Path of the file; an existing one is replaced.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Writes recordings while they are received. If the process ends, the file is complete up to its last row.
+"""Writes recordings while statuses are received. If the process ends, the file ends with a complete row.
 
 Written rows survive the termination of the process. The last rows before a power failure may be lost.
 """
@@ -18,7 +18,7 @@ from dvrk_drake.recordings.csv_rows import GrowingFile
 from dvrk_drake.recordings.lcm_log_reader import LcmEvent, StatusStream, event_bytes, measurements
 from dvrk_drake.recordings.recording import column_names
 
-#: Additional columns of a CSV after those of a Recording, which identify the status of each row.
+#: Columns of a CSV after the columns of a Recording. They identify the status of each row.
 _ORIGIN = ("utime", "sequence", "guard_state")
 
 
