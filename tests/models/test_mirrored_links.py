@@ -171,6 +171,6 @@ def test_an_exported_left_arm_is_not_mirrored_again(tmp_path):
         content = (MODELS_FOLDER / f"{part}.yaml").read_text()
         assert content.count(text) == 1
         (tmp_path / f"{part.split('/')[1]}.yaml").write_text(content.replace(text, new))
-    left, own = load_arm("mtml"), load_arm(str(tmp_path / "mtml.yaml"))
+    left, exported = load_arm("mtml"), load_arm(str(tmp_path / "mtml.yaml"))
     for q in left.sample_poses(3, np.random.default_rng(0)):
-        np.testing.assert_allclose(torque(own, q), torque(left, q), atol=1e-12)
+        np.testing.assert_allclose(torque(exported, q), torque(left, q), atol=1e-12)

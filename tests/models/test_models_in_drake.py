@@ -50,18 +50,18 @@ def positions(plant: MultibodyPlant, arm: Arm, q: np.ndarray) -> tuple[np.ndarra
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
 def test_drake_parser_and_load_arm_give_the_same_arm(name):
     arm = load_arm(name)
-    ours, plain = make_arm_plant(arm), plain_plant(name)
-    assert plain.num_positions() == ours.num_positions() == len(arm.tree_joint_names)
-    ours_context, context = ours.CreateDefaultContext(), plain.CreateDefaultContext()
+    composed, plain = make_arm_plant(arm), plain_plant(name)
+    assert plain.num_positions() == composed.num_positions() == len(arm.tree_joint_names)
+    composed_context, context = composed.CreateDefaultContext(), plain.CreateDefaultContext()
     for q in arm.sample_poses(10, np.random.default_rng(0)):
-        set_arm_positions(ours, ours_context, arm, q)
+        set_arm_positions(composed, composed_context, arm, q)
         q_plant, index = positions(plain, arm, q)
         plain.SetPositions(context, q_plant)
         gravity = -arm.linkage.pull_back_effort(plain.CalcGravityGeneralizedForces(context)[index])
-        np.testing.assert_allclose(gravity, holding_torque(ours, ours_context, arm), atol=1e-12)
-        order = positions(ours, arm, q)[1]
+        np.testing.assert_allclose(gravity, holding_torque(composed, composed_context, arm), atol=1e-12)
+        order = positions(composed, arm, q)[1]
         mass = plain.CalcMassMatrix(context)[np.ix_(index, index)]
-        np.testing.assert_allclose(mass, ours.CalcMassMatrix(ours_context)[np.ix_(order, order)], atol=1e-12)
+        np.testing.assert_allclose(mass, composed.CalcMassMatrix(composed_context)[np.ix_(order, order)], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])

@@ -163,15 +163,15 @@ def test_links_do_not_collide_within_the_joint_limits():
     plant.Finalize()
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
-    inspector, met = scene_graph.model_inspector(), set()
+    inspector, contacts = scene_graph.model_inspector(), set()
     for q in np.vstack([box_corners(arm), np.random.default_rng(0).uniform(*limits(arm), (200, 7))]):
         set_arm_positions(plant, plant.GetMyMutableContextFromRoot(context), arm, q)
         query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
         for pair in query.ComputePointPairPenetration():
             frames = [inspector.GetFrameId(geometry) for geometry in (pair.id_A, pair.id_B)]
-            met.add(frozenset(plant.GetBodyFromFrameId(frame).name() for frame in frames))
-    assert met <= set(map(frozenset, NEIGHBOURS))
-    assert frozenset({"top_bar_link", "end_link"}) in met
+            contacts.add(frozenset(plant.GetBodyFromFrameId(frame).name() for frame in frames))
+    assert contacts <= set(map(frozenset, NEIGHBOURS))
+    assert frozenset({"top_bar_link", "end_link"}) in contacts
 
 
 def limits(arm):

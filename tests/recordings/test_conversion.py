@@ -103,11 +103,11 @@ def test_real_motion_without_header_and_time_is_restored(shared_data, tmp_path):
     original = (shared_data / "trajectories" / "mtm_one.csv").read_text().splitlines()[1:]
     path = write_text(tmp_path, "\n".join(line.split(",", 1)[1] for line in original))
     notes = convert(path, tmp_path / "out.csv").notes
-    ours = read_recording(tmp_path / "out.csv", coordinates="actuator")
-    theirs = read_recording(shared_data / "trajectories" / "mtm_one.csv", coordinates="actuator")
+    converted = read_recording(tmp_path / "out.csv", coordinates="actuator")
+    expected = read_recording(shared_data / "trajectories" / "mtm_one.csv", coordinates="actuator")
     for name in ("q", "qd", "tau"):
-        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
-    np.testing.assert_allclose(ours.t, theirs.t, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(getattr(converted, name), getattr(expected, name))
+    np.testing.assert_allclose(converted.t, expected.t, rtol=0, atol=1e-12)
     assert notes[-1].startswith("795 of 5999 rows repeat")
 
 

@@ -49,10 +49,10 @@ def test_reads_logs_written_by_lcm(tmp_path):
 
 
 def test_lcm_reads_logs_of_this_package(tmp_path):
-    path = write_log(tmp_path / "ours.log", statuses())
+    path = write_log(tmp_path / "a.log", statuses())
     events = list(lcm.EventLog(str(path)))
-    ours = list(LcmLogReader(path))
-    assert [(e.eventnum, e.timestamp, e.channel, e.data) for e in events] == [tuple(e) for e in ours]
+    read_events = list(LcmLogReader(path))
+    assert [(e.eventnum, e.timestamp, e.channel, e.data) for e in events] == [tuple(e) for e in read_events]
     assert [e.data for e in events] == [s.encode() for s in statuses()]
 
 

@@ -93,7 +93,7 @@ def check_clock(statuses):
     np.testing.assert_array_equal(np.diff([status.utime for status in statuses]), 1000 * steps)
 
 
-def holds(status):
+def is_holding(status):
     return status.guard_state == Status.STATE_HOLD
 
 

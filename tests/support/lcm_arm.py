@@ -84,7 +84,7 @@ def without_stops(plant):
             joint.set_position_limits([-np.inf], [np.inf])
 
 
-class Sending:
+class CommandSender:
     """DvrkCommandSender that answers each status, with fixed inputs."""
 
     def __init__(self, lcm, arm=ARM, **inputs):

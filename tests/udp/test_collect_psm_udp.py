@@ -6,7 +6,7 @@ This file starts itself again inside a network namespace. Processes are forked f
 import signal
 
 import numpy as np
-from arm_observer import Observer, holds
+from arm_observer import Observer, is_holding
 from arm_processes import LONG_TIMEOUT_DRIVER, dvrk_drake
 from own_network import inside, outside, run_inside
 
@@ -37,7 +37,7 @@ def test_psm_collection_from_both_sides_completes(tmp_path):
         collecting = dvrk_drake(*command)
         assert collecting.wait() == 0, collecting.output()
         assert f"{POSES} of {POSES} poses" in collecting.output()
-        observer.until(holds, "hold")
+        observer.until(is_holding, "hold")
         assert observer.last.fault_code == 0
     finally:
         print(process.end(signal.SIGINT))

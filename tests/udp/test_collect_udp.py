@@ -7,7 +7,7 @@ import signal
 
 import numpy as np
 import pytest
-from arm_observer import Observer, accepts_efforts, holds
+from arm_observer import Observer, accepts_efforts, is_holding
 from arm_processes import LONG_TIMEOUT_DRIVER, dvrk_drake
 from own_network import inside, outside, run_inside
 from waiting import wait_until
@@ -60,7 +60,7 @@ def test_collect_kill_resume_identify_and_release(observer, tmp_path):
     process.end(signal.SIGKILL)
     finished = output.read_bytes()
     assert 2 <= len(read_recording(output, arm)) < POSES
-    observer.until(holds, "hold")
+    observer.until(is_holding, "hold")
     observer.during(FORGOTTEN)
 
     process = dvrk_drake(*command)
@@ -73,7 +73,7 @@ def test_collect_kill_resume_identify_and_release(observer, tmp_path):
     error = np.abs(recording.tau - truth) / arm.effort_limits
     print(f"measured efforts are off by {error.max():.2g} of the effort limit at most")
     assert np.all(error < 0.005)
-    observer.until(holds, "hold")
+    observer.until(is_holding, "hold")
     observer.during(FORGOTTEN)
 
     model = tmp_path / "model.yaml"

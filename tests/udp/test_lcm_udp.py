@@ -15,7 +15,7 @@ import lcm
 import lcm_controller
 import numpy as np
 import pytest
-from arm_observer import NETWORK_URL, Observer, accepts_efforts, check_clock, holds
+from arm_observer import NETWORK_URL, Observer, accepts_efforts, check_clock, is_holding
 from arm_processes import (
     FORKSERVER,
     LONG_TIMEOUT_DRIVER,
@@ -127,7 +127,7 @@ def test_command_and_status_round_trip(arm):
         controller.end()
     received = observer.received[first : last + 1]
     check_clock(received)
-    assert all(map(holds, received))
+    assert all(map(is_holding, received))
     assert received[-1].num_refused == received[0].num_refused
     assert received[-1].command_sequence > 2000
     assert drift(*received) < 1e-4
@@ -150,7 +150,7 @@ def test_arm_holds_after_controller_is_killed(name, tmp_path):
         realtime = not make_realtime()  # this thread too: it shares Python's lock with the observer's
         controller.send_signal(signal.SIGKILL)
         first = len(observer.received)
-        held = observer.until(holds, "hold")
+        held = observer.until(is_holding, "hold")
         last_command = max(
             k for k in range(held) if observer.received[k].num_accepted < observer.received[held].num_accepted
         )
@@ -264,7 +264,7 @@ def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     steps = np.diff([status.sequence for status in acting])[:, None]
     efforts = np.array([status.effort_commanded for status in acting])
     assert np.all(np.abs(np.diff(efforts, axis=0)) < 0.01 * steps * load_arm(name).effort_limits)
-    held = observer.received[observer.until(holds, "hold", begun)]
+    held = observer.received[observer.until(is_holding, "hold", begun)]
     assert held.num_expired == expired  # it received HOLD and no command expired
     assert drift(*observer.during(0.1)) < 1e-3
     assert "holds by itself" in said
@@ -340,7 +340,7 @@ def test_invalid_messages_neither_stop_nor_move_the_arm(arm):
     observer.until(lambda status: unaccepted(status) - before > 9_000, "refusals", first, process)
     received = observer.received[first:]
     check_clock(received)
-    assert all(map(holds, received))
+    assert all(map(is_holding, received))
     assert drift(*received) < 1e-4
 
 
@@ -355,7 +355,7 @@ def test_controller_clock_jump_leads_to_hold_and_restart(arm):
             lambda status: status.refusal_code == Status.REFUSAL_CLOCK_JUMP, "refusal", begun, controller
         )
         # The last good command expires first.
-        held = observer.until(holds, "hold", jumped, controller)
+        held = observer.until(is_holding, "hold", jumped, controller)
         observer.until(accepts_efforts, "a new start", held, controller)
         observer.during(0.2)
     finally:
@@ -405,14 +405,14 @@ def test_replayed_commands_of_a_log_are_refused(arm, tmp_path):
             observer.until(lambda status: status.num_accepted > accepted + 500, "500 commands", process=controller)
         finally:
             controller.end()
-        observer.until(holds, "hold")
+        observer.until(is_holding, "hold")
     before, first = observer.last, len(observer.received)
     assert log.count(name) > 500
     log.play()
     enough = before.num_refused + 0.9 * log.count(name)
     observer.until(lambda status: status.num_refused > enough, "refusals", first)
     received = observer.received[first:]
-    assert all(map(holds, received))
+    assert all(map(is_holding, received))
     assert received[-1].num_accepted == before.num_accepted
     assert received[-1].refusal_code == Status.REFUSAL_STALE
     assert drift(*received) < 1e-3
@@ -444,7 +444,7 @@ def test_restarted_arm_ignores_run_and_log(tmp_path):
     finally:
         print(run.end(), arm.end())
     received = observer.received[first:]
-    assert all(map(holds, received))
+    assert all(map(is_holding, received))
     assert received[-1].num_accepted == 0
     assert received[-1].ignored_code == Status.REFUSAL_WRONG_SESSION
     assert drift(*received) < 1e-3
