@@ -110,7 +110,7 @@ def reset(name, observer):
         for k, asks in enumerate((False, False, True)):
             send(network, observer.last, k, sender_id, reset_fault=asks)
             observer.during(0.01)
-        return holds(observer.during(0.05)[-1])
+        return is_holding(observer.during(0.05)[-1])
 
     wait_until(is_cleared, "cleared fault")
 
@@ -181,7 +181,7 @@ def stop(process, seconds):
 
 def waits_for_an_operator(status):
     """Accepts that the guard detected the stall first by its own period."""
-    return holds(status) and not status.fault_code and bool(status.fault_text)
+    return is_holding(status) and not status.fault_code and bool(status.fault_text)
 
 
 @inside
@@ -238,7 +238,7 @@ def test_run_ends_after_stall_and_operator_restarts(stalled):
             assert line.endswith("Look at the arm, then start again with --reset")
         assert all(map(waits_for_an_operator, observer.received[held:]))
         runs.append(start_run("mtml", *url, "--reset"))
-        observer.until(lambda status: holds(status) and not status.fault_text, "resume", held, runs[-1])
+        observer.until(lambda status: is_holding(status) and not status.fault_text, "resume", held, runs[-1])
         observer.until(accepts_efforts, "run", held, runs[-1])
     finally:
         for process in (*runs, arm):
