@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
-from dvrk_drake.models.coupled_limits import shift_within_limits
+from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
@@ -192,7 +192,7 @@ class Collector:
         for side in (-1, 1) if self._settings.both_sides else (0,):
             self._what = f"going to pose {k + 1}"
             if side:
-                yield from self._go(shift_within_limits(self._arm, pose, side * self._approach))
+                yield from self._go(offset_pose(self._arm, pose, side * self._approach))
             yield from self._go(pose)
             self._what = f"settling at pose {k + 1}"
             if not (yield from self._settle()):
