@@ -68,7 +68,7 @@ def control(file: Path | None) -> None:
     network, held = lcm.LCM(), []
     kp, kd = np.array(ARM.gains.kp), np.array(ARM.gains.kd)
 
-    def hear(channel, data):
+    def receive(channel, data):
         status = lcmt_dvrk_status.decode(data)
         q, v = np.array(status.position), np.array(status.velocity)
         if not held:
@@ -76,7 +76,7 @@ def control(file: Path | None) -> None:
         data = answer_to(status, (held[1] + kp * (held[0] - q) - kd * v).tolist()).encode()
         network.publish(command_channel(ARM), key.sign(data) if key else data)
 
-    network.subscribe(status_channel(ARM), hear)
+    network.subscribe(status_channel(ARM), receive)
     while True:
         network.handle()
 
@@ -105,10 +105,10 @@ class Observer:
 
     def __init__(self) -> None:
         self.network, self.data = lcm.LCM(), lcmt_dvrk_status().encode()
-        self.network.subscribe(status_channel(ARM), self.hear).set_queue_capacity(0)
+        self.network.subscribe(status_channel(ARM), self.receive).set_queue_capacity(0)
         self.states: list[int] = []
 
-    def hear(self, channel: str, data: bytes) -> None:
+    def receive(self, channel: str, data: bytes) -> None:
         """Keeps a status."""
         self.data = data
         self.states.append(lcmt_dvrk_status.decode(data).guard_state)

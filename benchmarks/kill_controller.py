@@ -94,10 +94,10 @@ def be_the_arm(name: str, realtime: bool) -> None:
             print(f"warning: {warning}", file=sys.stderr)
     settle_memory()
 
-    def tell(line: str) -> None:
+    def report(line: str) -> None:
         print(1000 * read[0], line.partition(" s  ")[2], flush=True)
 
-    simulated.run(stopped, tell)
+    simulated.run(stopped, report)
 
 
 def be_the_controller(arguments: list[str]) -> None:

@@ -102,7 +102,7 @@ class StandingArm:
     def run(self, stopped: Callable[[], bool]) -> None:
         """A status each millisecond by the wall clock until `stopped`; a command that asks for efforts gets them."""
         network = lcm.LCM()
-        network.subscribe(command_channel(ARM), self.hear)
+        network.subscribe(command_channel(ARM), self.receive)
         pace = Pace(1e-3, sleep=lambda seconds: listen(network, seconds))
         begin = time.time_ns() // 1000
         while not stopped():
@@ -114,7 +114,7 @@ class StandingArm:
             self.times.went_out()
             network.publish(status_channel(ARM), self.status.encode())
 
-    def hear(self, channel: str, data: bytes) -> None:
+    def receive(self, channel: str, data: bytes) -> None:
         """Takes a command, and makes its sender the one that acts."""
         command = self.times.received(data, first=0)
         self.sender_id = command.sender_id
@@ -134,10 +134,10 @@ class TimedSimulatedArm(SimulatedArm):
         """Returns whether commands act; an echo asks for none."""
         return self.guard.state == lcmt_dvrk_status.STATE_EFFORT or bool(self.times.back)
 
-    def hear(self, channel: str, data: bytes) -> None:
+    def receive(self, channel: str, data: bytes) -> None:
         """As the arm does, noting when."""
         self.times.received(data, first=1)
-        super().hear(channel, data)
+        super().receive(channel, data)
 
     def send(self, network: lcm.LCM) -> None:
         """As the arm does, noting when."""

@@ -269,9 +269,7 @@ def _collect_chunk(name: str, ground_truth_arm: Arm, poses: NDArray[np.float64],
     """Returns the means (m, 2n) of q and tau over both approach directions."""
     arm = load_arm(name)
     offset = arm.per_joint(*APPROACH)
-    visited = np.concatenate(
-        [[offset_pose(arm, q, -offset), q, offset_pose(arm, q, offset), q] for q in poses]
-    )
+    visited = np.concatenate([[offset_pose(arm, q, -offset), q, offset_pose(arm, q, offset), q] for q in poses])
     station = ArmStation(arm, plant_arm=ground_truth_arm, effects=ground_truth_arm.effects, seed=seed)
     generator = np.random.default_rng(seed)
     nominal = IdentifiedModel.from_arm(arm)

@@ -130,7 +130,7 @@ _REFUSALS = {
     lcmt_dvrk_status.REFUSAL_BAD_RESET: "reset of a fault in a mode other than HOLD",
     lcmt_dvrk_status.REFUSAL_START_FAR: "start too far from the present efforts or pose",
     lcmt_dvrk_status.REFUSAL_START_OUTSIDE: "start while the arm is beyond a position limit",
-    lcmt_dvrk_status.REFUSAL_OTHER_SENDER: "command of a second sender",
+    lcmt_dvrk_status.REFUSAL_OTHER_SENDER: "sent by a second sender",
     lcmt_dvrk_status.REFUSAL_SUDDEN_OFF: "OFF without HOLD before",
     lcmt_dvrk_status.REFUSAL_RESUME: "command before the operator has resumed",
     lcmt_dvrk_status.REFUSAL_START_GRAVITY: "start while the measured effort differs from the gravity effort",
