@@ -166,7 +166,7 @@ def test_a_simulation_takes_a_system_or_a_scenario(poses):
     start = [0.2, 0.4, -0.25, 0.6, 0.9, 0.3, 0.5]
     held = dvrk.simulate(arm, controller=controller, effects=False, duration=0.3, start=start)
     np.testing.assert_allclose(held.recording.q[-1], start, atol=1e-3)
-    with pytest.raises(dvrk.DvrkDrakeError, match="a scenario states duration itself"):
+    with pytest.raises(dvrk.DvrkDrakeError, match="`duration` cannot be given with a scenario"):
         dvrk.simulate(dvrk.load_scenario("mtmr"), duration=1.0)
 
 
@@ -243,12 +243,15 @@ def test_an_unknown_method_is_refused(exact):
 def test_what_cannot_be_simulated_is_refused():
     arm = dvrk.load_arm("mtml")
     for controller, message in (
-        ("m.yaml", "controller is a str; allowed: an IdentifiedModel"),
-        (dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtmr")), "controller is a model of MTMR, not of MTML"),
+        ("m.yaml", "`controller` is a str; allowed: an IdentifiedModel"),
+        (
+            dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtmr")),
+            "`controller` is a model of MTMR, but the simulated arm is MTML",
+        ),
     ):
         with pytest.raises(DvrkDrakeError, match=message):
             dvrk.simulate(arm, controller=controller)
-    with pytest.raises(DvrkDrakeError, match="what is a str; allowed: an Arm"):
+    with pytest.raises(DvrkDrakeError, match="`what` is a str; allowed: an Arm"):
         dvrk.simulate("mtml")
     with pytest.raises(DvrkDrakeError, match="unknown effect frictions"):
         dvrk.simulate(arm, effects="frictions")

@@ -174,15 +174,17 @@ class Scenario(ArmConfig):
             _check_choice("controller.compensated_effects", part, ("cables", "springs"))
         if self.controller.compensated_effects and self.controller.model:
             raise ScenarioError(
-                "controller.compensated_effects is of a model from the arm's files; controller.model names another"
+                "controller.compensated_effects and controller.model exclude each other. Remove one of them."
             )
         if (gains := self.controller.gains) and (fault := arm.gains_fault(gains)):
             raise ScenarioError(f"controller.{fault}")
         for name in ("friction_ratio", "hysteresis_ratio"):
             if getattr(self.controller, name) and self.controller.mode != "gravity":
-                raise ScenarioError(f'controller.{name} needs mode "gravity"; it is "{self.controller.mode}"')
+                raise ScenarioError(
+                    f'controller.{name} requires controller.mode "gravity"; the mode is "{self.controller.mode}"'
+                )
         if self.targets and self.controller.mode != "hold":
-            raise ScenarioError(f'targets need controller.mode "hold"; it is "{self.controller.mode}"')
+            raise ScenarioError(f'targets require controller.mode "hold"; the mode is "{self.controller.mode}"')
         _ = self.model  # raises an error for a model of another arm
 
     def _check_targets(self, name: str, targets: list[Target], after: float) -> None:
@@ -191,7 +193,7 @@ class Scenario(ArmConfig):
             if not after < target.time <= self.duration:
                 earliest = "0 s or later" if after < 0 else f"after {after:g} s"
                 raise ScenarioError(
-                    f"{name}[{i}].time = {target.time:g} s must be {earliest} and at most the duration, "
+                    f"{name}[{i}].time is {target.time:g} s; allowed: {earliest}, up to the duration of "
                     f"{self.duration:g} s"
                 )
             after = target.time
@@ -201,7 +203,9 @@ class Scenario(ArmConfig):
             return
         ArmFrame(self.mounted_arm, self.hand.frame)
         if len(self.hand.path) < 2:
-            raise ScenarioError("hand.path needs two poses or more: from when to when the hand holds on")
+            raise ScenarioError(
+                "hand.path must have 2 or more poses. The hand grasps the arm at the first and releases it at the last."
+            )
 
 
 def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
@@ -226,7 +230,7 @@ def check_pose(name: str, pose: list[float], arm: Arm) -> None:
         message = f"{name}: {'; '.join(violations)} [rad, m] of {arm.name}"
         far = arm.prismatic & (np.abs(q) > 2 * arm.position_upper)
         if np.any(far) and np.all(np.abs(q[far]) / 1000 <= arm.position_upper[far]):
-            message += f"; is {arm.joint_names[int(np.argmax(far))]} in mm? It must be in m"
+            message += f". Give {arm.joint_names[int(np.argmax(far))]} in m, not in mm."
         raise ScenarioError(message)
 
 
@@ -277,11 +281,13 @@ def _load_gains_of(content: dict[str, Any]) -> None:
 def _change(content: dict[str, Any], setting: str) -> None:
     key, equals, value = setting.partition("=")
     if not equals or not key:
-        raise ScenarioError(f'--set {setting}: must be key=value, e.g. "duration=2" or "controller.mode=gravity"')
+        raise ScenarioError(
+            f'--set {setting}: a setting must be key=value, e.g. "duration=2" or "controller.mode=gravity"'
+        )
     *groups, last = key.strip().split(".")
     group: Any = content
     for name in groups:
         group = group.setdefault(name, {})
         if not isinstance(group, dict):
-            raise ScenarioError(f"--set {setting}: {name} has no keys of its own")
+            raise ScenarioError(f"--set {setting}: {name} is not a group and has no keys")
     group[last] = parse_yaml(value, f"--set {setting}", ScenarioError)

@@ -104,11 +104,12 @@ def simulate(
         ((51, 7), True)
     """
     if not isinstance(what, Arm | Scenario):
-        raise ScenarioError(f'what is a {type(what).__name__}; allowed: an Arm, e.g. load_arm("mtml"), or a Scenario')
+        raise ScenarioError(f'`what` is a {type(what).__name__}; allowed: an Arm, e.g. load_arm("mtml"), or a Scenario')
     if not isinstance(controller, IdentifiedModel | System | None):
         kind = type(controller).__name__
         raise ScenarioError(
-            f"controller is a {kind}; allowed: an IdentifiedModel (the `model` of a result) or a System"
+            f"`controller` is a {kind}; allowed: an IdentifiedModel (attribute `model` of an identification result) or "
+            "a System"
         )
     given: dict[str, Any] = {"duration": duration, "sample_period": sample_period, "seed": seed}
     if isinstance(what, Arm):
@@ -119,12 +120,17 @@ def simulate(
         scenario.mounted_arm = what
         if isinstance(controller, IdentifiedModel):
             if controller.arm.name != what.name:
-                raise ScenarioError(f"controller is a model of {controller.arm.name}, not of {what.name}")
+                raise ScenarioError(
+                    f"`controller` is a model of {controller.arm.name}, but the simulated arm is {what.name}. "
+                    f"Use a model of {what.name}."
+                )
             scenario.model = controller
     else:
         given |= {"controller": controller, "effects": effects, "start": start, "targets": targets}
-        if beside := [name for name, value in given.items() if value is not None]:
-            raise ScenarioError(f"a scenario states {beside[0]} itself; change the scenario, or give an arm")
+        if extra := [name for name, value in given.items() if value is not None]:
+            raise ScenarioError(
+                f"`{extra[0]}` cannot be given with a scenario. Set it in the scenario, or give an arm."
+            )
         scenario = what
     return _simulate(scenario, controller if isinstance(controller, System) else None, meshcat, progress)
 

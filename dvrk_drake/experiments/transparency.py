@@ -105,7 +105,7 @@ def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> Piecewi
     """
     recording = recording.in_joint_coordinates(arm)
     if recording.t is None:
-        raise ScenarioError(f"{recording.source}: has no times; a path needs column t")
+        raise ScenarioError(f"{recording.source}: the recording has no times; column t is required")
     if not 0 < speed <= 10:
         raise ScenarioError(f"speed is {speed:g}; allowed: above 0, up to 10")
     A, lower, upper = arm.limit_matrix()
@@ -114,12 +114,12 @@ def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> Piecewi
         j = int(np.argmax(outside))
         name = [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)][j]
         raise ScenarioError(
-            f"{recording.source}: {name} leaves the limits of {arm.name} by {outside[j]:.2g} rad or m; is it a motion "
-            f"of this arm's joints, not of another arm's or of actuators?"
+            f"{recording.source}: {name} exceeds the limits of {arm.name} by {outside[j]:.2g} rad or m. Check that the "
+            "recording is of this arm and contains joint positions, not actuator positions."
         )
     t, keep = np.unique(recording.t, return_index=True)
     if len(t) < 3:
-        raise ScenarioError(f"{recording.source}: has {len(t)} different times; a path needs 3 or more")
+        raise ScenarioError(f"{recording.source}: the recording has {len(t)} different times; 3 or more are required")
     q = np.clip(recording.q[keep], arm.position_lower, arm.position_upper)
     return PiecewisePolynomial.CubicShapePreserving((t - t[0]) / speed, q.T, zero_end_point_derivatives=True)
 

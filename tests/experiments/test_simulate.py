@@ -167,20 +167,23 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
         ("controller.model=nothing.yaml", "nothing.yaml: no such file"),
         ("gravity=[0, 0, 981]", "gravity[2] is 981; allowed: -30..30 m/s^2"),
         ("start=[0, 0, 0.1, 0, 0, 0]", "start has 6 numbers; PSM has 7 joints: yaw, pitch, insertion"),
-        ("start=[0, 0, 100, 0, 0, 0, 0]", "insertion = 100 is outside 0..0.24 [rad, m] of PSM; is insertion in mm?"),
+        (
+            "start=[0, 0, 100, 0, 0, 0, 0]",
+            "insertion = 100 is outside 0..0.24 [rad, m] of PSM. Give insertion in m, not in mm.",
+        ),
         ("start=[3, 0, 0.1, 0, 0, 0, 0]", "yaw = 3 is outside -1.588..1.588 [rad, m] of PSM"),
         ("start=[0, .nan, 0.1, 0, 0, 0, 0]", "start[1] is nan; allowed: a finite number"),
         ("targets=[{time: 1, pose: [0, 0]}]", "targets[0].pose has 2 numbers"),
         (
             f"targets=[{{time: 9, pose: {ZERO}}}]",
-            "targets[0].time = 9 s must be after 0 s and at most the duration, 5 s",
+            "targets[0].time is 9 s; allowed: after 0 s, up to the duration of 5 s",
         ),
         (f"targets=[{{time: .nan, pose: {ZERO}}}]", "targets[0].time is nan; allowed: a finite number"),
         ("effects=[{coordinate: elbow, kind: offset}]", 'effects[0].coordinate is "elbow"; allowed: actuator.yaw'),
         ("effects=[{coordinate: joint.yaw, kind: viscous}]", 'effects[0].kind is "viscous"; allowed: offset, spring'),
         ("seed=-1", "seed is -1"),
         ("arm=psm9", 'unknown arm "psm9"; did you mean "psm"? known arms: mtml, mtmr, psm'),
-        ("duration", "--set duration: must be key=value"),
+        ("duration", "--set duration: a setting must be key=value"),
         ("start=[0,", "--set start=[0,: not YAML"),
     ],
 )
@@ -224,5 +227,5 @@ def test_targets_need_mode_hold():
     scenario = Scenario(arm="psm", targets=[Target(1.0, [0, 0, 0.1, 0, 0, 0, 0])])
     scenario.check()
     scenario.controller.mode = "gravity"
-    with pytest.raises(ScenarioError, match=r'targets need controller\.mode "hold"'):
+    with pytest.raises(ScenarioError, match=r'targets require controller\.mode "hold"'):
         scenario.check()

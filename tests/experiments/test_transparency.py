@@ -63,7 +63,7 @@ def test_recorded_path_respects_limits_and_speed():
     assert np.all(values <= ARM.position_upper + 1e-12) and np.all(values >= ARM.position_lower - 1e-12)
     expected = np.clip(middle + (half + 0.05) * np.sin(4.0), ARM.position_lower, ARM.position_upper)
     np.testing.assert_allclose(path.value(2.0).ravel(), expected, atol=2e-3)
-    with pytest.raises(ScenarioError, match="leaves the limits of MTML"):
+    with pytest.raises(ScenarioError, match="exceeds the limits of MTML"):
         recorded_path(ARM, Recording(q=middle + (half + 0.2) * np.sin(t)[:, None], t=t, tau=np.zeros_like(q)))
     with pytest.raises(ScenarioError, match="speed is 0"):
         recorded_path(ARM, Recording(q=q, t=t, tau=np.zeros_like(q)), speed=0)
@@ -71,7 +71,7 @@ def test_recorded_path_respects_limits_and_speed():
         recorded_path(ARM, Recording(q=q, tau=np.zeros_like(q)))
     with pytest.raises(ScenarioError, match="has 2 different times"):
         recorded_path(ARM, Recording(q=q[:2], t=t[:2]))
-    with pytest.raises(ScenarioError, match="parallelogram leaves the limits of MTML"):
+    with pytest.raises(ScenarioError, match="parallelogram exceeds the limits of MTML"):
         recorded_path(ARM, Recording(q=q + 0.6 * np.array([0, 1, 1, 0, 0, 0, 0]), t=t))
     moved = Recording(q=q, t=t).in_actuator_coordinates(ARM)
     np.testing.assert_allclose(recorded_path(ARM, moved, 0.5).value(2.0), path.value(2.0), atol=1e-12)

@@ -43,8 +43,8 @@ STEP_DURATION = 4.0
 SAMPLE_PERIOD = 0.01
 #: Note on the interpretation of the drift.
 NO_DRY_FRICTION = (
-    "Dry friction is not simulated here: every error of the model moves the released arm. On a real arm dry friction "
-    "resists this drift."
+    "The simulation has no dry friction, so every model error moves the released arm. On a real arm, dry friction "
+    "reduces this drift."
 )
 
 
@@ -149,7 +149,7 @@ def run_demo(
         ArmError: The demo has no plan for this arm.
     """
     if arm_name not in PLANS:
-        raise ArmError(f'the demo has no plan for "{arm_name}"; it has for {", ".join(PLANS)}')
+        raise ArmError(f'the demo does not support the arm "{arm_name}"; allowed: {", ".join(PLANS)}')
     with TemporaryDirectory() as folder:
         return _run_demo(output, Path(folder) / "ground_truth_arm.sdf", arm_name, seed, progress)
 

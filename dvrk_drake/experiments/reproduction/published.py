@@ -143,6 +143,7 @@ STATIC, FIGURE_4 = "mtm_2015_good72.csv", "paper_fig4_squared_errors.csv"
 PAPER_ARM = "mtmr"
 #: Environment variable with the folder that contains data/mtm_static; the tests use the same variable.
 VARIABLE = "DVRK_DRAKE_SHARED"
+_INSTRUCTIONS = "To create it from the team's repository, see docs/public_recordings.md."
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ class PaperRecordings:
         """
         if folder is not None:
             if not (Path(folder) / STATIC).is_file():
-                raise RecordingError(f"{folder}: no {STATIC} there; {_where_from()}")
+                raise RecordingError(f"{folder}: the folder does not contain {STATIC}. {_INSTRUCTIONS}")
             return cls(Path(folder))
         shared = os.environ.get(VARIABLE)
         below = Path(shared) / "data" / "mtm_static" if shared else None
@@ -174,7 +175,7 @@ class PaperRecordings:
             RecordingError: The recording does not exist.
         """
         if self.folder is None:
-            raise RecordingError(f"needs {STATIC}: name its folder with --data; {_where_from()}")
+            raise RecordingError(f"{STATIC} is required. Give its folder with --data. {_INSTRUCTIONS}")
         return read_recording(self.folder / STATIC)
 
     @property
@@ -191,9 +192,7 @@ class PaperRecordings:
         except ValueError as error:
             raise RecordingError(f"{path}: {error}") from error
         if table.shape != (72, 7):
-            raise RecordingError(f"{path}: must be 72 rows of pose, J2..J7; it is {table.shape}")
+            raise RecordingError(
+                f"{path}: the table must have 72 rows and 7 columns (pose, J2..J7); its shape is {table.shape}"
+            )
         return np.asarray(table[:, 1:])
-
-
-def _where_from() -> str:
-    return "docs/public_recordings.md says how to make it from the team's repository"

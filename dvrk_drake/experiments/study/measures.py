@@ -69,20 +69,21 @@ class Measure:
         for name, default in (("band", kind.band), ("time", kind.time)):
             value = getattr(self, name)
             if value is not None and default is None:
-                raise StudyError(f"{self.kind} has no {name}")
+                raise StudyError(f"{name} is not a setting of {self.kind}. Remove it.")
         if unknown := sorted(set(self.joints) - set(scenario.mounted_arm.joint_names)):
             raise StudyError(
-                f"joints of {self.column}: unknown {', '.join(unknown)}; {scenario.mounted_arm.name} has "
+                f"joints of {self.column}: unknown joint {', '.join(unknown)}; joints of {scenario.mounted_arm.name}: "
                 f"{', '.join(scenario.mounted_arm.joint_names)}"
             )
         rest = scenario.duration - _arrival(scenario)
         if kind.time is not None and not 2 * scenario.sample_period <= self._time <= rest + 1e-9:
             raise StudyError(
-                f"time of {self.column} is {self._time:g} s; allowed: {2 * scenario.sample_period:g}..{rest:g} s, from "
-                "two samples to what is left of the scenario after start, last target and hand"
+                f"time of {self.column} is {self._time:g} s; allowed: {2 * scenario.sample_period:g}..{rest:g} s. The "
+                "minimum is two sample periods. The maximum is the time left after the last target and the release "
+                "by the hand."
             )
         if self.kind == "overshoot" and not scenario.targets:
-            raise StudyError("overshoot needs a scenario with targets")
+            raise StudyError("overshoot requires a scenario with targets")
 
     def __call__(self, scenario: Scenario, simulation: Simulation) -> float | bool:
         """Computes the measure of a run: the worst value of its joints."""

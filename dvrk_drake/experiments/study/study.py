@@ -80,8 +80,9 @@ def run_study(
         if losses:
             case, error = losses[0]
             raise StudyError(
-                f"{len(study.cases) - len(table.rows)} of {len(study.cases)} cases are missing: case {case.index}: "
-                f"{type(error).__name__}: {error}; the others are in {output}; the same command goes on"
+                f"{len(study.cases) - len(table.rows)} of {len(study.cases)} cases are missing (case {case.index}: "
+                f"{type(error).__name__}: {error}). {output} contains the finished cases. Repeat the command to run "
+                "the missing ones."
             ) from error
         table.sort()
         return table.rows
@@ -188,22 +189,24 @@ def dask_executor(address: str) -> Iterator[Executor]:
         StudyError: distributed is not installed, the scheduler does not answer, or it has no suitable workers.
     """
     if not re.fullmatch(r"tcp://\S+:\d+", address):
-        raise StudyError(f'"{address}" is no address of a scheduler; allowed: tcp://HOST:PORT')
+        raise StudyError(f'"{address}" is not the address of a scheduler; allowed: tcp://HOST:PORT')
     try:
         from distributed import Client
     except ImportError as error:
-        raise StudyError("--scheduler needs distributed: pip install 'dvrk-drake[dask]'") from error
+        raise StudyError("--scheduler requires the package distributed. Run: pip install 'dvrk-drake[dask]'") from error
     for logger in ("distributed", "distributed.client"):
         logging.getLogger(logger).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
-        raise StudyError(f"{address}: no Dask scheduler answers there: {error}") from error
+        raise StudyError(f"{address}: no Dask scheduler answers at this address: {error}") from error
     with client:
         try:
             client.wait_for_workers(1, timeout=TIMEOUT)
         except TimeoutError as error:
-            raise StudyError(f"{address}: the scheduler has no workers; start some: dask worker {address}") from error
+            raise StudyError(
+                f"{address}: the scheduler has no workers. Start workers: dask worker {address}"
+            ) from error
         _check_workers(client)
         # The cluster would cache the results of pure functions and share them between studies.
         yield client.get_executor(pure=False)
@@ -216,7 +219,9 @@ def _check_workers(client: Client) -> None:
         raise StudyError(f"the Dask workers cannot import dvrk_drake: {error}") from error
     for worker, theirs in found.items():
         if theirs != versions():
-            raise StudyError(f"{worker}: has {theirs}, here is {versions()}; results would differ: install the same")
+            raise StudyError(
+                f"{worker}: the worker has {theirs}, this computer has {versions()}. Install the same versions."
+            )
 
 
 class _SpawningExecutor(ProcessPoolExecutor):

@@ -140,13 +140,13 @@ class Study:
             ScenarioError, ArmError, ModelError: The scenario is invalid for a variation or a pose.
         """
         if not self.scenario:
-            raise StudyError("scenario is missing; give an arm's name, or the path of a scenario's YAML file")
+            raise StudyError("scenario is missing. Give the name of an arm, or the path of a scenario's YAML file.")
         if not (self.seeds and self.variations and self.measures):
             raise StudyError("seeds, variations and measures must not be empty")
         if fault := number_fault(self):
             raise StudyError(fault)
         if len({*self.seeds}) < len(self.seeds):
-            raise StudyError(f"seeds must be different whole numbers from 0; got {self.seeds}")
+            raise StudyError(f"seeds must not contain a number twice; got {self.seeds}")
         _check_names("variations", [variation.name for variation in self.variations])
         if any(scenario.mounted_arm.joint_names != self.arm.joint_names for scenario in self.scenarios.values()):
             raise StudyError("all variations must have the same joints")
@@ -157,9 +157,12 @@ class Study:
                 except StudyError as error:
                     raise StudyError(f"measures[{i}].{error}") from error
         _check_names("measures", [measure.column for measure in self.measures])
+        reserved = ", ".join([*RESERVED, "q1, q2, ..."])
         for column in (measure.column for measure in self.measures):
             if column in RESERVED or not re.fullmatch(r"[A-Za-z_]\w*", column) or re.fullmatch(r"q\d+", column):
-                raise StudyError(f'measures: "{column}" cannot be a column; allowed: a word, but {", ".join(RESERVED)}')
+                raise StudyError(
+                    f'measures: "{column}" cannot be a column; allowed: letters, digits and "_", except {reserved}'
+                )
         self._check_poses()
 
     def _check_poses(self) -> None:
@@ -169,7 +172,7 @@ class Study:
         if self.random_poses is None:
             return
         if self.poses:
-            raise StudyError("poses and random_poses: give one of them")
+            raise StudyError("poses and random_poses exclude each other. Remove one of them.")
 
     def _starts(self) -> list[list[float]]:
         """Returns the start poses of the arm."""
@@ -207,4 +210,4 @@ def _seed_of_run(seed: int, pose: int) -> int:
 
 def _check_names(what: str, names: list[str]) -> None:
     if len({*names}) < len(names) or not all(name.isprintable() and name for name in names):
-        raise StudyError(f"{what} must have different names, of one line; got {names}")
+        raise StudyError(f"{what} must have different names of one line each; got {names}")

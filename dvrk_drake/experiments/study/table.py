@@ -99,20 +99,22 @@ class StudyTable:
         except (UnicodeDecodeError, csv.Error):
             rows = []
         if not rows or rows[0][:2] != self._header[:2]:
-            raise StudyError(f"{self._path}: is there and is no table of a study; name another output")
+            raise StudyError(
+                f"{self._path}: the file exists and does not contain results of a study. Give another output."
+            )
         header, *rows = rows
         found: dict[int, Row] = {}
         for line, cells in enumerate(rows, 2):
-            where = f"{self._path}:{line}"
+            where = f"{self._path}, line {line}"
             if header != self._header or cells[:1] != [self._study.fingerprint]:
                 raise StudyError(
-                    f"{where}: was begun with another study (its file, or what that names, or a version changed); "
-                    "name another output"
+                    f"{where}: the results are from a different study. Its files or the installed versions have "
+                    "changed since then. Give another output."
                 )
             if len(cells) != len(header) or not cells[1].isdigit() or int(cells[1]) >= len(self._study.cases):
-                raise StudyError(f"{where}: was changed by hand: is no row of this study; name another output")
+                raise StudyError(f"{where}: the line is not a result of this study. Give another output.")
             if int(cells[1]) in found:
-                raise StudyError(f"{where}: has case {cells[1]} again; name another output")
+                raise StudyError(f"{where}: case {cells[1]} occurs twice. Give another output.")
             found[int(cells[1])] = self._row(cells, where)
         return found
 
@@ -123,7 +125,7 @@ class StudyTable:
         try:
             return Row({name: _value(text) for name, text in zip(self._names, texts, strict=True)})
         except ValueError as error:
-            raise StudyError(f"{where}: was changed by hand: {error}; name another output") from error
+            raise StudyError(f"{where}: {error}. Give another output.") from error
 
 
 def _line(cells: list[str]) -> bytes:
@@ -150,7 +152,9 @@ def _lock(path: Path) -> IO[bytes]:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         file.close()
-        raise StudyError(f"{path}: another study is writing it") from error
+        raise StudyError(
+            f"{path}: another process is writing this file. Wait for it, or give another output."
+        ) from error
     return file
 
 
@@ -177,7 +181,9 @@ class ParquetStudyTable(StudyTable):
             RecordingError: The file cannot be read or written.
         """
         if pyarrow is None:
-            raise StudyError(f"{path}: Parquet needs pyarrow: pip install 'dvrk-drake[parquet]', or name a .csv")
+            raise StudyError(
+                f"{path}: Parquet requires pyarrow. Run: pip install 'dvrk-drake[parquet]'. Or give a .csv file."
+            )
         self._parquet = Path(path)
         finished = _finished_rows(self._parquet, study) if self._parquet.exists() else {}
         super().__init__(f"{path}.rows.csv", study)
@@ -207,9 +213,11 @@ def _finished_rows(path: Path, study: Study) -> dict[int, Row]:
     try:
         content = pyarrow.parquet.read_table(path).to_pylist()
     except (OSError, pyarrow.ArrowException) as error:
-        raise StudyError(f"{path}: is there and is no table of a study; name another output") from error
+        raise StudyError(
+            f"{path}: the file exists and does not contain results of a study. Give another output."
+        ) from error
     if {row.get("study") for row in content} != {study.fingerprint}:
-        raise StudyError(f"{path}: was made by another study; name another output")
+        raise StudyError(f"{path}: the results are from a different study. Give another output.")
     names = [measure.column for measure in study.measures]
     return {row["case"]: Row({} if row["error"] else {n: row[n] for n in names}, row["error"] or "") for row in content}
 

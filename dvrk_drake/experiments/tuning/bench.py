@@ -69,7 +69,10 @@ def tuning_poses(arm: Arm, count: int, seed: int) -> NDArray[np.float64]:
     motors = per_actuator(arm.effects.saturation, arm.joint_names, np.inf)
     light = candidates[np.all(np.abs(efforts) <= HOLDING_SHARE * motors, axis=1)]
     if len(light) < count:
-        raise ArmError(f"{arm.name}: its motors hold hardly any pose with {100 * HOLDING_SHARE:.0f} % of their effort")
+        raise ArmError(
+            f"{arm.name}: gravity requires more than {100 * HOLDING_SHARE:.0f} % of a motor's maximum effort at almost "
+            "all poses. Check the inertias and motor limits of the arm."
+        )
     return light[:count]
 
 

@@ -113,7 +113,9 @@ def design_arm(arm: Arm) -> ArmDesign:
         slow = int(np.argmax(shares))
         slowed[slow] *= 0.9
         joints[slow] = design_joint(facts[slow], sampling, slowed[slow])
-    raise ControllerError(f"{arm.name}: no gains with which all joints are stable together")
+    raise ControllerError(
+        f"{arm.name}: no gains stabilise all joints together. Check the inertias, delays and encoders of the arm."
+    )
 
 
 def _named(arm: Arm, name: str, fact: JointFacts, sampling: Sampling) -> JointDesign:
@@ -141,7 +143,9 @@ def design_joint(fact: JointFacts, sampling: Sampling, slowed: float = 1.0) -> J
         kp, kd, ki = design
         low, high = (SampledLoop(M, sampling, fact.viscous).margins(Gains([kp], [kd], [ki])) for M in fact.inertia)
         return JointDesign(kp, kd, ki, float(slowed * w), (low, high), limited_by)
-    raise ControllerError(f"no gains for {FREQUENCIES[-1]:g} rad/s or more, limited by: {limited_by}")
+    raise ControllerError(
+        f"no gains satisfy the requirements at {FREQUENCIES[-1]:g} rad/s or more (limited by {limited_by})"
+    )
 
 
 def _joint_gains(fact: JointFacts, sampling: Sampling, w: float) -> tuple[float, float, float]:

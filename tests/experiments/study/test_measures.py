@@ -114,13 +114,16 @@ def test_failed_run_has_worst_value(kind):
     ("measure", "message"),
     [
         (Measure("settle"), 'kind is "settle"; allowed: settling_time, overshoot'),
-        (Measure("overshoot", band=0.1), "overshoot has no band"),
-        (Measure("ran_away", time=1.0), "ran_away has no time"),
+        (Measure("overshoot", band=0.1), "band is not a setting of overshoot"),
+        (Measure("ran_away", time=1.0), "time is not a setting of ran_away"),
         (Measure("held", band=-1.0), "band is -1; allowed: 1e-09..12.6 rad or m"),
         (Measure("held", time=math.nan), "time is nan; allowed: 1e-05..3600 s"),
         (Measure("held", time=18.5), r"time of held is 18.5 s; allowed: 0.02..18 s"),
         (Measure("drift", time=0.001), r"time of drift is 0.001 s; allowed: 0.02..18 s"),
-        (Measure("drift", joints=["elbow"]), "unknown elbow; MTML has outer_yaw, shoulder_pitch, elbow_pitch"),
+        (
+            Measure("drift", joints=["elbow"]),
+            "unknown joint elbow; joints of MTML: outer_yaw, shoulder_pitch, elbow_pitch",
+        ),
     ],
 )
 def test_rejects_invalid_measures(measure, message):
@@ -129,5 +132,5 @@ def test_rejects_invalid_measures(measure, message):
 
 
 def test_overshoot_requires_target():
-    with pytest.raises(StudyError, match="overshoot needs a scenario with targets"):
+    with pytest.raises(StudyError, match="overshoot requires a scenario with targets"):
         Measure("overshoot").check(released()[0])

@@ -128,7 +128,7 @@ def test_table_does_not_depend_on_workers_or_order(executor, reference, tmp_path
 @pytest.mark.parametrize("cases", [0, 1, 23])
 def test_lost_workers_do_not_lose_rows(cases, reference, tmp_path):
     path = tmp_path / "killed.csv"
-    message = rf"^{24 - cases} of 24 cases are missing: case"
+    message = rf"^{24 - cases} of 24 cases are missing \(case"
     with Dying(cases) as executor, pytest.raises(StudyError, match=message) as loss:
         run_study(make_study(), executor, path)
     assert isinstance(loss.value.__cause__, BrokenProcessPool)
@@ -174,7 +174,7 @@ def test_rejects_table_of_another_study_unchanged(change, reference, tmp_path):
     path = tmp_path / "begun.csv"
     begun = reference[: len(reference) // 2]
     path.write_bytes(begun)
-    with ThreadPoolExecutor(1) as executor, pytest.raises(StudyError, match="was begun with another study"):
+    with ThreadPoolExecutor(1) as executor, pytest.raises(StudyError, match="the results are from a different study"):
         run_study(make_study(**change), executor, path)
     assert path.read_bytes() == begun
 
@@ -182,12 +182,12 @@ def test_rejects_table_of_another_study_unchanged(change, reference, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda text: b"hello", "is no table of a study"),
-        (lambda text: b"t,q1,q2\n1,2,3\n", "is no table of a study"),
-        (lambda text: b"\xff\xfe\n", "is no table of a study"),
-        (lambda text: text + text.splitlines(keepends=True)[5], ":26: has case 4 again"),
-        (lambda text: text.replace(b',3,"wrong', b',300,"wrong'), ":5: was changed by hand"),
-        (lambda text: text.replace(b",false,", b",nearly,", 1), "was changed by hand: could not convert"),
+        (lambda text: b"hello", "does not contain results of a study"),
+        (lambda text: b"t,q1,q2\n1,2,3\n", "does not contain results of a study"),
+        (lambda text: b"\xff\xfe\n", "does not contain results of a study"),
+        (lambda text: text + text.splitlines(keepends=True)[5], ", line 26: case 4 occurs twice"),
+        (lambda text: text.replace(b',3,"wrong', b',300,"wrong'), ", line 5: the line is not a result of this study"),
+        (lambda text: text.replace(b",false,", b",nearly,", 1), ": could not convert"),
     ],
 )
 def test_rejects_other_files_and_leaves_them_unchanged(change, message, reference, tmp_path):
@@ -203,7 +203,7 @@ def test_two_studies_cannot_write_the_same_file(tmp_path):
     with (
         StudyTable(path, make_study()),
         ThreadPoolExecutor(1) as executor,
-        pytest.raises(StudyError, match="another study is writing it"),
+        pytest.raises(StudyError, match="another process is writing this file"),
     ):
         run_study(make_study(), executor, path)
 
@@ -239,7 +239,7 @@ def test_parquet_matches_csv(reference, tmp_path):
     for ours, theirs in zip(table.to_pylist(), csv.DictReader(reference.decode().splitlines()), strict=True):
         texts = {name: "" if value is None else str(value) for name, value in ours.items()}
         assert texts | {"held": texts["held"].lower()} == theirs
-    with Dying(0) as executor, pytest.raises(StudyError, match="was made by another study"):
+    with Dying(0) as executor, pytest.raises(StudyError, match="the results are from a different study"):
         run_study(make_study(seeds=[5]), executor, path)
 
 
