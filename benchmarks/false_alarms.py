@@ -27,8 +27,8 @@ from dvrk_drake.processes.collector import CollectionSettings, Collector
 from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.systems.teleoperation import Teleoperation
 
-#: By use: arm, control, maximum speed [rad/s; 0.1 m/s], amplitude as a share of half of each range, whether a hand moves
-#: the arm, and weight in the total time.
+#: By use: arm, control, maximum speed [rad/s; 0.1 m/s], amplitude as a share of half of each range, whether a hand
+#: moves the arm, and weight in the total time.
 USES = {
     "hold, no commands": ("mtml", "hold", 0.5, 0.35, False, 1),
     "gravity compensation, hand at 0.5 rad/s": ("mtml", "gravity", 0.5, 0.35, True, 4),

@@ -1,8 +1,8 @@
-"""Coverage of the 95 % intervals of `payload` on simulated arms whose drives changed between two days.
+"""Measures the coverage of the 95 % intervals of `payload` on simulated arms whose drives change between two days.
 
     python benchmarks/payload_coverage.py [--seeds 40]
 
-Every arm has links, friction, springs and cables of its own (tests/support/loaded_arm.py says how large).
+Each arm has different links, friction, springs and cables; see tests/support/loaded_arm.py for their sizes.
 """
 
 from __future__ import annotations
@@ -43,8 +43,11 @@ def main() -> int:
             inside += list(np.abs(difference) < payload.quantile * spread)
             sizes.append(payload.mass_error)
         rms = ", ".join(f"{x:.2f}" for x in np.sqrt(np.mean(np.square(errors), axis=0)))
-        print(f"{name} {link}, {mass:.2f} kg: +- {np.median(sizes):.4f}; RMS errors in standard errors: {rms}")
-    print(f"95 % intervals that hold the truth: {np.mean(inside):.1%} of {len(inside)}")
+        print(
+            f"{name} {link}, {mass:.2f} kg: median standard error {np.median(sizes):.4f} kg; "
+            f"RMS error / standard error of mass and position: {rms}"
+        )
+    print(f"coverage of the 95 % intervals: {100 * np.mean(inside):.1f} % of {len(inside)}")
     return 0
 
 
