@@ -73,7 +73,7 @@ def print_table(title, arm, tasks, trials):
         f"{sum(scale * o.before <= 0.05 for scale, o in found)} had before <= 0.05, "
         f"{sum(o.speed <= 0.5 for _, o in found)} had speed <= 0.5, "
         f"and {sum(o.effort <= 0.4 for _, o in found)} had effort <= 0.4. Of the undetected faults, "
-        f"{sum(scale * o.before > 0.05 for scale, o in flat if np.isinf(o.detected))} moved the joint by more than 0.05.",
+        f"{sum(scale * o.before > 0.05 for scale, o in flat if np.isinf(o.detected))} had before > 0.05.",
         flush=True,
     )
 
