@@ -1,4 +1,4 @@
-"""Run a command with the kernels of another CPU: OpenBLAS, numpy and numba round differently on each kind.
+"""Runs a command with the numerical kernels of another CPU, since OpenBLAS, numpy and numba round differently on it.
 
     python tools/other_kernels.py make test-fast
 
@@ -21,7 +21,7 @@ print("numba:", cpu_target.target_context.codegen().magic_tuple()[1])
 
 
 def other_kernels() -> dict[str, str]:
-    """Returns the environment variables that select other kernels."""
+    """Returns environment variables that select the kernels of another CPU."""
     found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
     newest = [name for name in found if name == "X86_V4" or name.startswith("AVX512")]
     return {
