@@ -1,8 +1,8 @@
 """Mutation testing: changes one operator, constant or statement at a time and lists the changes that no test detects.
 
 Each mutant is tested in a fork of a process that has imported Drake and numpy. The tests that last detected a mutant
-run first, then the fastest tests. Tests marked slow do not run. Modules that numba compiles are refused, since numba would
-use the unchanged functions from its cache.
+run first, then the fastest tests. Tests marked slow do not run. Modules that numba compiles are refused, since numba
+would use the unchanged functions from its cache.
 """
 
 import ast
