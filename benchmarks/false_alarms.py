@@ -92,7 +92,7 @@ def collect(arm, seconds):
             CollectionFile(Path(folder) / "poses.csv", arm, True),
             CollectionSettings(),
         )
-        simulated.lead = collector.lead
+        simulated.on_status = collector.update
         result = step(simulated, seconds, check=lambda: str(collector.problem or ""), until=lambda: collector.finished)
         collector.close()
     print(f"{arm.name}: {np.count_nonzero(collector.done)} poses measured", flush=True)

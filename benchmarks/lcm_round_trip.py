@@ -136,10 +136,10 @@ class TimedSimulatedArm(SimulatedArm):
         """Returns whether commands act. The echo sends no efforts, so for the echo any answer is enough."""
         return self.guard.state == lcmt_dvrk_status.STATE_EFFORT or bool(self.times.back)
 
-    def hear(self, channel: str, data: bytes) -> None:
+    def receive(self, channel: str, data: bytes) -> None:
         """Stores the time, then receives a command."""
         self.times.received(data, first=1)
-        super().hear(channel, data)
+        super().receive(channel, data)
 
     def send(self, network: lcm.LCM) -> None:
         """Stores the time, then sends a status."""

@@ -81,7 +81,7 @@ class Controller:
     def period(self) -> None:
         """Receives a status and encodes a command."""
         self.time += 1e-3
-        self.statuses.take(self.arm.status_data, self.time)
+        self.statuses.accept(self.arm.status_data, self.time)
         self.arm.signed(self.arm.command)
 
 

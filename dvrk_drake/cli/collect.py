@@ -133,7 +133,7 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
             controller,
             stopped,
             lambda text: line.show(lambda: f"{len(teacher.poses)} poses; {text}"),
-            teacher.lead,
+            teacher.update,
         )
     finally:
         teacher.close()
@@ -172,7 +172,7 @@ def _visit(
             controller,
             lambda: collector.finished,
             lambda text: line.show(lambda: f"{collector.describe()}; {text}"),
-            collector.lead,
+            collector.update,
         )
     finally:
         collector.close()

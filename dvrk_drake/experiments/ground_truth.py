@@ -29,7 +29,7 @@ from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.study.study import await_results
 from dvrk_drake.export.sdf import to_text, with_inertias
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.coupled_limits import beside
+from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.loop_closure import Closure
@@ -269,7 +269,7 @@ def _collect_chunk(name: str, ground_truth_arm: Arm, poses: NDArray[np.float64],
     """Returns the means (m, 2n) of q and tau over both approach directions."""
     arm = load_arm(name)
     offset = arm.per_joint(*APPROACH)
-    visited = np.concatenate([[beside(arm, q, -offset), q, beside(arm, q, offset), q] for q in poses])
+    visited = np.concatenate([[offset_pose(arm, q, -offset), q, offset_pose(arm, q, offset), q] for q in poses])
     station = ArmStation(arm, plant_arm=ground_truth_arm, effects=ground_truth_arm.effects, seed=seed)
     generator = np.random.default_rng(seed)
     nominal = IdentifiedModel.from_arm(arm)

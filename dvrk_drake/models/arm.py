@@ -30,7 +30,7 @@ from dvrk_drake.models.arm_schema import (
 from dvrk_drake.models.coupled_limits import can_meet_coupled_limits, coupled_limit_fault, limits_fault
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.schema_fault import RANGE, Range, meant, number_fault, within
+from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, suggest_name, within
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, local_path, read_sdf_facts
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
@@ -313,7 +313,7 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
     path = Path(name)
     if not path.is_absolute():
         if name not in known_arms():
-            near = meant(name, known_arms())
+            near = suggest_name(name, known_arms())
             raise ArmError(f'unknown arm "{name}"; {near}known arms: {", ".join(known_arms())}; or name a YAML file')
         path = _ARMS / f"{name}.yaml"
     description = load_typed_yaml(ArmDescription, path, ArmError, "an arm's file")

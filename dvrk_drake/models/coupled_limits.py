@@ -56,7 +56,7 @@ def limits_fault(key: str, lower: float, upper: float, slides: bool) -> str:
     return widths.fault(f"{key}: upper - lower", upper - lower)
 
 
-def beside(arm: Arm, pose: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
+def offset_pose(arm: Arm, pose: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns pose + offset (n,), with the offset of each joint shortened so that no limit of `arm` is violated."""
     A, lower, upper = arm.limit_matrix()
     change = A @ offset

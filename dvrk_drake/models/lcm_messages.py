@@ -216,10 +216,10 @@ class StatusFilter:
         self._arm_name, self._num_joints, self._key, self._follow_after = arm_name, num_joints, key, follow_after
         self._session_id = session_id
         self._fingerprint = lcmt_dvrk_status()._get_packed_fingerprint()
-        self._heard = 0.0
+        self._last_arrival = 0.0
         self._reference = (0, 0, 0.0)
 
-    def take(self, data: bytes, now: float, *, settle: bool = True) -> lcmt_dvrk_status | None:
+    def accept(self, data: bytes, now: float, *, settle: bool = True) -> lcmt_dvrk_status | None:
         """Returns the status in a message, or None if it is ignored; arguments as for `examine`."""
         return None if self.examine(data, now, settle=settle) else self.last
 
@@ -242,7 +242,7 @@ class StatusFilter:
             self.ignored[reason] += 1
             return reason
         is_first = self.last is None
-        self.last, self._heard, self._session_id = status, now, status.session_id
+        self.last, self._last_arrival, self._session_id = status, now, status.session_id
         self.ignored.clear()
         if settle or is_first:
             self.settle(now)
@@ -262,7 +262,7 @@ class StatusFilter:
         if last is None:
             if self._session_id not in (0, session_id):
                 return self.OTHER_SESSION
-        elif now - self._heard <= self._follow_after:
+        elif now - self._last_arrival <= self._follow_after:
             if session_id != last.session_id:
                 return self.OTHER_SESSION
             if sequence <= last.sequence:

@@ -180,7 +180,7 @@ def _faults(schema: Any, value: Any, key: str, what: str, allowed: Range | None)
         ranges = {entry.name: entry.metadata.get(RANGE) for entry in dataclasses.fields(schema)}
         for name, entry in value.items():
             if name not in hints:
-                yield f"{f'{key}: ' if key else ''}key {_quoted(name)} is unknown; {meant(name, hints)}" + (
+                yield f"{f'{key}: ' if key else ''}key {_quoted(name)} is unknown; {suggest_name(name, hints)}" + (
                     f"allowed in {what}: {_keys(schema)}"
                 )
             else:
@@ -276,7 +276,7 @@ def _keys(schema: Any) -> str:
     return ", ".join(get_type_hints(schema))
 
 
-def meant(name: object, known: Iterable[str]) -> str:
+def suggest_name(name: object, known: Iterable[str]) -> str:
     """Returns "did you mean ...? " with the known name closest to a wrong name, or "" if there is none or a tie."""
     of_lower_case = {key.lower(): key for key in known}
     given = str(name)[:_MAX_LENGTH].lower()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
-from dvrk_drake.models.coupled_limits import beside
+from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.models.schema_fault import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
@@ -30,7 +30,7 @@ _MEASURE = 0.25
 #: Duration of braking after a stop during a motion [s].
 _BRAKE = 0.3
 #: Largest tracking error of a joint as a share of its range.
-_ASTRAY = 0.1
+_MAX_TRACKING_ERROR = 0.1
 #: Proportional effort of the controller at the start of an approach, as a share of the effort limit. Static friction of
 #: up to half of it is reversed during the approach.
 _APPROACH = 0.3
@@ -53,7 +53,7 @@ class CollectionSettings:
 
     def __post_init__(self) -> None:
         if fault := number_fault(self):
-            raise CollectionError(f"the time to cross a joint's range, {fault}")
+            raise CollectionError(f"collection settings: {fault}")
 
 
 class Collector:
@@ -99,9 +99,9 @@ class Collector:
         self._poses, self._controller, self._output = poses, controller, output
         self._settings, self._stopped, self._report = settings, stopped, report
         span = arm.position_upper - arm.position_lower
-        self._speed, self._astray = span / settings.traverse_time, _ASTRAY * span
+        self._speed, self._tracking_tolerance = span / settings.traverse_time, _MAX_TRACKING_ERROR * span
         self._approach = _APPROACH * arm.effort_limits / np.asarray(arm.gains.kp)
-        self._time, self._heard = 0.0, 0.0
+        self._time, self._status_time = 0.0, 0.0
         self._answers, self._obeyed = AnswerTimes(), lcmt_dvrk_status()
         self._q = self._tau = np.zeros(arm.num_joints)
         self._desired = np.zeros(2 * arm.num_joints)
@@ -112,11 +112,11 @@ class Collector:
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
         self._steps = self._collect()
 
-    def lead(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:
+    def update(self, status: lcmt_dvrk_status, time: float) -> NDArray[np.float64]:
         """Returns the desired state (2n) after a status. Time is that of the arm, which may be slow."""
         measured = 1e-6 * status.utime
-        self._time += min(max(measured - self._heard, 0.0), _MAX_STEP)
-        self._heard = measured
+        self._time += min(max(measured - self._status_time, 0.0), _MAX_STEP)
+        self._status_time = measured
         self._answers.add(time)
         # controller.acting refers to the previous status. This status may already report the problem.
         if (status.guard_state, status.command_sender_id) == (status.STATE_EFFORT, self._controller.sender_id):
@@ -151,12 +151,13 @@ class Collector:
             why = takeover_reason(status, self._obeyed, self._answers)
             raise CollectionError(f"{self._arm.name} took over and holds: {why}")
         n = self._arm.num_joints
-        away = np.abs(self._q - self._desired[:n]) / self._astray
+        away = np.abs(self._q - self._desired[:n]) / self._tracking_tolerance
         if away.max() > 1:
             j = int(np.argmax(away))
+            unit = "m" if self._arm.prismatic[j] else "rad"
             raise CollectionError(
-                f"{self._arm.name} does not follow: {self._arm.joint_names[j]} is at {self._q[j]:.3g}, wanted at "
-                f"{self._desired[j]:.3g}. Is something in its way, or the model wrong?"
+                f"{self._arm.name} does not follow: {self._arm.joint_names[j]} is at {self._q[j]:.3g} {unit}, its "
+                f"target is {self._desired[j]:.3g} {unit}. Check for an obstacle, then validate the model."
             )
 
     def _collect(self) -> Steps:
@@ -176,7 +177,7 @@ class Collector:
             if self._time - began > _START:
                 late = self._answers.lateness()
                 raise CollectionError(
-                    f"{self._arm.name} did not let efforts act within {_START:.0f} s" + (late and f": {late}")
+                    f"{self._arm.name} did not apply efforts within {_START:.0f} s" + (late and f": {late}")
                 )
             self._desired = np.concatenate([self._q, np.zeros_like(self._q)])
             yield
@@ -192,12 +193,12 @@ class Collector:
         for side in (-1, 1) if self._settings.both_sides else (0,):
             self._what = f"going to pose {k + 1}"
             if side:
-                yield from self._go(beside(self._arm, pose, side * self._approach))
+                yield from self._go(offset_pose(self._arm, pose, side * self._approach))
             yield from self._go(pose)
             self._what = f"settling at pose {k + 1}"
             if not (yield from self._settle()):
                 self.unsettled.append(k + 1)
-                self._report(f"pose {k + 1} left out: not at rest within {_SETTLE:.0f} s")
+                self._report(f"pose {k + 1} skipped: the arm did not come to rest within {_SETTLE:.0f} s")
                 return
             self._what = f"measuring pose {k + 1}"
             measured.append((yield from self._measure()))

@@ -51,8 +51,8 @@ _TIMEOUT = 10.0
 #: Advice for an arm that has a fault or waits for an operator.
 _RESET = "Look at the arm, then start again with --reset"
 
-#: Period in which `tell` is called with the live status [s].
-_TELL = 0.2
+#: Period in which `report` is called with the live status [s].
+_REPORT_PERIOD = 0.2
 
 
 class ArmLink:
@@ -83,7 +83,7 @@ class ArmLink:
         self._lcm = lcm.LCM(url)
         self._last: lcmt_dvrk_status | None = None
         self._is_new = False
-        self._subscription = self._lcm.subscribe(status_channel(arm), self._hear)
+        self._subscription = self._lcm.subscribe(status_channel(arm), self._receive)
         self._subscription.set_queue_capacity(_QUEUE)
 
     def close(self) -> None:
@@ -121,12 +121,12 @@ class ArmLink:
         data = command.encode()
         self._lcm.publish(command_channel(self.arm), data if self._key is None else self._key.sign(data))
 
-    def _hear(self, channel: str, data: bytes) -> None:
+    def _receive(self, channel: str, data: bytes) -> None:
         if self._replays:
             status = decode(lcmt_dvrk_status, data)
             if status is None or (status.arm_name, status.num_joints) != (self.arm.name, self.arm.num_joints):
                 return
-        elif (status := self._filter.take(data, self.now(), settle=False)) is None:
+        elif (status := self._filter.accept(data, self.now(), settle=False)) is None:
             return
         elif self._last is not None:
             self.lost += status.sequence - self._last.sequence - 1
@@ -154,9 +154,9 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
     status, name = link.next_status(_FIRST_WAIT), link.arm.name
     _check(status, name)
     if not np.all(np.isfinite([*status.position, *status.velocity, *status.effort_measured])):
-        raise ControllerError(f"{name} does not know its state: a position, velocity or effort is not finite")
+        raise ControllerError(f"{name}: a measured position, velocity or effort is not finite. Check its sensors first")
     if violations := link.arm.limit_violations(status.position):
-        raise ControllerError(f"{name} stands outside its limits: {'; '.join(violations)}. Move it inside first")
+        raise ControllerError(f"{name} is outside its limits: {'; '.join(violations)}. Move it inside first")
     if not status.accepted_modes >> lcmt_dvrk_command.EFFORT & 1:
         raise ControllerError(f"{name} does not accept efforts now; its state is {describe_state(status.guard_state)}")
     utimes = [status.utime]
@@ -165,22 +165,25 @@ def first_status(link: ArmLink) -> tuple[lcmt_dvrk_status, float]:
         _check(later, name)
         utimes.append(later.utime)
     if not (later.sequence > status.sequence and later.utime > status.utime):
-        raise ControllerError(f"{name} tells nothing new: its utime or sequence does not increase")
+        raise ControllerError(
+            f"{name}: utime or sequence of its status does not increase. Restart its driver or bridge"
+        )
     # The smallest period is used because a busy computer misses some. Statuses of one measurement have the same utime.
     gaps = np.diff(np.unique(utimes))
     if min(gaps) > _MAX_PERIOD:
         raise ControllerError(
-            f"{name} is measured at {1e6 / min(gaps):.0f} Hz; control needs {1e6 / _MAX_PERIOD:.0f} Hz, better 1 kHz"
+            f"{name} is measured at {1e6 / min(gaps):.0f} Hz; control needs at least {1e6 / _MAX_PERIOD:.0f} Hz "
+            "(1 kHz is recommended)"
         )
     return status, 1e-6 * (later.utime - status.utime) / (later.sequence - status.sequence)
 
 
-def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
+def reset_fault(link: ArmLink, report: Callable[[str], None]) -> None:
     """Clears the latched fault of the arm, or resumes after its watchdog took over. The arm then holds itself.
 
     Args:
         link: Channels of the arm.
-        tell: Function that is called with the fault, or the reason of the watchdog, before it is cleared.
+        report: Function that is called with the fault, or the reason of the watchdog, before it is cleared.
 
     Raises:
         ControllerError: There is no arm, or its fault or hold remains because the cause persists.
@@ -190,9 +193,9 @@ def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
         return
     fault = status.fault_text
     if status.fault_code == lcmt_dvrk_status.FAULT_NONE:
-        tell(f"{name} took over and waits for an operator, who resumes now: {fault}")
+        report(f"{name} took over and waits for an operator, who resumes now: {fault}")
     else:
-        tell(f"{name} has a fault, which is reset now: {fault}")
+        report(f"{name} has a fault, which is reset now: {fault}")
     sender = DvrkCommandSender(link.arm)
     context = sender.CreateDefaultContext()
     start = link.now()
@@ -208,7 +211,7 @@ def reset_fault(link: ArmLink, tell: Callable[[str], None]) -> None:
     while link.now() < end:
         status = link.next_status(_SILENCE)
     if status.fault_code != lcmt_dvrk_status.FAULT_NONE:
-        raise ControllerError(f"{name} has a fault that stays: {status.fault_text or fault}")
+        raise ControllerError(f"{name} still has a fault after the reset: {status.fault_text or fault}")
     if status.fault_text:
         raise ControllerError(f"{name} does not resume: {status.fault_text}")
 
@@ -225,21 +228,21 @@ def _check(status: lcmt_dvrk_status, name: str, late: Callable[[], str] = lambda
         raise ControllerError(f"{name} took over and holds: {why}. {_RESET}")
     if status.gravity_compensation:
         raise ControllerError(
-            f"{name} adds gravity compensation of its own, and two of them throw the arm upward: switch it off there "
-            "(gravity_compensation in its status)"
+            f"{name} adds its own gravity compensation. Together with this controller, it would throw the arm upward. "
+            "Switch it off in the arm's driver (gravity_compensation in its status)"
         )
 
 
 #: Function of a status and the time [s] that returns the desired state (2n), or None for the latched pose.
-Lead = Callable[[lcmt_dvrk_status, float], NDArray[np.float64] | None]
+StatusHandler = Callable[[lcmt_dvrk_status, float], NDArray[np.float64] | None]
 
 
 def control(
     link: ArmLink,
     controller: ArmController,
     stopped: Callable[[], bool],
-    tell: Callable[[LiveStatus], None],
-    lead: Lead = lambda status, time: None,
+    report: Callable[[LiveStatus], None],
+    on_status: StatusHandler = lambda status, time: None,
 ) -> None:
     """Answers every status until `stopped`, then lets the arm hold itself.
 
@@ -247,31 +250,31 @@ def control(
         link: Channels of the arm.
         controller: Controller that computes the commands.
         stopped: Function that returns whether to stop. It is called once per status.
-        tell: Function that is called with the live status a few times per second.
-        lead: Function that returns the desired state. It is called once per status.
+        report: Function that is called with the live status a few times per second.
+        on_status: Function that returns the desired state. It is called once per status.
 
     Raises:
         ControllerError: The arm stopped sending, restarted, had a fault, took over, or applies no commands.
     """
     start = link.now()
     first = link.next_status(_SILENCE)
-    live, tell_at, acted, before = LiveStatusMaker(controller.sender_id, first), _TELL, 0.0, first
+    live, next_report, acted, before = LiveStatusMaker(controller.sender_id, first), _REPORT_PERIOD, 0.0, first
     answers = AnswerTimes()
     while not stopped():
         status = link.next_status(_SILENCE)
         now = link.now() - start
         answers.add(now)
         _check(status, link.arm.name, answers.lateness)
-        link.send(controller.answer(status, now, lead(status, now)))
+        link.send(controller.answer(status, now, on_status(status, now)))
         live.answer(status, now)
         if controller.acting:
             acted, before = now, status
         elif now > acted + _TIMEOUT:
             why = takeover_reason(status, before, answers)
-            raise ControllerError(f"{link.arm.name} lets no command act for {_TIMEOUT:g} s; {why}")
-        if now >= tell_at:
-            tell(live.make(status, now, link.lost))
-            tell_at = now + _TELL
+            raise ControllerError(f"{link.arm.name} applied no command for {_TIMEOUT:g} s: {why}")
+        if now >= next_report:
+            report(live.make(status, now, link.lost))
+            next_report = now + _REPORT_PERIOD
     _release(link, controller, start)
 
 
@@ -286,4 +289,4 @@ def _release(link: ArmLink, controller: ArmController, start: float) -> None:
         command = controller.answer(status, link.now() - start)
         command.control_mode = lcmt_dvrk_command.HOLD
         link.send(command)
-    raise ControllerError(f"{link.arm.name} did not confirm that it holds; without commands it does after its expiry")
+    raise ControllerError(f"{link.arm.name} did not confirm HOLD. It holds when the last command expires")

@@ -34,10 +34,12 @@ def open_lcm(url: str = "") -> DrakeLcm:
             own.publish(channel, b"")
             handle_message(own, _NEXT_MESSAGE)
     except (RuntimeError, OSError) as error:
-        raise DvrkDrakeError(f'LCM network "{name}" cannot be used: {error}; e.g. udpm://239.255.76.67:7667') from error
+        raise DvrkDrakeError(
+            f'LCM network "{name}" cannot be used: {error}. Use a URL such as udpm://239.255.76.67:7667'
+        ) from error
     if not received:
         raise DvrkDrakeError(
-            f'LCM network "{name}" carries no message: is there a route for its multicast address? On one machine: '
+            f'LCM network "{name}" does not deliver messages. Add a route for its multicast address. On one machine: '
             "ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo"
         )
     return network

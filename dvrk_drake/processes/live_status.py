@@ -79,7 +79,7 @@ class LiveStatusMaker:
 
     def __init__(self, sender_id: int, first: lcmt_dvrk_status) -> None:
         """Starts the counts for a sender at the arm's `first` status. A restarted arm requires a new object."""
-        self._sender_id, self._before, self._told_at = sender_id, first, 0.0
+        self._sender_id, self._before, self._last_time = sender_id, first, 0.0
         self._answered = 0
         self._trips: deque[float] = deque(maxlen=1000)
 
@@ -91,16 +91,16 @@ class LiveStatusMaker:
 
     def make(self, status: lcmt_dvrk_status, time: float, lost: int) -> LiveStatus:
         """Returns the live status since the previous one. `lost` is the number of statuses that were not received."""
-        rate = self._answered / (time - self._told_at)
+        rate = self._answered / (time - self._last_time)
         trip = f"round trip {1e3 * float(np.median(self._trips)):.2f} ms" if self._trips else "no command accepted yet"
         problem = []
         if status.num_refused > self._before.num_refused:
             problem.append(f"refused: {describe_refusal(status.refusal_code)}")
         if status.num_ignored > self._before.num_ignored:
-            problem.append(f"messages that the arm ignores: {describe_refusal(status.ignored_code)}")
+            problem.append(f"the arm ignores messages: {describe_refusal(status.ignored_code)}")
         if status.num_expired > self._before.num_expired:
-            problem.append("no command for so long that the arm took over")
-        self._before, self._told_at, self._answered = status, time, 0
+            problem.append("the last command expired and the arm took over")
+        self._before, self._last_time, self._answered = status, time, 0
         pace = f"{rate:.0f} Hz, {trip}, {lost} statuses lost"
         return LiveStatus(describe_state(status.guard_state), pace, ", ".join(problem))
 
@@ -123,8 +123,8 @@ class AnswerTimes:
         if not len(intervals) or intervals.max() <= _LATE:
             return ""
         return (
-            f"this computer, or that of the arm, is too slow: {1 / intervals.mean():.0f} answers per second, and "
-            f"{1e3 * intervals.max():.0f} ms between two of them. End other programs, or use --realtime"
+            f"this computer, or that of the arm, is too slow: {1 / intervals.mean():.0f} answers per second, longest "
+            f"interval {1e3 * intervals.max():.0f} ms. End other programs, or use --realtime"
         )
 
 
@@ -141,9 +141,9 @@ def takeover_reason(status: lcmt_dvrk_status, before: lcmt_dvrk_status, answers:
     if late and (expired or not refused or status.refusal_code in _REFUSED_IF_LATE):
         return late
     if expired and not (refused and status.refusal_code in _EXPIRED_IF_REFUSED):
-        return "commands came too late for it (use --realtime)"
+        return "commands arrived too late (use --realtime)"
     if refused:
-        return f"the last refusal is: {describe_refusal(status.refusal_code)}"
+        return f"last refused command: {describe_refusal(status.refusal_code)}"
     if status.num_ignored > before.num_ignored:
-        return f"messages that it ignores: {describe_refusal(status.ignored_code)}"
+        return f"the arm ignores messages: {describe_refusal(status.ignored_code)}"
     return f"its state is {describe_state(status.guard_state)}"

@@ -53,7 +53,7 @@ class Recorder:
         self._arm, self._path, self._url = arm, path, url
         self._channel = status_channel(arm)
         self._file: RecordingFile | None = None
-        self._heard: Counter[str] = Counter()
+        self._other_channels: Counter[str] = Counter()
         self._arrivals: deque[float] = deque()
         self._lcm = lcm.LCM(url)
         # Statuses of all arms, to list the available ones if there are none of this arm.
@@ -80,7 +80,9 @@ class Recorder:
                     raise RecordingError(self._why_silent())
                 handle_message(self._lcm, _POLL)
             if self._file is None:
-                raise RecordingError(f"{self._path}: not made: ended before the first status of {self._arm.name}")
+                raise RecordingError(
+                    f"{self._path} was not written: the recording ended before the first status of {self._arm.name}"
+                )
             end = time.monotonic() + duration
             while not stopped() and time.monotonic() < end:
                 handle_message(self._lcm, _POLL)
@@ -98,7 +100,7 @@ class Recorder:
         if status is None:
             return f"waiting for {self._channel}"
         if not self._arrivals or self._arrivals[-1] < now - SILENCE:
-            return f"{self._arm.name}: no status any more; {self.stream.num_taken} rows"
+            return f"{self._arm.name}: no more statuses; {self.stream.num_taken} rows"
         parts = [
             f"{self._arm.name}: {self.stream.num_taken} rows",
             f"{len(self._arrivals)} Hz",
@@ -114,7 +116,7 @@ class Recorder:
 
     def _receive(self, channel: str, data: bytes) -> None:
         if channel != self._channel:
-            self._heard[channel] += 1
+            self._other_channels[channel] += 1
             return
         self.num_received += 1
         now = time.monotonic()
@@ -123,7 +125,7 @@ class Recorder:
             self.foreign[reason] += 1
             return
         self._arrivals.append(now)
-        status = self.stream.take(data)
+        status = self.stream.accept(data)
         if self._file is None:
             if self.stream.last is None:
                 return
@@ -135,9 +137,10 @@ class Recorder:
         if self.num_received:
             reasons = "; ".join(self.notes())
             return f"no status of {self._arm.name} within {FIRST_STATUS:.0f} s {where}: {reasons}"
-        if others := ", ".join(sorted(self._heard)):
-            return f"no message within {FIRST_STATUS:.0f} s {where}; there is {others}"
+        if others := ", ".join(sorted(self._other_channels)):
+            return f"no message within {FIRST_STATUS:.0f} s {where}. Channels with messages: {others}"
         return (
-            f"no message within {FIRST_STATUS:.0f} s {where}: does the arm's process or bridge run, on this network? "
-            "Between machines the URL needs ?ttl=1, and each a multicast route (ip route add 239.255.0.0/16 dev DEVICE)"
+            f"no message within {FIRST_STATUS:.0f} s {where}. Check that the arm's process or bridge runs on this "
+            "network. Between machines, the URL needs ?ttl=1 and each machine needs a multicast route "
+            "(ip route add 239.255.0.0/16 dev DEVICE)"
         )

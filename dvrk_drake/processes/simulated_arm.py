@@ -65,7 +65,7 @@ def start_pose(arm: Arm, pose: Sequence[float] | None = None) -> NDArray[np.floa
     if q.shape != (arm.num_joints,) or not np.all(np.isfinite(q)):
         raise StationError(f"a pose of {arm.name} is {arm.num_joints} finite numbers [rad, m]; got {q.tolist()}")
     if violations := arm.limit_violations(q):
-        raise StationError(f"{arm.name} cannot start there: {'; '.join(violations)}")
+        raise StationError(f"{arm.name} cannot start outside its limits: {'; '.join(violations)}")
     return q
 
 
@@ -110,7 +110,7 @@ class SimulatedArm:
         """Current guard, read-only."""
         return self._driver.GetGuard(self._driver.GetMyContextFromRoot(self._simulator.get_context()))
 
-    def hear(self, channel: str, data: bytes) -> None:
+    def receive(self, channel: str, data: bytes) -> None:
         """Stores a message of the command channel for the next step."""
         self._driver.Receive(data)
 
@@ -134,8 +134,8 @@ class SimulatedArm:
         """Publishes the current state."""
         network.publish(status_channel(self.arm), self._status)
 
-    def run(self, stopped: Callable[[], bool], tell: Callable[[str], None] = lambda line: None) -> Pace:
-        """Steps by the wall clock until `stopped` and reports every change of the guard's state to `tell`.
+    def run(self, stopped: Callable[[], bool], report: Callable[[str], None] = lambda line: None) -> Pace:
+        """Steps by the wall clock until `stopped` and reports every change of the guard's state to `report`.
 
         A status is published when its tick begins. The simulation computes the next state while the controller computes
         its answer, which is applied from the next tick on. The motors of a real arm do not wait for the answer either.
@@ -146,7 +146,7 @@ class SimulatedArm:
         # LCM is opened here because its receive thread inherits the scheduling of the thread that opens it. Drake's own
         # subscription would keep only one message between two steps and hide a second sender.
         network = lcm.LCM(self._url)
-        network.subscribe(command_channel(self.arm), self.hear).set_queue_capacity(_QUEUE)
+        network.subscribe(command_channel(self.arm), self.receive).set_queue_capacity(_QUEUE)
         # The first period of the guard is too long because it includes the time since the simulation was created. The
         # status of that step is not published because a controller would reject the arm for it.
         self.step()
@@ -161,7 +161,7 @@ class SimulatedArm:
             self.send(network)
             self.step()
             if (state := self._describe()) != described:
-                tell(f"{self._simulator.get_context().get_time():9.3f} s  {state}")
+                report(f"{self._simulator.get_context().get_time():9.3f} s  {state}")
                 described = state
         return pace
 

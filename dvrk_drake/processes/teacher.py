@@ -118,7 +118,7 @@ class Teacher:
         self._writer = writer or ThreadPoolExecutor(max_workers=1)
         self._writing: Future[None] | None = None
 
-    def lead(self, status: lcmt_dvrk_status, time: float) -> None:
+    def update(self, status: lcmt_dvrk_status, time: float) -> None:
         """Processes a status that arrived at `time` [s]. Returns no desired state because the operator moves the arm.
 
         Raises:
@@ -132,14 +132,14 @@ class Teacher:
                 return
             self._writing.result()
             self._writing = None
-            self._report(f"pose {len(self.poses)} taken")
+            self._report(f"pose {len(self.poses)} recorded")
         if not self._controller.ramped:
             return
         arm = self._controller.arm
         known = same_pose(self.poses, q, arm)
         if requested:
             if reason := self._refusal(arm, q, known):
-                self._report(f"not taken: {reason}")
+                self._report(f"not recorded: {reason}")
                 return
         elif not (self._at_rest and rests and known is None and not arm.limit_violations(q)):
             return
@@ -154,7 +154,7 @@ class Teacher:
     def _refusal(arm: Arm, q: np.ndarray, known: int | None) -> str:
         if violations := arm.limit_violations(q):
             return "; ".join(violations)
-        return "" if known is None else f"it is pose {known + 1} again"
+        return "" if known is None else f"same as pose {known + 1}"
 
 
 class EnterKey:

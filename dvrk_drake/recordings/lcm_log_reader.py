@@ -159,7 +159,7 @@ class StatusStream:
         self._sessions: list[int] = []
         self._left_out: Counter[str] = Counter()
 
-    def take(self, data: bytes) -> lcmt_dvrk_status | None:
+    def accept(self, data: bytes) -> lcmt_dvrk_status | None:
         """Returns the status in a message, or None if it cannot be used as a measurement.
 
         Raises:
@@ -270,7 +270,7 @@ def read_status_log(path: str | Path, arm: Arm | None = None) -> StatusLog:
         if stream is None and (first := decode(lcmt_dvrk_status, event.data)):
             stream = StatusStream(first.arm_name, first.num_joints)
         try:
-            status = stream.take(event.data) if stream else None
+            status = stream.accept(event.data) if stream else None
         except RecordingError as error:
             raise RecordingError(f"{path}: event {event.number}: {error}") from error
         if status is not None and stream is not None:

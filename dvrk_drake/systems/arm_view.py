@@ -66,7 +66,7 @@ def geometry_corners(arm: Arm) -> NDArray[np.float64]:
             X_WB = query.GetPoseInWorld(geometry) @ box.pose()
             corners.append([X_WB @ (box.half_width() * sign) for sign in product((-1.0, 1.0), repeat=3)])
     if not corners:
-        raise ArmError(f"{arm.name} has no visual geometry yet")
+        raise ArmError(f"{arm.name} has no visual geometry")
     return np.concatenate(corners)
 
 
@@ -105,7 +105,9 @@ def start_meshcat(
     try:
         meshcat = Meshcat(MeshcatParams(host="localhost", port=port, show_stats_plot=False))
     except RuntimeError as error:
-        raise DvrkDrakeError(f"port {port or ''} cannot be opened: is it in use?") from error
+        raise DvrkDrakeError(
+            f"port {port or ''} cannot be opened. If another program uses it, choose another port"
+        ) from error
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     meshcat.SetProperty("/Background", "top_color", [0.86, 0.89, 0.92])
@@ -134,7 +136,7 @@ class ArmView:
         add_arm(self._plant, arm)
         self._plant.Finalize()
         if scene_graph.model_inspector().NumGeometriesWithRole(role) == 0:
-            raise ArmError(f"{arm.name} has no {'visual' if role == Role.kIllustration else 'collision'} geometry yet")
+            raise ArmError(f"{arm.name} has no {'visual' if role == Role.kIllustration else 'collision'} geometry")
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, MeshcatVisualizerParams(role=role))
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()

@@ -35,7 +35,7 @@ class PlantJoints:
             StationError: A floating body, or a joint without a motor.
         """
         if plant.num_positions() != plant.num_velocities():
-            raise StationError("modify_plant must not add floating bodies: weld them to the arm")
+            raise StationError("modify_plant must not add floating bodies. Weld them to the arm")
         names = list(arm.tree_joint_names)
         tree, n = tree_selector(plant, arm, instance), arm.num_joints
         self.index: NDArray[np.int_] = tree[[names.index(joint) for joint in arm.joint_names]]
@@ -46,7 +46,9 @@ class PlantJoints:
         ]
         driven = [actuator.joint().name() for actuator in self.actuators]
         if undriven := [joint for joint in arm.joint_names if joint not in driven]:
-            raise StationError(f"{' '.join(arm.sdf)}: joint {', '.join(undriven)} has no <effort>, so no motor")
+            raise StationError(
+                f"{' '.join(arm.sdf)}: joint {', '.join(undriven)} has no <effort> and therefore no motor"
+            )
         columns = [driven.index(joint) for joint in arm.joint_names]
         self.actuation = np.zeros((len(self.actuators), n))
         self.actuation[columns, range(n)] = 1.0

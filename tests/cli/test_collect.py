@@ -27,12 +27,12 @@ def simulated(monkeypatch):
         what.arms.append(StickyArm(arm, IdentifiedModel.from_arm(arm), np.zeros(7), near_poses()[0]))
         return controller, lambda: None, PERIOD
 
-    def control(link, controller, stopped, tell, lead):
+    def control(link, controller, stopped, report, on_status):
         sticky = what.arms[-1]
         while not stopped():
             status, time = sticky.status(), PERIOD * sticky.ticks
             sticky.off = sticky.ticks == what.off_at
-            sticky.step(controller.answer(status, time, lead(status, time)))
+            sticky.step(controller.answer(status, time, on_status(status, time)))
 
     monkeypatch.setattr("dvrk_drake.cli.collect.ready_controller", ready)
     monkeypatch.setattr("dvrk_drake.processes.control.control", control)
@@ -75,4 +75,4 @@ def test_the_command_teaches(simulated, tmp_path, monkeypatch, capsys):
     simulated.stopped = lambda sticky: sticky.ticks > 3000
     assert main(["collect", "--arm", "mtml", "--poses", str(poses), "--teach", "--at-rest"]) == 0
     np.testing.assert_allclose(load_poses(poses, arm), near_poses(1), atol=0.01)
-    assert "pose 1 taken\n" in capsys.readouterr().out
+    assert "pose 1 recorded\n" in capsys.readouterr().out

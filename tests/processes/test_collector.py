@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 import pytest
-from sticky_arm import PERIOD, Disk, GuardedArm, lead, make_collector, make_quick, near_poses, random_poses
+from sticky_arm import PERIOD, Disk, GuardedArm, make_collector, make_quick, near_poses, random_poses, run_collector
 
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -21,7 +21,7 @@ def collect_with_friction(path, both_sides):
     poses = 0.5 * random_poses(arm, 1) + [0, 0.2, 0, 0, 0, 0, 0]
     lines = []
     collector, controller, sticky = make_collector(path, poses, FRICTION, both_sides, report=lines.append)
-    lead(collector, controller, sticky, 60.0)
+    run_collector(collector, controller, sticky, 60.0)
     collector.close()
     assert collector.finished and collector.problem is None and not collector.unsettled
     assert collector.done.all()
@@ -45,11 +45,11 @@ def test_a_stop_on_the_way_brakes_and_the_rest_is_done_next_time(tmp_path):
     asked = []
     collector, controller, sticky = make_quick(tmp_path, stopped=lambda: bool(asked))
     moves = lambda: collector.done.any() and np.abs(sticky.v).max() > 0.03  # noqa: E731
-    lead(collector, controller, sticky, 10.0, moves)
+    run_collector(collector, controller, sticky, 10.0, moves)
     assert moves() and not collector.finished
     asked.append(True)
     stopped_at = sticky.ticks
-    lead(collector, controller, sticky, 1.0)
+    run_collector(collector, controller, sticky, 1.0)
     collector.close()
     assert collector.finished and collector.problem is None
     assert PERIOD * (sticky.ticks - stopped_at) < 0.35
@@ -59,7 +59,7 @@ def test_a_stop_on_the_way_brakes_and_the_rest_is_done_next_time(tmp_path):
 
     collector, controller, sticky = make_quick(tmp_path)
     assert collector.done.tolist() == [True, False, False]
-    lead(collector, controller, sticky, 20.0)
+    run_collector(collector, controller, sticky, 20.0)
     collector.close()
     assert collector.done.all()
     assert (tmp_path / "o.csv").read_bytes().startswith(first)
@@ -68,16 +68,16 @@ def test_a_stop_on_the_way_brakes_and_the_rest_is_done_next_time(tmp_path):
 
 def test_a_stop_before_the_arm_obeys_ends_at_once(tmp_path):
     collector, controller, sticky = make_quick(tmp_path, stopped=lambda: True)
-    lead(collector, controller, sticky, 0.1)
+    run_collector(collector, controller, sticky, 0.1)
     assert collector.finished and collector.problem is None and sticky.ticks <= 2
     assert not (tmp_path / "o.csv").exists()
 
 
 def test_it_ends_when_the_arm_takes_over(tmp_path):
     collector, controller, sticky = make_quick(tmp_path)
-    lead(collector, controller, sticky, 10.0, collector.done.any)
+    run_collector(collector, controller, sticky, 10.0, collector.done.any)
     sticky.off = True
-    lead(collector, controller, sticky, 0.1)
+    run_collector(collector, controller, sticky, 0.1)
     collector.close()
     assert collector.finished and "MTML took over and holds: its " in str(collector.problem)
     assert len(read_recording(tmp_path / "o.csv")) == 1
@@ -86,17 +86,17 @@ def test_it_ends_when_the_arm_takes_over(tmp_path):
 def test_it_ends_when_the_arm_never_obeys(tmp_path):
     collector, controller, sticky = make_quick(tmp_path)
     sticky.off = True
-    lead(collector, controller, sticky, 12.0)
-    assert collector.finished and "did not let efforts act within 10 s" in str(collector.problem)
+    run_collector(collector, controller, sticky, 12.0)
+    assert collector.finished and "did not apply efforts within 10 s" in str(collector.problem)
 
 
 def test_it_ends_when_something_is_in_the_way(tmp_path):
     collector, controller, sticky = make_collector(
         tmp_path / "o.csv", near_poses() + np.outer([0, 1, 0], [0.3, 0.3, 0, 0, 0, 0, 0]), np.zeros(7), False
     )
-    lead(collector, controller, sticky, 10.0, collector.done.any)
+    run_collector(collector, controller, sticky, 10.0, collector.done.any)
     sticky.friction = np.array([1e3] + [0.0] * 6)  # outer yaw is held
-    lead(collector, controller, sticky, 5.0)
+    run_collector(collector, controller, sticky, 5.0)
     collector.close()
     assert collector.finished and "does not follow: outer_yaw is at" in str(collector.problem)
     assert collector.done.tolist() == [True, False, False]
@@ -104,7 +104,7 @@ def test_it_ends_when_something_is_in_the_way(tmp_path):
 
 def test_a_pose_without_rest_is_left_out_and_named(tmp_path):
     collector, controller, sticky = make_quick(tmp_path)
-    lead(collector, controller, sticky, 10.0, lambda: collector.describe().endswith("settling at pose 2"))
+    run_collector(collector, controller, sticky, 10.0, lambda: collector.describe().endswith("settling at pose 2"))
     status = sticky.status
     shaken = lambda: [q + 0.01 * np.sin(60 * PERIOD * sticky.ticks) for q in sticky.q]  # noqa: E731
 
@@ -115,7 +115,7 @@ def test_a_pose_without_rest_is_left_out_and_named(tmp_path):
         return said
 
     sticky.status = shaking
-    lead(collector, controller, sticky, 20.0)
+    run_collector(collector, controller, sticky, 20.0)
     collector.close()
     assert collector.finished and collector.problem is None
     assert collector.unsettled == [2]
@@ -135,7 +135,7 @@ def test_an_encoder_that_alternates_between_two_counts_rests(tmp_path):
         return said
 
     sticky.status = alternating
-    lead(collector, controller, sticky, 40.0)
+    run_collector(collector, controller, sticky, 40.0)
     collector.close()
     assert collector.finished and collector.problem is None and not collector.unsettled
     assert collector.done.all()
@@ -144,7 +144,7 @@ def test_an_encoder_that_alternates_between_two_counts_rests(tmp_path):
 def test_a_file_that_cannot_be_written_ends_it(tmp_path):
     collector, controller, sticky = make_quick(tmp_path)
     (tmp_path / "o.csv").mkdir()
-    lead(collector, controller, sticky, 10.0)
+    run_collector(collector, controller, sticky, 10.0)
     collector.close()
     assert collector.finished and isinstance(collector.problem, RecordingError)
     assert not collector.done.any()
@@ -153,14 +153,14 @@ def test_a_file_that_cannot_be_written_ends_it(tmp_path):
 def test_an_arm_is_held_at_its_pose_while_the_disk_is_slow(tmp_path):
     disk = Disk(slow=True)
     collector, controller, sticky = make_quick(tmp_path, writer=disk)
-    lead(collector, controller, sticky, 10.0, lambda: disk.waiting)
-    lead(collector, controller, sticky, 12.0)  # longer than the arm may take to settle
+    run_collector(collector, controller, sticky, 10.0, lambda: disk.waiting)
+    run_collector(collector, controller, sticky, 12.0)  # longer than the arm may take to settle
     assert collector.problem is None and not collector.finished and not collector.done.any()
     assert collector.describe() == "0 of 3 poses, writing pose 1"
     np.testing.assert_allclose(sticky.q, near_poses()[0], atol=2e-3)
     disk.finish()
     disk.slow = False
-    lead(collector, controller, sticky, 10.0)
+    run_collector(collector, controller, sticky, 10.0)
     collector.close()
     assert collector.problem is None and collector.done.all()
 
@@ -170,7 +170,7 @@ def test_rows_are_written_by_another_thread(tmp_path):
     collector, controller, sticky = make_quick(tmp_path, writer=None)
     written_by, append = [], collector._output.append
     collector._output.append = lambda *row: (append(*row), written_by.append(threading.get_ident()))
-    lead(collector, controller, sticky, np.inf, collector.done.any)
+    run_collector(collector, controller, sticky, np.inf, collector.done.any)
     collector.close()
     assert threading.get_ident() not in written_by and len(written_by) == 1
     assert len(read_recording(tmp_path / "o.csv")) == 1
@@ -188,7 +188,7 @@ def test_an_arm_whose_computer_is_slow_is_not_hurried(tmp_path):
     collector, controller, sticky = make_collector(tmp_path / "o.csv", poses, np.zeros(7), both_sides=False)
     while not collector.finished and sticky.ticks < 20_000:
         status, time = sticky.status(), 4 * PERIOD * sticky.ticks
-        sticky.step(controller.answer(status, time, collector.lead(status, time)))
+        sticky.step(controller.answer(status, time, collector.update(status, time)))
     collector.close()
     assert collector.problem is None
     assert collector.done.all()
@@ -202,7 +202,7 @@ def lead_until_obeyed(tmp_path):
     bad.effort = [np.nan] * 7
     arm.step(bad)
     assert arm.guard.refusal_code == Status.REFUSAL_NOT_FINITE
-    lead(collector, controller, arm, 10.0, collector.done.any)
+    run_collector(collector, controller, arm, 10.0, collector.done.any)
     assert collector.done.any() and arm.guard.state == Status.STATE_EFFORT
     return made
 
@@ -215,7 +215,7 @@ def problem_after(made, pause):
         if collector.finished:
             break
         status, time = arm.status(), start + PERIOD * tick
-        arm.step(controller.answer(status, time, collector.lead(status, time)))
+        arm.step(controller.answer(status, time, collector.update(status, time)))
     collector.close()
     assert collector.finished
     return str(collector.problem)
@@ -227,7 +227,7 @@ def test_a_pause_of_this_computer_is_named_as_the_cause(tmp_path):
         made[2].step()
     problem = problem_after(made, 0.0)
     assert made[2].guard.counts.expired == 1
-    assert "too slow" in problem and "81 ms between two of them" in problem and "answers per second" in problem
+    assert "too slow" in problem and "longest interval 81 ms" in problem and "answers per second" in problem
     assert "refusal" not in problem
 
 
@@ -236,7 +236,7 @@ def test_a_pause_of_the_arms_computer_is_not_a_clock_jump(tmp_path):
     made = lead_until_obeyed(tmp_path)
     problem = problem_after(made, 0.08)
     assert made[2].guard.refusal_code == Status.REFUSAL_CLOCK_JUMP
-    assert "too slow" in problem and "81 ms between two of them" in problem and "jump" not in problem
+    assert "too slow" in problem and "longest interval 81 ms" in problem and "jump" not in problem
 
 
 def test_a_refusal_without_a_pause_is_named(tmp_path):
@@ -244,11 +244,11 @@ def test_a_refusal_without_a_pause_is_named(tmp_path):
     collector, controller, arm = made
     while not collector.finished:
         status, time = arm.status(), PERIOD * arm.ticks
-        command = controller.answer(status, time, collector.lead(status, time))
+        command = controller.answer(status, time, collector.update(status, time))
         command.utime -= 10**6
         arm.step(command)
     problem = problem_after(made, 0.0)
-    assert "the last refusal is: after a jump of the sender's clock" in problem
+    assert "last refused command: after a jump of the sender's clock" in problem
 
 
 def test_a_refusal_of_an_earlier_time_is_not_named():
@@ -258,7 +258,7 @@ def test_a_refusal_of_an_earlier_time_is_not_named():
     status.guard_state = Status.STATE_HOLD
     assert takeover_reason(status, before, AnswerTimes()) == "its state is hold"
     status.num_refused += 1
-    assert takeover_reason(status, before, AnswerTimes()) == "the last refusal is: from a second sender"
+    assert takeover_reason(status, before, AnswerTimes()) == "last refused command: from a second sender"
     status.num_refused, status.num_ignored, status.ignored_code = 3, 1, Status.REFUSAL_NOT_AUTHENTIC
     problem = takeover_reason(status, before, AnswerTimes())
-    assert problem == "messages that it ignores: not signed with the arm's key (--key)"
+    assert problem == "the arm ignores messages: not signed with the arm's key (--key)"

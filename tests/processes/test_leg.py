@@ -7,7 +7,7 @@ import pytest
 from sticky_arm import random_poses
 
 from dvrk_drake.models.arm import load_arm
-from dvrk_drake.models.coupled_limits import beside
+from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.processes.teacher import Leg, RestDetector
 
 ARMS = ("mtml", "psm")
@@ -53,11 +53,11 @@ def test_approaches_begin_inside_the_limits(name):
     offset = 0.3 * arm.effort_limits / np.array(arm.gains.kp)
     for pose in random_poses(arm, 200, margin=0.0):
         for side in (-1, 1):
-            point = beside(arm, pose, side * offset)
+            point = offset_pose(arm, pose, side * offset)
             assert not arm.limit_violations(point, 1e-9)
             assert np.all(side * (point - pose) >= 0)
     middle = random_poses(arm, 1, margin=0.3)[0]
-    np.testing.assert_allclose(beside(arm, middle, offset), middle + offset, atol=1e-12)
+    np.testing.assert_allclose(offset_pose(arm, middle, offset), middle + offset, atol=1e-12)
 
 
 def test_rest_is_all_joints_near_one_pose_for_a_while():

@@ -189,7 +189,7 @@ def test_why_an_arm_took_over():
     status.guard_state = lcmt_dvrk_status.STATE_OFF
     assert takeover_reason(status, before, AnswerTimes()) == "its state is off"
     status.num_expired = 3
-    assert takeover_reason(status, before, AnswerTimes()) == "commands came too late for it (use --realtime)"
+    assert takeover_reason(status, before, AnswerTimes()) == "commands arrived too late (use --realtime)"
     status.num_expired, status.num_refused = 0, 1
     status.refusal_code = lcmt_dvrk_status.REFUSAL_START_FAR
     assert "starting too far" in takeover_reason(status, before, AnswerTimes())

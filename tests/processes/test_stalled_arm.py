@@ -50,7 +50,7 @@ class Loop:
             self.led += 1e-3
             desired = np.concatenate([POSES[self.status.arm_name.lower()] + self.led * self.velocity, self.velocity])
         if answers:
-            self.arm.hear("", self.controller.answer(self.status, self.time, desired).encode())
+            self.arm.receive("", self.controller.answer(self.status, self.time, desired).encode())
 
     def stall_of_the_bridge(self, seconds):
         """Its motors do what was commanded last."""

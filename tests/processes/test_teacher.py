@@ -32,7 +32,7 @@ class Hand:
         self.enter, end = enter, self.time + seconds
         while self.time < end:
             self.time += 0.01
-            self.teacher.lead(SimpleNamespace(position=list(pose)), self.time)
+            self.teacher.update(SimpleNamespace(position=list(pose)), self.time)
 
 
 def test_enter_takes_a_pose(tmp_path):
@@ -52,10 +52,10 @@ def test_enter_takes_a_pose(tmp_path):
     hand.at([1.2, *poses[0, 1:]], 0.1, enter=True)
     hand.at(poses[1], 0.1, enter=True)
     hand.teacher.close()
-    assert hand.lines[0] == "pose 1 taken"
-    assert hand.lines[1] == "not taken: it is pose 1 again"
-    assert hand.lines[2].startswith("not taken: outer_yaw = 1.2 is outside")
-    assert hand.lines[3] == "pose 2 taken"
+    assert hand.lines[0] == "pose 1 recorded"
+    assert hand.lines[1] == "not recorded: same as pose 1"
+    assert hand.lines[2].startswith("not recorded: outer_yaw = 1.2 is outside")
+    assert hand.lines[3] == "pose 2 recorded"
     np.testing.assert_array_equal(load_poses(path, arm), poses[:2])
     again = Hand(path)
     again.at(poses[2], 0.1, enter=True)
@@ -67,13 +67,13 @@ def test_a_rest_takes_a_pose_once(tmp_path):
     hand, poses = Hand(path, at_rest=True), near_poses()
     hand.at(poses[0], 0.9)
     hand.at(poses[1], 3.0)
-    hand.at([1.2, *poses[0, 1:]], 3.0)  # outside the limits: not taken, and nothing is said of it all the time
+    hand.at([1.2, *poses[0, 1:]], 3.0)  # outside the limits: not recorded and not reported repeatedly
     hand.at(poses[2], 0.9)
     hand.at(poses[1], 3.0)
     hand.at(poses[2], 3.0)
     hand.teacher.close()
     np.testing.assert_array_equal(load_poses(path, arm), poses[1:])
-    assert hand.lines == ["pose 1 taken", "pose 2 taken"]
+    assert hand.lines == ["pose 1 recorded", "pose 2 recorded"]
 
 
 def test_a_file_of_poses_that_cannot_be_written_is_an_error(tmp_path):

@@ -253,7 +253,7 @@ def test_a_growing_file_is_whole_after_every_message(tmp_path, suffix):
     messages = changed(7, guard_state=Status.STATE_OFF)
     for k, message in enumerate(messages):
         data = message.encode()
-        file.write(data, message.utime + 500, stream.take(data))
+        file.write(data, message.utime + 500, stream.accept(data))
         assert_same_numbers(read_recording(path, ARM), [m for m in messages[: k + 1] if m.guard_state])
     file.close()
     with pytest.raises(RecordingError, match=r"nowhere\.csv: cannot be written: "):
@@ -278,7 +278,7 @@ def test_a_full_disk_ends_the_file_with_a_whole_row(tmp_path, suffix):
     try:
         with pytest.raises(RecordingError, match="cannot be written any more: "):
             for message in statuses(40):
-                file.write(message.encode(), message.utime, stream.take(message.encode()))
+                file.write(message.encode(), message.utime, stream.accept(message.encode()))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     file.close()

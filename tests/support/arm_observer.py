@@ -38,13 +38,13 @@ class Observer:
         # because the main thread starts them.
         make_realtime()
         network = lcm.LCM(url)
-        subscription = network.subscribe(f"DVRK_STATUS_{name.upper()}", self.hear)
+        subscription = network.subscribe(f"DVRK_STATUS_{name.upper()}", self.receive)
         subscription.set_queue_capacity(0)  # no limit
         self.listens.set()
         while not self.ended.is_set():
             network.handle_timeout(100)
 
-    def hear(self, channel, data):
+    def receive(self, channel, data):
         self.times.append(time.monotonic())
         self.received.append(Status.decode(data))
 

@@ -107,7 +107,7 @@ class FaultyArm:
         sensors: Sensors whose measurements can be made to fail.
         model: Ground-truth model.
         desired: Function from time to the desired state (2n) of the arm under "effort" and "position".
-        lead: Function from status and time to the desired state for `ArmController.answer`.
+        on_status: Function from status and time to the desired state for `ArmController.answer`.
         controller: ArmController, or None.
     """
 
@@ -143,7 +143,7 @@ class FaultyArm:
         velocity = path.MakeDerivative()
         self.desired = lambda t: np.concatenate([path.value(t), velocity.value(t)]).ravel()
         self.controller = None
-        self.lead = lambda status, time: self.desired(time) if use == "effort" else None
+        self.on_status = lambda status, time: self.desired(time) if use == "effort" else None
         if use in ("effort", "gravity", "damped"):
             self.controller = ArmController(arm, model, "hold" if use == "effort" else use, PERIOD)
         elif use == "position":
@@ -171,7 +171,7 @@ class FaultyArm:
         time = PERIOD * self.ticks
         if self.controller is not None:
             status = self.driver.GetOutputPort("lcmt_dvrk_status").Eval(self.driver.GetMyContextFromRoot(self.context))
-            self.driver.Receive(self.controller.answer(status, time, self.lead(status, time)).encode())
+            self.driver.Receive(self.controller.answer(status, time, self.on_status(status, time)).encode())
         elif self._use == "position":
             context = self._sender.GetMyMutableContextFromRoot(self.context)
             self._sender.GetInputPort("desired_state").FixValue(context, self.desired(time))

@@ -93,11 +93,11 @@ class Sending:
         self.lcm, self.status, self.ticks = lcm, Status(), 0
         # Fixing the value at each tick would copy it each time.
         self.received = self.port("lcmt_dvrk_status").FixValue(self.context, AbstractValue.Make(self.status))
-        lcm.Subscribe(f"DVRK_STATUS_{arm.name}", self.hear)
+        lcm.Subscribe(f"DVRK_STATUS_{arm.name}", self.receive)
         for name, value in inputs.items():
             self.fix(name, value)
 
-    def hear(self, data):
+    def receive(self, data):
         self.status = Status.decode(data)
 
     def port(self, name):

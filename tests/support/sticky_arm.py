@@ -123,11 +123,11 @@ def make_collector(path, poses, friction, both_sides=True, *, arm_type=StickyArm
     return Collector(poses, controller, output, settings, **{"writer": Disk()} | options), controller, sticky
 
 
-def lead(collector, controller, sticky, seconds, until=lambda: False):
+def run_collector(collector, controller, sticky, seconds, until=lambda: False):
     end = sticky.ticks + seconds / PERIOD
     while not (collector.finished or until()) and sticky.ticks < end:
         status, time = sticky.status(), PERIOD * sticky.ticks
-        sticky.step(controller.answer(status, time, collector.lead(status, time)))
+        sticky.step(controller.answer(status, time, collector.update(status, time)))
 
 
 def near_poses(count=3):

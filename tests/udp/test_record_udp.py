@@ -197,10 +197,10 @@ def test_missing_status_is_explained(tmp_path, played):
     arms = ("psm", "mtmr", "mtml")
     waiting = dict(zip(arms, start_records([tmp_path / f"{arm}.csv" for arm in arms], arms=arms), strict=True))
     said = end(waiting.pop("mtmr"), signal.SIGINT)
-    assert "mtmr.csv: not made: ended before the first status of MTMR" in said
+    assert "mtmr.csv was not written: the recording ended before the first status of MTMR" in said
     messages = {
-        "psm": "no message within 10 s on channel DVRK_STATUS_PSM of udpm://239.255.76.67:7667?ttl=0; "
-        "there is DVRK_STATUS_MTML",
+        "psm": "no message within 10 s on channel DVRK_STATUS_PSM of udpm://239.255.76.67:7667?ttl=0. "
+        "Channels with messages: DVRK_STATUS_MTML",
         "mtml": "no status of MTML within 10 s on channel DVRK_STATUS_MTML of udpm://239.255.76.67:7667?ttl=0: "
         "messages left out, no lcmt_dvrk_status, or one of another version",
     }
@@ -209,5 +209,5 @@ def test_missing_status_is_explained(tmp_path, played):
         assert messages[arm] in process.stdout.read()
     ended.set()
     assert alone.wait(TIMEOUT) == 2
-    assert "does the arm's process or bridge run, on this network?" in alone.stdout.read()
+    assert "Check that the arm's process or bridge runs on this network." in alone.stdout.read()
     assert not list(tmp_path.glob("*.csv"))

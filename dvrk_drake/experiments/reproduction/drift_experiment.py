@@ -19,7 +19,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.simulation import samples
 from dvrk_drake.experiments.study.study import await_results
 from dvrk_drake.models.arm import Arm, load_arm
-from dvrk_drake.models.coupled_limits import beside
+from dvrk_drake.models.coupled_limits import offset_pose
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
@@ -99,7 +99,7 @@ def _way(case: Release, arm: Arm) -> PiecewisePolynomial:
     q = from_where = np.asarray(case.start, float)
     if case.led:
         sides = np.random.default_rng(case.seed).choice([-1.0, 1.0], arm.num_joints)
-        from_where = beside(arm, q, sides * arm.per_joint(*APPROACH))
+        from_where = offset_pose(arm, q, sides * arm.per_joint(*APPROACH))
     knots = np.column_stack([from_where, q])
     return PiecewisePolynomial.CubicHermite([0.0, LEADING], knots, np.zeros_like(knots))
 

@@ -46,7 +46,7 @@ class Motors:
 
 
 @numba.njit("float64(float64, float64)", cache=True)
-def in_steps(value, step):
+def round_to_step(value, step):
     """Rounds `value` to the nearest multiple of `step`. A step of 0 leaves it unchanged."""
     return step * np.rint(value / step) if step > 0.0 else value
 
@@ -61,7 +61,7 @@ def motor_effort_into(command, constants, to_motors, effort):
         for i in range(len(effort)):
             effort[i] += to_motors[i, k] * tau
     for i in range(len(effort)):
-        effort[i] = min(max(in_steps(effort[i], steps[i]), -most[i]), most[i])
+        effort[i] = min(max(round_to_step(effort[i], steps[i]), -most[i]), most[i])
 
 
 class EffortSensor(LeafSystem):
@@ -105,7 +105,7 @@ class EffortSensor(LeafSystem):
             tick = int(context.get_time() / self._time_step + 0.5)
             bits = np.random.Philox(key=self._seed, counter=[0, 0, tick, 0])
             effort = effort + self._deviations * np.random.Generator(bits).standard_normal(len(effort))
-        counted = np.array([in_steps(value, step) for value, step in zip(effort, self._steps, strict=True)])
+        counted = np.array([round_to_step(value, step) for value, step in zip(effort, self._steps, strict=True)])
         output.SetFromVector(self._transmission.pull_back_effort(counted))
 
 
@@ -158,7 +158,8 @@ class DriveForce(LeafSystem):
 
     def _make_calc(self, n: int) -> Callable[[Context, BasicVector], None]:
         """Returns the handler of the port. Its data are local names for speed, see GravityPidController."""
-        eval_vector_input, motors_into, subtract_at = self.EvalVectorInput, entry_point(_force_into), entry_point(_take)
+        eval_vector_input, motors_into = self.EvalVectorInput, entry_point(_force_into)
+        subtract_at = entry_point(_subtract_at)
         torque_into = None if self._torque is None else entry_point(self._torque)
         constants, to_motors, from_motors = self._motors.constants, self._motors.to_motors, self._from_motors
         joints, coefficients = self._joints, self._coefficients
@@ -204,6 +205,6 @@ def _force_into(command, outside, state, joints, constants, to_motors, from_moto
 
 
 @numba.njit("void(float64[::1], int64[::1], float64[::1])", cache=True)
-def _take(tau, joints, force):
+def _subtract_at(tau, joints, force):
     for k in range(len(joints)):
         force[joints[k]] -= tau[k]

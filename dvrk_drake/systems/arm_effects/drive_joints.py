@@ -66,7 +66,9 @@ class DriveJoints:
         plant, i = self._plant, self._arm.joint_names.index(name)
         row = joint_row(self._arm, f"actuator.{name}")
         if self._arm.prismatic[i] or not np.array_equal(row, np.eye(len(row))[i]):
-            raise StationError(f"{self._arm.name}: stretch.{name}: allowed are actuators that turn one joint alone")
+            raise StationError(
+                f"{self._arm.name}: stretch.{name}: the actuator must drive one revolute joint and no other joint"
+            )
         joint = self._new(row, cable)
         motor = plant.AddJointActuator(f"motor_{name}", joint)
         at_joint = plant.GetJointActuatorByName(name, self._instance)
@@ -122,7 +124,7 @@ class DriveJoints:
                 total = total + sign * self._arm.linkage.matrix[names.index(joint.name())]
                 if np.allclose(total, row, atol=1e-12):
                     origin = _offset(joint.frame_on_parent()) + along
-                    return self._beside(row, cable, joint.parent_body(), origin, last)
+                    return self._add_coaxial_joint(row, cable, joint.parent_body(), origin, last)
                 parent = joint.parent_body()
                 if parent.index() not in above:
                     break
@@ -133,7 +135,7 @@ class DriveJoints:
                 along, joint = along + step, upper
         return None
 
-    def _beside(
+    def _add_coaxial_joint(
         self,
         row: NDArray[np.float64],
         cable: Cable,
@@ -146,7 +148,7 @@ class DriveJoints:
         body = self._body(name, row)
         frame = plant.AddFrame(FixedOffsetFrame(f"{name}_base", parent, RigidTransform(p_PR)))
         joint = plant.AddJoint(RevoluteJoint(name, frame, body.body_frame(), last.revolute_axis()))
-        self._tie(last.child_body(), _offset(last.frame_on_child()), body, last.revolute_axis(), cable)
+        self._couple_rotation(last.child_body(), _offset(last.frame_on_child()), body, last.revolute_axis(), cable)
         return joint
 
     def _chain(self, row: NDArray[np.float64], cable: Cable) -> Joint:
@@ -161,10 +163,10 @@ class DriveJoints:
             end = body
         body = self._body(f"drive_{i}", row)
         joint = plant.AddJoint(RevoluteJoint(f"drive_{i}", plant.world_frame(), body.body_frame(), axis))
-        self._tie(end, np.zeros(3), body, axis, cable)
+        self._couple_rotation(end, np.zeros(3), body, axis, cable)
         return joint
 
-    def _tie(
+    def _couple_rotation(
         self, A: RigidBody, p_AAxis: NDArray[np.float64], B: RigidBody, axis: NDArray[np.float64], cable: Cable
     ) -> None:
         """Couples the rotation of B to A about a common axis by a rod between points a quarter of a turn apart."""

@@ -14,7 +14,7 @@ from dvrk_drake.dynamics.actuator_effects import effect_step
 from dvrk_drake.dynamics.codegen import entry_point
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
-from dvrk_drake.systems.arm_effects.drive_force import in_steps
+from dvrk_drake.systems.arm_effects.drive_force import round_to_step
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 
 
@@ -66,8 +66,8 @@ class DriveStep(LeafSystem):
         self._measure_into = entry_point(_measure_into)
         self.DeclareVectorInputPort(name="plant_state", size=2 * exact.shape[1])
         self._queue_length = max(delay - 1, 0)
-        hooks = self.DeclareDiscreteState(num_state_variables=2 * parts.num_actuators)
-        self.DeclareStateOutputPort(name="desired_state", state_index=hooks)
+        anchors = self.DeclareDiscreteState(num_state_variables=2 * parts.num_actuators)
+        self.DeclareStateOutputPort(name="desired_state", state_index=anchors)
         out, memory = self._at_rest(q_default)
         self.DeclareDiscreteState(out)
         self.DeclareDiscreteState(memory)
@@ -83,15 +83,16 @@ class DriveStep(LeafSystem):
 
     def _make_update(self) -> Callable[[Context, DiscreteValues], None]:
         """Returns the handler of the update. Its data are local names for speed, see GravityPidController."""
-        eval_vector_input, follow, measure_into = self.EvalVectorInput, entry_point(_follow), self._measure_into
+        eval_vector_input, measure_into = self.EvalVectorInput, self._measure_into
+        move_anchors = entry_point(_move_anchors)
         places, laws, maps, constants = self._places, self._laws, self._maps, self._constants
-        rubs, time_step = len(places) > 0, self._constants[-1]
+        has_friction, time_step = len(places) > 0, self._constants[-1]
 
         def update(context: Context, discrete_state: DiscreteValues) -> None:
             state = eval_vector_input(context, 0).get_value()
             value = discrete_state.get_mutable_value
-            if rubs:
-                follow(state, places, laws, time_step, value(_HOOKS))
+            if has_friction:
+                move_anchors(state, places, laws, time_step, value(_ANCHORS))
             measure_into(state, *maps, constants, value(_MEMORY), value(_OUT))
 
         return update
@@ -109,8 +110,8 @@ class DriveStep(LeafSystem):
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self.EvalVectorInput(context, 0).get_value()
-        hooks = discrete_state.get_mutable_value(_HOOKS)
-        hooks[self._places[:, 1]] = state[self._places[:, 2]]
+        anchors = discrete_state.get_mutable_value(_ANCHORS)
+        anchors[self._places[:, 1]] = state[self._places[:, 2]]
         exact = self._maps[2]
         for group, value in zip((_OUT, _MEMORY), self._at_rest(exact @ state[: exact.shape[1]]), strict=True):
             discrete_state.set_value(group, value)
@@ -120,38 +121,38 @@ class DriveStep(LeafSystem):
         n = len(q)
         a = self._J @ q
         if self._constants[n] >= 0.0:
-            a = np.array([in_steps(x, step) for x, step in zip(a, self._constants[:n], strict=True)])
+            a = np.array([round_to_step(x, step) for x, step in zip(a, self._constants[:n], strict=True)])
             q = self._maps[1] @ a
         still = np.zeros(n)
         out = np.concatenate([q, still])
         return out, np.concatenate([a, still, *[out] * self._queue_length])
 
 
-_HOOKS, _OUT, _MEMORY = 0, 1, 2  # indices of the discrete state groups
+_ANCHORS, _OUT, _MEMORY = 0, 1, 2  # indices of the discrete state groups
 
 
 @numba.njit("void(float64[::1], int64[:, ::1], float64[:, ::1], float64, float64[::1])", cache=True)
-def _follow(state, places, laws, time_step, hooks):
+def _move_anchors(state, places, laws, time_step, anchors):
     """Moves the anchors of the springs; see `Slider` for `places` and `laws`."""
     num_positions = len(state) // 2
     for i in range(len(places)):
-        code, hook, column = places[i]
+        code, actuator, column = places[i]
         travel, fall_speed, side = laws[i]
         position, velocity = state[column], state[num_positions + column]
-        holds = travel
+        slip_travel = travel
         if fall_speed > 0.0:
-            holds *= max(math.exp(-((velocity / fall_speed) ** 2)), 1e-6)
-        stretch = side * (position - hooks[hook])
+            slip_travel *= max(math.exp(-((velocity / fall_speed) ** 2)), 1e-6)
+        deflection = side * (position - anchors[actuator])
         # The deflection of a spring that starts relaxed equals the element's state.
-        z, _ = effect_step(code, 0.0, stretch, 0.0, holds)
-        if abs(stretch - z * holds) < 1e-12 * travel:
+        z, _ = effect_step(code, 0.0, deflection, 0.0, slip_travel)
+        if abs(deflection - z * slip_travel) < 1e-12 * travel:
             continue
-        stretch = z * holds
-        if holds < travel:
+        deflection = z * slip_travel
+        if slip_travel < travel:
             # The deflection increases in the present step and in the step that the anchor is for. Up to `travel`, the
             # effort limit covers this.
-            stretch = math.copysign(max(abs(stretch) - 2.0 * time_step * abs(velocity), 0.0), stretch)
-        hooks[hook] = position - side * stretch
+            deflection = math.copysign(max(abs(deflection) - 2.0 * time_step * abs(velocity), 0.0), deflection)
+        anchors[actuator] = position - side * deflection
 
 
 @numba.njit(
@@ -167,13 +168,13 @@ def _measure_into(state, to_actuators, to_joints, exact, constants, memory, out)
     n, num_positions = to_actuators.shape
     decay, time_step = constants[n], constants[n + 1]
     queue = memory[2 * n :]
-    late = len(queue)
+    queue_size = len(queue)
     measured = out
-    if late:
+    if queue_size:
         out[:] = queue[: 2 * n]
-        for i in range(late - 2 * n):
+        for i in range(queue_size - 2 * n):
             queue[i] = queue[i + 2 * n]
-        measured = queue[late - 2 * n :]
+        measured = queue[queue_size - 2 * n :]
     if decay < 0.0:
         for i in range(n):
             q, v = 0.0, 0.0
@@ -186,7 +187,7 @@ def _measure_into(state, to_actuators, to_joints, exact, constants, memory, out)
         a = 0.0
         for k in range(num_positions):
             a += to_actuators[i, k] * state[k]
-        a = in_steps(a, constants[i])
+        a = round_to_step(a, constants[i])
         memory[n + i] = decay * memory[n + i] + (1.0 - decay) * (a - memory[i]) / time_step
         memory[i] = a
     for i in range(n):

@@ -54,13 +54,15 @@ def add_drive_with_effects(builder: DiagramBuilder, drive: DriveWithEffects) -> 
     # Optional: unconnected, its output is not read.
     commanded = builder.AddNamedSystem("effort_commanded", PassThrough(drive.arm.num_joints))
     force = builder.AddNamedSystem("drive_force", DriveForce(drive.arm, motors, drive.parts, drive.effects))
-    at_motors = _late(builder, "command_delay", delay.command, commanded.get_output_port(), drive)
+    at_motors = _add_delay(builder, "command_delay", delay.command, commanded.get_output_port(), drive)
     builder.Connect(at_motors, force.GetInputPort("effort_commanded"))
     builder.Connect(plant.get_state_output_port(), force.GetInputPort("plant_state"))
     builder.Connect(force.get_output_port(), plant.get_applied_generalized_force_input_port())
     sensor = EffortSensor(drive.arm, motors, drive.effects.effort, drive.parts.time_step, drive.seed)
     builder.AddNamedSystem("effort_sensor", sensor)
-    builder.Connect(_late(builder, "measurement_delay", delay.measurement, at_motors, drive), sensor.get_input_port())
+    builder.Connect(
+        _add_delay(builder, "measurement_delay", delay.measurement, at_motors, drive), sensor.get_input_port()
+    )
     ports = DrivePorts(
         commanded.get_input_port(),
         force.GetInputPort("effort_disturbance"),
@@ -71,7 +73,7 @@ def add_drive_with_effects(builder: DiagramBuilder, drive: DriveWithEffects) -> 
     return ports, step
 
 
-def _late(builder: DiagramBuilder, name: str, steps: int, port: OutputPort, drive: DriveWithEffects) -> OutputPort:
+def _add_delay(builder: DiagramBuilder, name: str, steps: int, port: OutputPort, drive: DriveWithEffects) -> OutputPort:
     if steps == 0:
         return port
         # The sampled input already causes a delay of one step, because the plant steps while it is stored.

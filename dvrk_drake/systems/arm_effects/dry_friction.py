@@ -43,7 +43,7 @@ class Slider:
     side: float
 
     @staticmethod
-    def of(element: tuple[JointActuator, FrictionEffect, float], order: Sequence[object]) -> Slider:
+    def from_element(element: tuple[JointActuator, FrictionEffect, float], order: Sequence[object]) -> Slider:
         """Returns the slider of an element of `add_friction`. `order` lists the indices of the instance's actuators."""
         actuator, effect, ratio = element
         side = 1.0 if effect.coefficient * ratio > 0 else -1.0
@@ -161,7 +161,7 @@ class PlantEffects:
         """Computes the indices. Call it when the plant is finalized."""
         order = [actuator.index() for actuator in joints.actuators]
         self.num_actuators = len(order)
-        self.sliders = [Slider.of(element, order) for element in self._elements]
+        self.sliders = [Slider.from_element(element, order) for element in self._elements]
         J = self._arm.transmission.matrix
         self.to_actuators: NDArray[np.float64] = np.ascontiguousarray(J @ joints.selection.T)
         self.from_motors: NDArray[np.float64] = np.ascontiguousarray(joints.selection @ J.T)

@@ -162,9 +162,9 @@ class CommandGuard:
             StationError: The session is 0, a mode is unknown, or the settings or the arm's gains are out of range.
         """
         if unknown := set(modes or ()) - {*_ACTIVE, lcmt_dvrk_command.OFF, lcmt_dvrk_command.HOLD}:
-            raise StationError(f"modes must be of POSITION, EFFORT and OFF; got {sorted(unknown)}")
+            raise StationError(f"modes must be POSITION, EFFORT or OFF; got {sorted(unknown)}")
         if session_id == 0:
-            raise StationError("session_id must not be 0, which a command has that was never filled in")
+            raise StationError("session_id must not be 0, the value in a command that was not filled in")
         self.settings = settings or GuardSettings()
         self.settings.check()
         self.limits = GuardLimits(arm, self.settings)
@@ -219,7 +219,7 @@ class CommandGuard:
         if self.state == lcmt_dvrk_status.STATE_FAULT:
             return 1 << lcmt_dvrk_command.HOLD
         modes = {lcmt_dvrk_command.HOLD, *self._modes}
-        if self.state == lcmt_dvrk_status.STATE_OFF or self.waits_for:
+        if self.state == lcmt_dvrk_status.STATE_OFF or self.blocked_reason:
             modes -= set(_ACTIVE)
         if self.state not in (lcmt_dvrk_status.STATE_OFF, lcmt_dvrk_status.STATE_HOLD):
             modes -= {lcmt_dvrk_command.OFF}
@@ -241,7 +241,7 @@ class CommandGuard:
         return self._force.command
 
     @property
-    def waits_for(self) -> str:
+    def blocked_reason(self) -> str:
         """Reason why POSITION and EFFORT are not accepted although there is no fault. Empty: they are accepted.
 
         The reason is either `hold_reason`, until an operator resumes, or a period of the guard that is too long.
@@ -272,7 +272,7 @@ class CommandGuard:
         self.counts.refused += 1
         self.refusal_code = code
         if code not in OUT_OF_STREAM and self.state == lcmt_dvrk_status.STATE_STARTING:
-            self._take_over(f"a command was refused while its mode began: {describe_refusal(code)}")
+            self._take_over(f"a command was refused during the start check: {describe_refusal(code)}")
         return code
 
     def ignore(self, code: int, count: int = 1) -> None:
@@ -307,9 +307,9 @@ class CommandGuard:
         self._measure(measured_utime, q, v, effort)
         self._expire(utime)
         self._watch_period(dt)
-        if self.state == lcmt_dvrk_status.STATE_EFFORT and (excess := self.limits.beyond(self._q())):
+        if self.state == lcmt_dvrk_status.STATE_EFFORT and (excess := self.limits.position_limit_fault(self._q())):
             self.report_fault(excess, lcmt_dvrk_status.FAULT_POSITION_LIMIT)
-        if self.state in _REGULATED and (away := self._follower.astray(self._q())):
+        if self.state in _REGULATED and (away := self._follower.following_fault(self._q())):
             self.report_fault(away, lcmt_dvrk_status.FAULT_FOLLOWING)
         self.output = self._output(min(max(dt, 0.0), _MAX_STEP))
         if not self.output.is_finite():
@@ -347,7 +347,7 @@ class CommandGuard:
         first = measured.q is None
         begins = plausibility.begins or measured.time_since(measured_utime) >= _MAX_GAP
         implausible_pose = self.limits.implausible_pose if begins else None
-        self._problem = problem = measured.take(measured_utime, q, v, effort, implausible_pose)
+        self._problem = problem = measured.store(measured_utime, q, v, effort, implausible_pose)
         if problem:
             if first or measured.bad > self.settings.plausibility.bad_samples:
                 # Without any measurement there is no pose to hold.
@@ -436,7 +436,7 @@ class CommandGuard:
         self.counts.lost = self._stream.lost
         mode, force = command.control_mode, self._force
         goes_on = self.state == lcmt_dvrk_status.STATE_STARTING and mode == force.command.control_mode
-        force.take(command)
+        force.replace(command)
         force.wall_utime = self._expiry.wall_time(command.status_utime, utime - command.status_utime)
         self._acted &= mode in _ACTIVE
         if mode == lcmt_dvrk_command.OFF:

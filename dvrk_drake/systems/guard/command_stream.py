@@ -109,7 +109,7 @@ class CommandInForce:
     wall_utime: int = 0
     good_since: int = 0
 
-    def take(self, command: lcmt_dvrk_command) -> None:
+    def replace(self, command: lcmt_dvrk_command) -> None:
         """Replaces the command by the next one of the same stream."""
         self.command, self.status_utime = command, command.status_utime
         self.position, self.velocity, self.effort = (

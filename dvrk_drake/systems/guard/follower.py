@@ -44,7 +44,7 @@ class Follower:
     def __init__(self, limits: GuardLimits) -> None:
         """Creates a follower at rest. No array is changed in place, so copies may share them."""
         self._limits, self._zero = limits, np.zeros(len(limits.effort_limits))
-        self.target = self._laggard = self._effort = self._kick = self._zero
+        self.target = self._filtered_target = self._effort = self._start_wall_effort = self._zero
 
     def off(self, q: Vector) -> GuardOutput:
         """Returns the output without power, at the measured q."""
@@ -54,11 +54,11 @@ class Follower:
         """Makes the measured q the target. The following error allows for the braking distance of an arm at speed v."""
         self.target = q.copy()
         speed = self._limits.speed
-        self._laggard = q + self._limits.following_time * clip(v, -speed, speed)
+        self._filtered_target = q + self._limits.following_time * clip(v, -speed, speed)
 
     def hold(self, dt: float) -> GuardOutput:
         """Returns the output that holds the target, `dt` seconds after the last one."""
-        self._follow_late(dt)
+        self._filter_target(dt)
         return self._output(lcmt_dvrk_command.HOLD, self.target)
 
     def hold_valid_joints(self, q: Vector, v: Vector, valid: Mask, gravity: Vector) -> GuardOutput:
@@ -84,33 +84,36 @@ class Follower:
 
     def begin_position(self) -> None:
         """Starts following position commands. The target starts from its present value."""
-        self._laggard = self.target
+        self._filtered_target = self.target
 
     def follow_position(self, position: Vector, velocity: Vector, dt: float) -> GuardOutput:
         """Returns the output `dt` seconds on, towards a position with a feedforward velocity [rad, m, rad/s, m/s]."""
         self.target, flags = self._limits.limit_position(position, self.target, dt)
-        self._follow_late(dt)
+        self._filter_target(dt)
         velocity = self._limits.limit_velocity(velocity, self.target, flags)
         return self._output(lcmt_dvrk_command.POSITION, self.target, velocity=velocity, flags=flags)
 
-    def _follow_late(self, dt: float) -> None:
-        self._laggard = self._laggard + min(dt / self._limits.following_time, 1.0) * (self.target - self._laggard)
+    def _filter_target(self, dt: float) -> None:
+        self._filtered_target = self._filtered_target + min(dt / self._limits.following_time, 1.0) * (
+            self.target - self._filtered_target
+        )
 
-    def astray(self, q: Vector) -> str:
+    def following_fault(self, q: Vector) -> str:
         """Describes the joint that is furthest from its target, if this is further than allowed. Empty: none.
 
         A position controller without feedforward lags by Kd/Kp. The arm may therefore be anywhere between the target
         and the target filtered to first order with the time constant `following_time`, plus the allowed error.
         """
-        ahead = q - np.maximum(self.target, self._laggard)
-        behind = np.minimum(self.target, self._laggard) - q
+        ahead = q - np.maximum(self.target, self._filtered_target)
+        behind = np.minimum(self.target, self._filtered_target) - q
         share = np.maximum(ahead, behind) / self._limits.following_error
         j = int(np.argmax(share))
         if not share[j] > 1.0:
             return ""
+        unit = self._limits.unit(j)
         return (
-            f"{self._limits.names[j]} = {q[j]:.4g} does not follow {self.target[j]:.4g}; "
-            f"{self._limits.following_error[j]:.3g} away is allowed"
+            f"{self._limits.names[j]} is at {q[j]:.4g} {unit} and does not follow its target {self.target[j]:.4g} {unit} "
+            f"(allowed difference {self._limits.following_error[j]:.3g} {unit})"
         )
 
     def begin_effort(self, effort: Vector, q: Vector) -> None:
@@ -118,12 +121,12 @@ class Follower:
         limit = self._limits.command_limits
         self._effort = clip(effort, -limit, limit)
         # Initial effort of the walls on an arm at rest. `follow_effort` subtracts a decreasing share of it.
-        self._kick = self._limits.wall_effort(q, self._zero)[0]
+        self._start_wall_effort = self._limits.wall_effort(q, self._zero)[0]
 
     def follow_effort(self, effort: Vector, q: Vector, v: Vector, dt: float, begun: float) -> GuardOutput:
         """Returns the output `dt` seconds on, towards an effort at q, v. `begun` is the elapsed share of the start."""
         self._effort, flags = self._limits.follow_effort(effort, self._effort, dt)
-        left_out = None if begun == 1.0 else (1.0 - begun) * self._kick
+        left_out = None if begun == 1.0 else (1.0 - begun) * self._start_wall_effort
         applied, walls = self._limits.restrain_effort(self._effort, q, v, left_out)
         return self._output(lcmt_dvrk_command.EFFORT, q, effort=applied, flags=flags | walls)
 

@@ -99,14 +99,17 @@ class GuardLimits:
         self._wall_flags = np.full(len(self.A), lcmt_dvrk_status.FLAG_COUPLED_LIMIT, np.int8)
         self._wall_flags[:n] = lcmt_dvrk_status.FLAG_POSITION_LIMIT
 
-    def beyond(self, q: Vector) -> str:
+    def position_limit_fault(self, q: Vector) -> str:
         """Describes the position limit that q (n,) exceeds most, by more than half of its margin. Empty: none."""
         c = self.A.dot(q)
         excess = np.abs(c - self._middle) - self._allowed
         k = int(excess.argmax())
         if not excess[k] > 0:
             return ""
-        return f"{self.names[k]} = {c[k]:.4g} is beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}"
+        return (
+            f"{self.names[k]} is at {c[k]:.4g} {self.unit(k)}, outside its limits "
+            f"{self.lower[k]:.4g}..{self.upper[k]:.4g} {self.unit(k)}"
+        )
 
     def implausible_pose(self, q: Vector) -> str:
         """Describes the first position limit that q (n,) exceeds by more than half of its range. Empty: none.
@@ -119,11 +122,15 @@ class GuardLimits:
         if not far.size:
             return ""
         k = int(far[0])
-        unit = "mm" if k < len(self._prismatic) and self._prismatic[k] else "degrees"
+        wrong_unit = "mm" if self.unit(k) == "m" else "degrees"
         return (
-            f"{self.names[k]} = {c[k]:.4g} is far beyond {self.lower[k]:.4g}..{self.upper[k]:.4g}; "
-            f"{unit} or wrong zero?"
+            f"{self.names[k]} is at {c[k]:.4g} {self.unit(k)}, far outside its limits "
+            f"{self.lower[k]:.4g}..{self.upper[k]:.4g} {self.unit(k)}; check its unit ({wrong_unit}?) and its zero"
         )
+
+    def unit(self, k: int) -> str:
+        """Returns the unit of the coordinate of limit `k`: "m" for a prismatic joint, otherwise "rad"."""
+        return "m" if k < len(self._prismatic) and self._prismatic[k] else "rad"
 
     def refusal_to_start(self, command: lcmt_dvrk_command, q: Vector, effort: Vector, gravity: Vector) -> int:
         """Returns REFUSAL_START_* of a command that would begin to act at the measured q and effort (n,).
@@ -131,7 +138,7 @@ class GuardLimits:
         `gravity` (n,) is the model's gravity effort at q. The result is REFUSAL_NONE for an accepted command.
         """
         if command.control_mode == lcmt_dvrk_command.EFFORT:
-            if self.beyond(q):
+            if self.position_limit_fault(q):
                 return lcmt_dvrk_status.REFUSAL_START_OUTSIDE
             if not np.all(np.abs(effort - gravity) <= self.start_gravity):
                 return lcmt_dvrk_status.REFUSAL_START_GRAVITY

@@ -59,7 +59,7 @@ class Measurement:
         """Returns the time from the last good measurement to `measured_utime` [us] in s; inf without one."""
         return math.inf if self._measured_utime is None else 1e-6 * (measured_utime - self._measured_utime)
 
-    def take(
+    def store(
         self,
         measured_utime: int,
         q: ArrayLike,
@@ -81,7 +81,7 @@ class Measurement:
             return ""
         if dt < 0:
             self.bad += 1
-            return f"the measurement is {-dt:.6f} s older than the one before"
+            return f"the measurement is {-dt:.6f} s older than the previous one"
         q, v, effort = (np.array(numbers, float) for numbers in (q, v, effort))
         self.bad += 1
         if not (

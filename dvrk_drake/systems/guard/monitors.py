@@ -40,10 +40,10 @@ class PeriodMonitor:
         self.fault = ""
         if period > self._longest_period:
             self.fault = (
-                f"the guard was not stepped for {1e3 * period:.0f} ms; allowed are {1e3 * self._longest_period:g}"
+                f"the guard was not stepped for {1e3 * period:.0f} ms; {1e3 * self._longest_period:g} ms are allowed"
             )
         elif self._slow.bit_count() > _PERIODS // 2:
-            self.fault = f"the guard's period has a median above the allowed {1e3 * self._slow_period:g} ms"
+            self.fault = f"the median period of the guard is above the allowed {1e3 * self._slow_period:g} ms"
         return self.fault
 
 

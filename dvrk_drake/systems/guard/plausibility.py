@@ -192,7 +192,7 @@ class Response:
 class SilentEffort:
     """Check that measured efforts follow the commanded ones. Finds sensors that read zero and motors without power."""
 
-    text, about_position = "the measured effort does not show the commanded one", False
+    text, about_position = "the measured effort does not follow the commanded effort", False
 
     def __init__(self, settings: PlausibilitySettings, arm: Arm) -> None:
         """Creates the check for the joints of `arm`."""

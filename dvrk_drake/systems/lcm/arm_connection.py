@@ -79,7 +79,7 @@ def connect_arm(
     statuses = StatusFilter(arm.name, arm.num_joints, key)
     if lcm is None:
         lcm = builder.AddNamedSystem("lcm", LcmInterfaceSystem(lcm=DrakeLcm(driver.lcm_url)))
-    serializer = TolerantSerializer(lcmt_dvrk_status, read=lambda data: statuses.take(data, time.monotonic()))
+    serializer = TolerantSerializer(lcmt_dvrk_status, read=lambda data: statuses.accept(data, time.monotonic()))
     subscriber = builder.AddNamedSystem("status_subscriber", LcmSubscriberSystem(status_channel(arm), serializer, lcm))
     receiver = builder.AddNamedSystem("status_receiver", DvrkStatusReceiver(arm))
     sender = builder.AddNamedSystem("command_sender", DvrkCommandSender(arm))

@@ -104,7 +104,7 @@ def fill_in_guard(status: lcmt_dvrk_status, guard: CommandGuard) -> None:
     """Sets the fields of `status` that describe the state of a guard. Bridges use it as well."""
     status.session_id = guard.session_id
     status.guard_state, status.accepted_modes = guard.state, guard.accepted_modes
-    status.fault_code, status.fault_text = guard.fault_code, guard.fault_text or guard.waits_for
+    status.fault_code, status.fault_text = guard.fault_code, guard.fault_text or guard.blocked_reason
     status.command_sender_id = guard.sender_id
     status.command_sequence, status.command_utime = guard.last_command.sequence, guard.last_command.utime
     counts = guard.counts

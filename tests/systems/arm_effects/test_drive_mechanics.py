@@ -130,7 +130,7 @@ def test_cable_stretches_by_its_load():
 
 @pytest.mark.parametrize(("name", "actuator"), [("mtml", "elbow_pitch"), ("psm", "insertion"), ("psm", "jaw")])
 def test_cable_without_rotor_inertia_is_refused(name, actuator):
-    with pytest.raises(StationError, match=f"stretch.{actuator}: allowed are actuators that turn one joint alone"):
+    with pytest.raises(StationError, match=f"stretch.{actuator}: the actuator must drive one revolute joint"):
         ArmStation(load_arm(name), effects=ArmEffects(stretch={actuator: Cable(100.0)}))
 
 

@@ -102,9 +102,9 @@ class HeldArm:
         for k, i in enumerate(plant.GetJointActuatorIndices(instance)):
             actuator = plant.get_joint_actuator(i)
             if actuator.name().startswith("friction"):
-                hooks = plant.get_desired_state_input_port(instance).Eval(context)
+                anchors = plant.get_desired_state_input_port(instance).Eval(context)
                 p = actuator.get_controller_gains().p
-                force = p * (hooks[k] - actuator.joint().GetOnePosition(context))
+                force = p * (anchors[k] - actuator.joint().GetOnePosition(context))
                 energy += 0.5 * min(abs(force), actuator.effort_limit()) ** 2 / p
         return energy
 

@@ -48,7 +48,7 @@ def test_is_near_includes_the_exact_tolerance():
     follower = at(STILL)
     follower.begin_position()
     assert follower.is_near(LIMITS.start_position)
-    assert follower.astray(LIMITS.following_error) == ""
+    assert follower.following_fault(LIMITS.following_error) == ""
 
 
 # Positions
@@ -80,13 +80,13 @@ def test_large_following_error_is_detected(joint, side):
     follower = at()
     follower.begin_position()
     away = side * 0.15 * RANGE[joint] * E[joint]
-    assert follower.astray(Q + 0.999 * away) == ""
-    text = follower.astray(Q + 1.001 * away)
-    assert text.startswith(f"{ARM.joint_names[joint]} = ")
-    assert text.endswith(f"{0.15 * RANGE[joint]:.3g} away is allowed")
+    assert follower.following_fault(Q + 0.999 * away) == ""
+    text = follower.following_fault(Q + 1.001 * away)
+    assert text.startswith(f"{ARM.joint_names[joint]} is at ")
+    assert text.endswith(f"(allowed difference {0.15 * RANGE[joint]:.3g} rad)")
     # The worst one is reported.
     other = (joint + 1) % N
-    assert follower.astray(Q + 1.1 * away + 0.5 * RANGE[other] * E[other]).startswith(ARM.joint_names[other])
+    assert follower.following_fault(Q + 1.1 * away + 0.5 * RANGE[other] * E[other]).startswith(ARM.joint_names[other])
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -100,15 +100,15 @@ def test_lag_up_to_following_time_is_allowed(side):
         late += dt / 0.1 * (target - late)
     assert side * (target - late) > 0.5 * error
 
-    def astray(position):
-        return follower.astray(Q + (position - Q[joint]) * E[joint])
+    def fault_at(position):
+        return follower.following_fault(Q + (position - Q[joint]) * E[joint])
 
-    assert astray(late - side * 0.999 * error) == astray(target + side * 0.999 * error) == astray(late) == ""
-    assert astray(late - side * 1.001 * error) and astray(target + side * 1.001 * error)
+    assert fault_at(late - side * 0.999 * error) == fault_at(target + side * 0.999 * error) == fault_at(late) == ""
+    assert fault_at(late - side * 1.001 * error) and fault_at(target + side * 1.001 * error)
     # A step longer than the following time brings the late one to the target, not beyond.
     target = follower.follow_position(Q + side * 9.0 * E[joint], STILL, 0.2).position[joint]
-    assert astray(target - side * 0.999 * error) == ""
-    assert astray(target - side * 1.001 * error) and astray(target + side * 1.001 * error)
+    assert fault_at(target - side * 0.999 * error) == ""
+    assert fault_at(target - side * 1.001 * error) and fault_at(target + side * 1.001 * error)
 
 
 def test_position_start_resets_the_lag():
@@ -117,9 +117,9 @@ def test_position_start_resets_the_lag():
     for _ in range(100):
         follower.follow_position(Q + 9.0 * E[4], STILL, 1e-3)
     target = follower.target
-    assert follower.astray(target - 1.2 * 0.15 * RANGE[4] * E[4]) == ""
+    assert follower.following_fault(target - 1.2 * 0.15 * RANGE[4] * E[4]) == ""
     follower.begin_position()
-    assert follower.astray(target - 1.01 * 0.15 * RANGE[4] * E[4])
+    assert follower.following_fault(target - 1.01 * 0.15 * RANGE[4] * E[4])
     np.testing.assert_array_equal(follower.target, target)
 
 
@@ -136,14 +136,14 @@ def test_braking_distance_is_allowed_after_latch(joint, side, share):
     q[:] = 9.0
     np.testing.assert_array_equal(follower.target, Q)
 
-    def astray(away):
-        return bool(follower.astray(Q + away * E[joint]))
+    def fault_at(away):
+        return bool(follower.following_fault(Q + away * E[joint]))
 
-    assert not astray(way + 0.999 * side * error) and astray(way + 1.001 * side * error)
-    assert not astray(-0.999 * side * error) and astray(-1.001 * side * error)
+    assert not fault_at(way + 0.999 * side * error) and fault_at(way + 1.001 * side * error)
+    assert not fault_at(-0.999 * side * error) and fault_at(-1.001 * side * error)
     for _ in range(20):
         np.testing.assert_array_equal(follower.hold(0.05).position, Q)
-    assert not astray(0.999 * side * error) and astray(1.001 * side * error)
+    assert not fault_at(0.999 * side * error) and fault_at(1.001 * side * error)
 
 
 @pytest.mark.parametrize("side", [-1, 1])

@@ -53,7 +53,7 @@ def test_pose_beyond_limit_faults_in_effort_mode():
     bench.q[5] = ARM.position_upper[5] + 0.03
     output = bench.tick()
     assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_POSITION_LIMIT)
-    assert bench.guard.fault_text.startswith("wrist_yaw = 0.8154 is beyond")
+    assert bench.guard.fault_text.startswith("wrist_yaw is at 0.8154 rad, outside its limits")
     np.testing.assert_array_equal(output.position, bench.q)
     bench.run(Command.HOLD, 1)
     bench.run(Command.HOLD, 1, reset_fault=True)
@@ -65,7 +65,7 @@ def test_pose_beyond_coupled_limit_faults():
     bench.q = Q.copy()
     bench.q[1:3] = 0.2, -0.2 - 0.36  # each joint inside its own range
     bench.tick()
-    assert bench.guard.fault_text == "parallelogram = -0.36 is beyond -0.33..0.68"
+    assert bench.guard.fault_text == "parallelogram is at -0.36 rad, outside its limits -0.33..0.68 rad"
 
 
 BAD = GuardSettings().plausibility.bad_samples
@@ -219,7 +219,9 @@ def test_implausible_first_pose_is_a_fault():
     bench = Bench(q=degrees, modes=WITH_OFF)
     guard = bench.guard
     assert (guard.state, guard.fault_code) == (Status.STATE_FAULT, Status.FAULT_MEASUREMENT)
-    assert guard.fault_text == "outer_yaw = 40 is far beyond -0.6981..1.134; degrees or wrong zero?"
+    assert guard.fault_text == (
+        "outer_yaw is at 40 rad, far outside its limits -0.6981..1.134 rad; check its unit (degrees?) and its zero"
+    )
     assert bench.output.control_mode == Command.OFF  # it never held a pose
     bench.q = Q
     assert bench.tick().control_mode == Command.OFF
@@ -278,7 +280,7 @@ def test_pose_far_beyond_limits_is_never_held(begin):
             assert np.abs(bench.output.position).max() < np.abs(Q).max() + 0.1
         bench.send(Command.HOLD, position=list(Q), reset_fault=k % 2 == 1)
     assert bench.tick().control_mode != Command.HOLD
-    assert begin is lost_power or "outer_yaw = 5.73 is far beyond" in bench.guard.fault_text
+    assert begin is lost_power or "outer_yaw is at 5.73 rad, far outside" in bench.guard.fault_text
     bench.q = Q
     bench.tick()
     bench.run(Command.HOLD, 1)
@@ -302,7 +304,7 @@ def test_backward_measurement_time_is_a_fault():
         bench.age = 2 * MS * (k % 2)
         bench.utime += MS
         bench.step()
-    assert bench.guard.hold_reason == "the measurement is 0.001000 s older than the one before"
+    assert bench.guard.hold_reason == "the measurement is 0.001000 s older than the previous one"
 
 
 def test_efforts_require_finite_model_gravity():
@@ -317,7 +319,7 @@ def test_caller_cannot_change_commanded_effort():
         bench.effort = 0.0 * LIMIT
         bench.run(Command.EFFORT, 1, effort=list(0.6 * LIMIT)) if bench.guard.fault_code == 0 else None
         bench.output.effort[:] = 0.0
-    assert "does not show the commanded one" in bench.guard.fault_text
+    assert "does not follow the commanded effort" in bench.guard.fault_text
 
 
 def test_prismatic_joint_in_millimetres_is_reported():
@@ -326,7 +328,9 @@ def test_prismatic_joint_in_millimetres_is_reported():
     q = np.zeros(7)
     q[2] = 120.0
     guard.step(0, 0, q, 0 * q, 0 * q)
-    assert guard.fault_text == "insertion = 120 is far beyond 0..0.24; mm or wrong zero?"
+    assert (
+        guard.fault_text == "insertion is at 120 m, far outside its limits 0..0.24 m; check its unit (mm?) and its zero"
+    )
 
 
 def test_off_in_fault_requires_reset():
@@ -377,7 +381,7 @@ def test_joint_that_does_not_follow_is_a_fault(joint, side):
     bench.q = Q + 1.01 * away
     output = bench.tick()
     assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_FOLLOWING)
-    assert bench.guard.fault_text.startswith(f"{ARM.joint_names[joint]} = ")
+    assert bench.guard.fault_text.startswith(f"{ARM.joint_names[joint]} is at ")
     np.testing.assert_array_equal(output.position, bench.q)
 
 

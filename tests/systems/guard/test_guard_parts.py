@@ -21,7 +21,7 @@ def measurement():
     """Returns a good measurement of three joints, 25 ms old."""
     measured = Measurement(3, 20_000)
     measured.advance(NOW - 25 * MS)
-    assert measured.take(NOW - 25 * MS, GOOD, GOOD, GOOD) == ""
+    assert measured.store(NOW - 25 * MS, GOOD, GOOD, GOOD) == ""
     assert measured.dt == np.inf
     measured.advance(NOW)
     return measured
@@ -49,7 +49,7 @@ def test_stopped_clock_is_reported():
 @pytest.mark.parametrize(("age", "good"), [(-1, False), (0, True), (20_000, True), (20_001, False)])
 def test_measurement_age_is_checked(age, good):
     measured = measurement()
-    problem = measured.take(NOW - age, GOOD + 1, GOOD + 2, GOOD + 3)
+    problem = measured.store(NOW - age, GOOD + 1, GOOD + 2, GOOD + 3)
     assert (problem == "") == good
     assert measured.bad == (not good)
     for kept, added in ((measured.q, 1), (measured.v, 2), (measured.effort, 3)):
@@ -65,43 +65,43 @@ def test_measurement_size_and_numbers_are_checked(which, bad):
     vectors[which] = bad
     for count in (1, 2):
         text = "the measured positions, velocities or efforts are not 3 finite numbers each"
-        assert measured.take(NOW, *vectors) == text
+        assert measured.store(NOW, *vectors) == text
         assert measured.bad == count
     np.testing.assert_array_equal(measured.q, GOOD)
-    assert measured.take(NOW, GOOD, GOOD, GOOD) == ""
+    assert measured.store(NOW, GOOD, GOOD, GOOD) == ""
     assert measured.bad == 0
 
 
 def test_interval_is_between_good_measurements():
     measured = measurement()
     measured.advance(NOW + 7 * MS)
-    measured.take(NOW + 2 * MS, GOOD * np.nan, GOOD, GOOD)
-    measured.take(NOW + 5 * MS, GOOD, GOOD, GOOD)
+    measured.store(NOW + 2 * MS, GOOD * np.nan, GOOD, GOOD)
+    measured.store(NOW + 5 * MS, GOOD, GOOD, GOOD)
     assert measured.dt == pytest.approx(30e-3, abs=1e-12)
 
 
 def test_repeated_and_older_measurements():
     measured = measurement()
-    assert measured.take(NOW, GOOD + 1, GOOD, GOOD) == ""
-    assert measured.take(NOW, GOOD + 2, GOOD, GOOD) == "" and measured.dt == 0.0
-    problem = measured.take(NOW - 2 * MS, GOOD + 3, GOOD, GOOD)
-    assert problem == "the measurement is 0.002000 s older than the one before" and measured.bad == 1
+    assert measured.store(NOW, GOOD + 1, GOOD, GOOD) == ""
+    assert measured.store(NOW, GOOD + 2, GOOD, GOOD) == "" and measured.dt == 0.0
+    problem = measured.store(NOW - 2 * MS, GOOD + 3, GOOD, GOOD)
+    assert problem == "the measurement is 0.002000 s older than the previous one" and measured.bad == 1
     np.testing.assert_array_equal(measured.q, GOOD + 1)
     # After the arm's clock went back, times begin anew.
     measured.advance(NOW - 1000 * MS)
-    assert measured.take(NOW - 1000 * MS, GOOD, GOOD, GOOD) == "" and measured.dt == np.inf
+    assert measured.store(NOW - 1000 * MS, GOOD, GOOD, GOOD) == "" and measured.dt == np.inf
 
 
 def test_first_pose_can_be_implausible():
     measured = measurement()
-    assert measured.take(NOW, GOOD + 100, GOOD, GOOD, lambda q: f"{q[0]:g} is far away") == "100 is far away"
+    assert measured.store(NOW, GOOD + 100, GOOD, GOOD, lambda q: f"{q[0]:g} is far away") == "100 is far away"
     np.testing.assert_array_equal(measured.q, GOOD)
     assert measured.bad == 1
 
 
 def test_measurement_is_copied():
     measured, q = measurement(), GOOD.copy()
-    measured.take(NOW, q, q, q)
+    measured.store(NOW, q, q, q)
     q[:] = 9.0
     np.testing.assert_array_equal(measured.q, GOOD)
 
@@ -242,7 +242,7 @@ def test_forget_discards_the_sender():
 def test_command_in_force_is_copied():
     command = Bench().command(effort=np.ones(N))
     force = CommandInForce()
-    force.take(command)
+    force.replace(command)
     command.effort[:] = 9.0
     np.testing.assert_array_equal(force.effort, np.ones(N))
     np.testing.assert_array_equal(force.position, command.position)

@@ -130,7 +130,7 @@ def test_refusal_during_mode_change_requires_resume(bad):
     assert bench.guard.state == Status.STATE_STARTING
     assert bench.send(**{**fields, **bad}) != Status.REFUSAL_NONE
     assert bench.tick().control_mode == Command.HOLD
-    assert bench.guard.hold_reason.startswith("a command was refused while its mode began: ")
+    assert bench.guard.hold_reason.startswith("a command was refused during the start check: ")
     bench.tick(1000)
     assert bench.send(Command.EFFORT) == Status.REFUSAL_RESUME
 

@@ -64,11 +64,11 @@ def test_joint_without_gains_is_refused(kp):
 
 @pytest.mark.parametrize("row", range(N + 1))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_beyond_starts_at_half_of_the_margin(row, side):
+def test_position_limit_fault_starts_at_half_of_the_margin(row, side):
     joint = int(np.flatnonzero(A[row])[0])
     bound = (LOWER if side < 0 else UPPER)[row]
     q = Q.copy()
-    # The sum of shoulder and elbow has limits of its own, and stays inside of them unless they are in question.
+    # The sum of shoulder and elbow has its own limits and stays inside unless they are tested.
     elsewhere = {(1, 1): -0.6, (1, -1): 0.3, (2, 1): -0.1, (2, -1): 1.0, (N, -1): -0.6, (N, 1): 0.2}
     if (row, side) in elsewhere:
         q[1 if row == 2 else 2] = elsewhere[row, side]
@@ -76,19 +76,19 @@ def test_beyond_starts_at_half_of_the_margin(row, side):
     def at(share):
         pose = q.copy()
         pose[joint] += bound + side * share * LIMITS.margin[row] - A[row] @ q
-        return LIMITS.beyond(pose)
+        return LIMITS.position_limit_fault(pose)
 
     assert at(-0.5) == at(0.0) == at(0.499) == ""
-    assert at(0.501).startswith(f"{LIMITS.names[row]} = ")
-    assert at(0.501).endswith(f" is beyond {LOWER[row]:.4g}..{UPPER[row]:.4g}")
+    assert at(0.501).startswith(f"{LIMITS.names[row]} is at ")
+    assert at(0.501).endswith(f", outside its limits {LOWER[row]:.4g}..{UPPER[row]:.4g} rad")
 
 
-def test_beyond_describes_the_worst_limit():
+def test_position_limit_fault_names_the_worst_limit():
     q = Q.copy()
     q[4], q[6] = UPPER[4] + 0.6 * LIMITS.margin[4], LOWER[6] - 0.7 * LIMITS.margin[6]
-    assert LIMITS.beyond(q).startswith("wrist_roll = ")
+    assert LIMITS.position_limit_fault(q).startswith("wrist_roll is at ")
     q[4] += 0.2 * LIMITS.margin[4]
-    assert LIMITS.beyond(q).startswith("wrist_pitch = ")
+    assert LIMITS.position_limit_fault(q).startswith("wrist_pitch is at ")
 
 
 @pytest.mark.parametrize("row", range(N + 1))
@@ -105,8 +105,8 @@ def test_implausible_pose_starts_at_half_of_the_range(row, side):
         return LIMITS.implausible_pose(pose)
 
     assert at(-0.5) == at(0.0) == at(0.499) == ""
-    assert at(0.501).startswith(f"{LIMITS.names[row]} = ")
-    assert at(0.501).endswith("; degrees or wrong zero?")
+    assert at(0.501).startswith(f"{LIMITS.names[row]} is at ")
+    assert at(0.501).endswith("; check its unit (degrees?) and its zero")
 
 
 # The start

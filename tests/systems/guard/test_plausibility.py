@@ -243,7 +243,7 @@ def test_missing_measured_effort_is_found(joint, measured):
         sensors.commanded = unit(joint, commanded * LIMIT[joint])
         sensors.effort = measured * sensors.commanded
         fault, ticks = sensors.move(np.zeros(N), ticks=100)
-        text = f"{ARM.joint_names[joint]}: the measured effort does not show the commanded one"
+        text = f"{ARM.joint_names[joint]}: the measured effort does not follow the commanded effort"
         assert (fault == text) == found
         assert not sensors.checks.invalid.any()  # its position is valid
         if found:
@@ -402,4 +402,4 @@ def test_saturated_coupled_actuators_are_plausible():
     # An effort that reads zero although the actuators apply it is still found.
     sensors.commanded = 0.4 * LIMIT * unit(1)
     sensors.effort = np.zeros(N)
-    assert "does not show" in sensors.move(COUNTS / MS, ticks=200)[0]
+    assert "does not follow the commanded effort" in sensors.move(COUNTS / MS, ticks=200)[0]

@@ -213,7 +213,7 @@ def test_status_receiver_outputs_nan_without_valid_status():
     lcm = DrakeLcm("memq://")
     builder = DiagramBuilder()
     statuses = StatusFilter("MTML", 7)
-    serializer = TolerantSerializer(Status, read=lambda data: statuses.take(data, 0.0))
+    serializer = TolerantSerializer(Status, read=lambda data: statuses.accept(data, 0.0))
     subscriber = builder.AddSystem(LcmSubscriberSystem("DVRK_STATUS_MTML", serializer, lcm))
     receiver = builder.AddSystem(DvrkStatusReceiver(ARM))
     builder.Connect(subscriber.get_output_port(), receiver.get_input_port())
