@@ -182,9 +182,7 @@ def _largest_error(arm: Arm, errors: np.ndarray, torques: np.ndarray, kind: str 
 
 def _print_motion_errors(console: Console, result: DynamicIdentification, verdicts: Mapping[str, Verdict]) -> None:
     section = result.model.dynamic_model.section
-    title = (
-        f"{result.model.arm.name}, {len(result.recording)} rows of motion: effort and relative error (RMS)"
-    )
+    title = f"{result.model.arm.name}, {len(result.recording)} rows of motion: effort and relative error (RMS)"
     columns = ("", "effort [N m; N]", "fit error", "cross-validation error", "repeatability", "verdict")
     table = make_table(title, *columns)
     table.columns[-1].justify = "left"
