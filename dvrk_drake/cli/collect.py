@@ -16,7 +16,7 @@ from dvrk_drake.errors import CollectionError
 if TYPE_CHECKING:
     from dvrk_drake.processes.live_status import LiveLine
 
-_TASK = one_of("Task (give one)")
+_TASK = one_of("Task (one is required)")
 
 
 @app.command(group=HARDWARE)
@@ -28,13 +28,13 @@ def record(
     lcm_url: LcmUrl = "",
     key: Key = None,
 ) -> None:
-    """Record an arm over LCM.
+    """Record the measurements of an arm over LCM.
 
-    The file is complete up to its last row, even after Ctrl-C or an error.
+    All received rows are in the file, even after Ctrl-C or an error.
 
     Args:
-        output: New file to write: .csv, or .log for an LCM log.
-        duration: Duration [s], counted from the first status message. Without it: until Ctrl-C.
+        output: New file: .csv for a CSV recording, .log for an LCM log.
+        duration: Duration [s], counted from the first status message. Default: until Ctrl-C.
     """
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
@@ -71,18 +71,18 @@ def collect(
     both_sides: Annotated[bool, Parameter(negative="--no-both-sides")] = True,
     traverse_time: Seconds = 5.0,
 ) -> None:
-    """Collect poses and holding torques over LCM.
+    """Collect static poses and their holding torques over LCM.
 
-    Run the same command again to continue after an interruption.
+    After an interruption, run the same command again to continue.
 
     Args:
-        poses: File of the poses, read or written.
+        poses: File of poses. --output reads it, --teach and --random add poses to it.
         output: Move the arm to each pose, and append one row per pose to this file.
-        teach: Move the arm by hand, and add the current pose to the file with Enter.
+        teach: Compensate gravity while you move the arm by hand. Enter adds the current pose to the file.
         random: Add N random poses to the file.
         at_rest: With --teach: also add each pose at which the arm rests for one second.
-        both_sides: Approach each pose from below and from above, and average the torques. This cancels dry friction.
-        traverse_time: Time to move a joint over its full range [s].
+        both_sides: Approach each pose from below and from above, and average the torques to cancel dry friction.
+        traverse_time: Time to move a joint over its full range, 1 to 60 s. It sets the speed between poses.
     """
     check_output(poses, overwrite=True)
     if random is not None:

@@ -30,7 +30,7 @@ class ControlledArm:
 
     arm: Arm
     model: Annotated[
-        Model | None, Parameter(help="An identified model, from identify. Without it: what the arm's SDF states.")
+        Model | None, Parameter(help="Model file, written by identify. Default: the nominal model from the SDF.")
     ] = None
     lcm_url: LcmUrl = ""
     key: Key = None
@@ -39,7 +39,7 @@ class ControlledArm:
         bool,
         Parameter(
             show_default=False,
-            help="Print why the arm has a fault or its guard took over, and clear that before it is controlled.",
+            help="Print and clear a fault of the arm, and resume control after its guard took over.",
         ),
     ] = False
 
@@ -56,12 +56,12 @@ def arm(
     meshcat: Annotated[bool, Parameter(show_default=False)] = False,
     realtime: Realtime = False,
 ) -> None:
-    """Run a simulated arm on LCM, with the safeguards of a driver.
+    """Run a simulated arm with its driver and command guard on LCM.
 
     Args:
-        driver: Configuration file of the driver, with the fields of DvrkDriver.
-        pose: Initial joint positions [rad, m]. Without it: near zero.
-        meshcat: Show the arm in a browser.
+        driver: Configuration file of the driver (docs/lcm.md). Default: the default driver.
+        pose: Initial joint positions [rad; m if prismatic]. Default: near zero, inside the joint limits.
+        meshcat: Show the arm in a web browser.
     """
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.lcm_network import open_lcm
@@ -92,10 +92,10 @@ def arm(
 
 @app.command(group=HARDWARE)
 def key(*, output: Annotated[str, Parameter(metavar="FILE")]) -> None:
-    """Create a key that signs LCM messages.
+    """Create a key to sign LCM messages.
 
     Args:
-        output: New key file, readable only by its owner.
+        output: New key file. Only its owner can read it.
     """
     from dvrk_drake.models.lcm_messages import create_key_file
 
@@ -113,16 +113,14 @@ def run(
     hysteresis_ratio: Annotated[float, Parameter(metavar="R")] = 0.0,
     friction_model: Annotated[str | None, Parameter(metavar="MODEL.yaml")] = None,
 ) -> None:
-    """Compensate the gravity of an arm over LCM, or hold it.
+    """Control an arm over LCM: gravity compensation, damping or pose regulation.
 
     Args:
-        mode: gravity: an operator moves the arm freely. damped: as gravity, with damping. hold: the arm holds its pose.
-        gains: Gains from the command tune, for modes hold and damped. Without it: the default gains of the arm.
-        friction_ratio: Share of the friction to compensate in mode gravity, 0 to 0.6. It is reduced where the arm could
-            creep.
-        hysteresis_ratio: Share of the wide hysteresis to compensate in mode gravity, 0 to 0.9, so that the arm stays
-            where it is released.
-        friction_model: Model identified from a motion, whose friction is compensated. Without it: the one of --model.
+        mode: gravity: compensate gravity. damped: also damp the motion. hold: regulate the current pose.
+        gains: Gains from the command tune, for modes damped and hold. Default: the gains of the arm file.
+        friction_ratio: Compensated share of the friction in mode gravity, 0 to 0.6. Reduced if the arm could creep.
+        hysteresis_ratio: Compensated share of the wide hysteresis in mode gravity, 0 to 0.9.
+        friction_model: Model with the friction, identified from a motion. Default: --model.
     """
     from dvrk_drake.processes.control import control
     from dvrk_drake.processes.live_status import LiveLine, LiveStatus

@@ -21,11 +21,11 @@ def model(
     overwrite: Overwrite = False,
     gravity: Gravity = None,
 ) -> None:
-    """Show base parameters, or write gravity as source code.
+    """Show the base parameters of gravity, or generate source code.
 
     Args:
-        format: Print the gravity torque and its regressor as source code in this language.
-        output: File for the source code. Without it: standard output.
+        format: Generate source code of the gravity torque and its regressor in this language.
+        output: File for the source code. Default: standard output.
     """
     from dvrk_drake.dynamics.gravity_regressor import derive_gravity
     from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
@@ -67,12 +67,12 @@ def view(
     lcm_url: LcmUrl = "",
     port: Port = None,
 ) -> None:
-    """Show an arm in a browser.
+    """Show an arm in a web browser.
 
-    The sliders move the joints and keep the linkage closed.
+    Sliders set the joint positions. The linkage stays closed.
 
     Args:
-        live: Show the pose from the arm's status messages, without sliders.
+        live: Show the measured pose from the LCM messages of the arm, without sliders.
     """
     from dvrk_drake.models.arm import load_arm
     from dvrk_drake.processes.control import ArmLink
