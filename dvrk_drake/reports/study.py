@@ -66,13 +66,13 @@ def print_study(
 def _headline(measure: Measure, summary: Summary) -> str:
     value = summary.measures[measure.column]
     if isinstance(value, Share):
-        return f"{value.yes} of {value.runs} runs"
+        return f"{value.count} of {value.runs} runs"
     return f"median {value.median:.4g} {measure.unit}".strip()
 
 
 def _cells(measure: Measure, summary: Summary) -> list[str]:
     value = summary.measures[measure.column]
     if isinstance(value, Share):
-        share = f"{100 * value.yes / value.runs:.1f} %"
+        share = f"{100 * value.count / value.runs:.1f} %"
         return [share, f"{100 * value.lower:.1f}..{100 * value.upper:.1f} %", ""]
     return [f"{number:.4g} {measure.unit}".strip() for number in (value.median, value.percentile_95, value.largest)]

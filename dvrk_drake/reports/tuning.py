@@ -11,7 +11,7 @@ from rich.console import Console
 from dvrk_drake.experiments.tuning.bench import band, step_size
 from dvrk_drake.experiments.tuning.model_based import ArmDesign, JointDesign, friction
 from dvrk_drake.experiments.tuning.procedure import JointProcedure
-from dvrk_drake.experiments.tuning.tuning import DURATION, OWN, REST, Comparison, Tuning
+from dvrk_drake.experiments.tuning.tuning import DURATION, OWN, REST_TIME, Comparison, Tuning
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
 
@@ -100,10 +100,10 @@ def _print_design(console: Console, arm: Arm, design: ArmDesign) -> None:
     """Prints inertia and stability margins of the model-based design, and its gains."""
     columns = ("inertia", "frequency [rad/s]", "phase", "gain", "limited by")
     table = make_table(f"{arm.name}, model-based design", "", *columns)
-    for name, fact, joint in zip(arm.joint_names, design.facts, design.joints, strict=True):
+    for name, properties, joint in zip(arm.joint_names, design.properties, design.joints, strict=True):
         table.add_row(
             name,
-            "{:.3g}..{:.3g}".format(*fact.inertia),
+            "{:.3g}..{:.3g}".format(*properties.inertia),
             f"{joint.frequency:.1f}",
             "..".join(f"{np.degrees(margins.phase):.0f}" for margins in joint.margins),
             "..".join(f"{margins.gain:.1f}" for margins in joint.margins),
@@ -125,7 +125,8 @@ def _print_joints(console: Console, comparison: Comparison) -> None:
     print_note(
         console,
         "Settling time [s] of the slowest pose, into a band of 2 % of the step, but at least one encoder count. "
-        f"n/{poses}: not settled within {DURATION - REST:g} s at n poses. Overshoot, steady-state error and ripple "
+        f"n/{poses}: not settled within {DURATION - REST_TIME:g} s at n poses. Overshoot, steady-state error and "
+        "ripple "
         "(peak-to-peak effort at rest / effort limit): largest values over all poses, arm as modelled.",
     )
     for j, joint in enumerate(arm.joint_names):

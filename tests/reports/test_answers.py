@@ -20,7 +20,7 @@ from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import RandomPoses, Study, Variation
 from dvrk_drake.experiments.study.table import Row
 from dvrk_drake.experiments.transparency import OperatorForces
-from dvrk_drake.experiments.tuning.model_based import ArmDesign, JointDesign, JointFacts
+from dvrk_drake.experiments.tuning.model_based import ArmDesign, JointDesign, JointProperties
 from dvrk_drake.experiments.tuning.procedure import JointProcedure, Ultimate
 from dvrk_drake.experiments.tuning.sampled_loop import Margins
 from dvrk_drake.experiments.tuning.tuning import CONDITIONS, OWN, PUBLISHED, Comparison, StepMeasures, Tuning
@@ -134,9 +134,9 @@ def tuned(console, verbose):
     }
     compared = Comparison(arm, dict.fromkeys(names, arm.gains), CONDITIONS, q, measures, {})
     procedure = JointProcedure(1.2, 0.3, 0.5, Ultimate(1234.5, 0.123, 1.01, False), 1.0, False, 1.234e-3)
-    facts = JointFacts((1.23e-4, 4.56e-3), 0.1, 0.1, 1.0, 1e-4, 1e-3, 3.0)
+    properties = JointProperties((1.23e-4, 4.56e-3), 0.1, 0.1, 1.0, 1e-4, 1e-3, 3.0)
     design = JointDesign(1.2, 0.3, 0.5, 123.4, (Margins(0.7, 100.0, 2.3),) * 2, "phase margin")
-    found = Tuning(arm, (procedure,) * n, ArmDesign(arm.gains, (facts,) * n, (design,) * n), compared)
+    found = Tuning(arm, (procedure,) * n, ArmDesign(arm.gains, (properties,) * n, (design,) * n), compared)
     tuning.print_tuning(console, found, verbose=verbose)
 
 

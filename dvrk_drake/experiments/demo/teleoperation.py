@@ -27,7 +27,7 @@ SCALE = 0.4
 START_MASTER = np.array([0.0, 0.25, -0.1, 0.0, 1.2, 0.0, 0.0])
 START_FOLLOWER = np.array([0.0, 0.0, 0.13, 0.0, 0.0, 0.0, 0.5])
 #: Positions of the bases [m], with equal orientation. The arms face each other, with handle and tip side by side.
-PLACES = {"mtml": (0.0, 0.45, 0.05), "psm": (0.0, -0.22, 0.0)}
+BASE_POSITIONS = {"mtml": (0.0, 0.45, 0.05), "psm": (0.0, -0.22, 0.0)}
 CAMERA, TARGET, ZOOM = (1.7, 0.45, 0.5), (0.0, -0.12, 0.08), 2.6
 #: Intervals of the simulated motion in which the clutch is closed [s].
 ENGAGED = ((0.5, 9.7), (11.2, 16.0))
@@ -148,7 +148,7 @@ def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
 def start_scene(port: int | None = None) -> Meshcat:
     """Starts a Meshcat with the camera on both arms and frames for them; uses a free port unless one is given."""
     meshcat = start_meshcat(port=port, camera=CAMERA, target=TARGET, zoom=ZOOM)
-    for name, p_WB in PLACES.items():
+    for name, p_WB in BASE_POSITIONS.items():
         meshcat.SetTransform(name, RigidTransform(np.array(p_WB)))
     return meshcat
 

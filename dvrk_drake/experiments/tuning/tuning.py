@@ -30,7 +30,7 @@ from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.models.arm_schema import Gains
 
 #: Duration of a step test [s], and its final part in which the joints should be at rest [s].
-DURATION, REST = 2.0, 0.4
+DURATION, REST_TIME = 2.0, 0.4
 CONDITIONS = (
     NOMINAL,
     Condition("G +20 %", gravity=1.2),
@@ -49,10 +49,10 @@ class StepMeasures:
 
     Attributes:
         settling: Time (n,) after which the joint stays inside its `band` [s]; infinite if it leaves the band during
-            the last `REST`.
+            the last `REST_TIME`.
         overshoot: Maximum distance (n,) beyond the goal, as a share of the step; 0 if the joint does not reach it.
-        steady_error: Mean distance (n,) from the goal over the last `REST` [rad, m].
-        oscillation: Peak-to-peak commanded effort (n,) over the last `REST`, as a share of the effort limit.
+        steady_error: Mean distance (n,) from the goal over the last `REST_TIME` [rad, m].
+        oscillation: Peak-to-peak commanded effort (n,) over the last `REST_TIME`, as a share of the effort limit.
     """
 
     settling: NDArray[np.float64]
@@ -110,9 +110,9 @@ def measure_step(arm: Arm, response: Response) -> StepMeasures:
     outside = np.abs(error) > band(arm)
     last_outside = np.where(outside.any(axis=0), len(t) - 1 - np.argmax(outside[::-1], axis=0), -1)
     settling = np.append(t, np.inf)[last_outside + 1]
-    late = t > t[-1] - REST
+    late = t > t[-1] - REST_TIME
     return StepMeasures(
-        settling=np.where(settling > t[-1] - REST, np.inf, settling),
+        settling=np.where(settling > t[-1] - REST_TIME, np.inf, settling),
         overshoot=np.maximum(np.max(-error / way, axis=0), 0.0),
         steady_error=np.abs(error[late]).mean(axis=0),
         oscillation=np.ptp(response.effort[late], axis=0) / arm.effort_limits,

@@ -29,7 +29,7 @@ def plot_study(path: Path, study: Study, rows: Mapping[int, Row]) -> None:
         squeeze=False,
     )
     for ax, measure in zip(axes.flat, study.measures, strict=False):
-        if measure.is_answer:
+        if measure.is_boolean:
             _draw_shares(ax, measure, summaries)
         else:
             _draw_distribution(ax, measure, study, rows)
@@ -43,7 +43,7 @@ def _draw_shares(ax: plt.Axes, measure: Measure, summaries: list[Summary]) -> No
     for i, summary in enumerate(summaries):
         share = summary.measures[measure.column]
         assert isinstance(share, Share)
-        y, low, high = (100 * value for value in (share.yes / share.runs, share.lower, share.upper))
+        y, low, high = (100 * value for value in (share.count / share.runs, share.lower, share.upper))
         error = [[max(0.0, y - low)], [max(0.0, high - y)]]
         ax.errorbar(i, y, error, fmt="o", capsize=6, color=COLOURS[i % len(COLOURS)])
     ax.set_xticks(range(len(summaries)), [summary.variation for summary in summaries], fontsize=8)
@@ -55,8 +55,8 @@ def _draw_shares(ax: plt.Axes, measure: Measure, summaries: list[Summary]) -> No
 def _draw_distribution(ax: plt.Axes, measure: Measure, study: Study, rows: Mapping[int, Row]) -> None:
     smallest = np.inf
     for i, variation in enumerate(study.variations):
-        of_it = [rows[c.index] for c in study.cases if c.variation == variation.name and c.index in rows]
-        values = np.sort(values_of(measure, of_it))
+        variation_rows = [rows[c.index] for c in study.cases if c.variation == variation.name and c.index in rows]
+        values = np.sort(values_of(measure, variation_rows))
         share = 100 * np.arange(1, len(values) + 1) / max(len(values), 1)
         finite = np.isfinite(values)
         colour = COLOURS[i % len(COLOURS)]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dvrk_drake.dynamics.friction_compensation import MAX_HYSTERESIS_RATIO
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.reproduction import published
-from dvrk_drake.experiments.reproduction.drift_experiment import APPROACH, BAND, RESTING, SAMPLE_PERIOD, Drifts
+from dvrk_drake.experiments.reproduction.drift_experiment import APPROACH, BAND, SAMPLE_PERIOD, SETTLING_TIME, Drifts
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.reproduction.session import ReproductionSession
 from dvrk_drake.experiments.tuning.model_based import friction
@@ -121,7 +121,7 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         mtm.file,
         poses[: sample_sizes.hand_guided_releases],
         "Fig. 5: leading and releasing ours",
-        led=True,
+        with_approach=True,
     )
     kept = session.release(
         PAPER_ARM,
@@ -129,7 +129,7 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         mtm.file,
         poses[: sample_sizes.hand_guided_releases],
         "Fig. 5: leading and releasing, hysteresis compensated",
-        led=True,
+        with_approach=True,
         hysteresis_ratio=MAX_HYSTERESIS_RATIO,
     )
     frictionless = [name for name in EFFECT_NAMES if name != "friction"]
@@ -143,7 +143,7 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
             f"Fig. 5: no friction, {what}",
             frictionless,
             damped,
-            longest=LOOSE_DURATION,
+            max_duration=LOOSE_DURATION,
         )
 
     loose_paper = loose(session.paper_file, few, "the paper's")
@@ -171,7 +171,8 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         "by more than friction holds, as it does in Fig. 4, since unweighted least squares had other joints to "
         "please and the model no spring. What differs from the published drifts: the real trials began wherever a "
         "hand had put the arm, with hysteresis in its cables, and the friction here is that of another MTM.",
-        f"**Led there**, from {APPROACH[0]:g} rad beside and held for {RESTING:g} s, the arm is let go with friction "
+        f"**Led there**, from {APPROACH[0]:g} rad beside and held for {SETTLING_TIME:g} s, the arm is let go with "
+        f"friction "
         f"that the way has loaded. Then ours holds every joint at {share(led.num_held, len(led.positions))} only; "
         f"the joints that leave are {_any_lost(led)}. Gravity compensation cannot know how friction is loaded: "
         "hysteresis with a travel of 0.06-0.25 rad pushes joints 2 and 3 back and leaves less friction for what the "
@@ -193,9 +194,9 @@ def reproduce_figure_6(session: ReproductionSession) -> Section:
     """Joints 5-7 without torque, as the paper tried against their drift."""
     mtm, sample_sizes = session.mtm, session.sample_sizes
     few = session.random_poses(PAPER_ARM, sample_sizes.paper_releases)
-    zeroed = session.zeroed(session.paper_file)
+    zeroed = session.without_wrist_torque(session.paper_file)
     paper = session.release(PAPER_ARM, mtm.truth, zeroed, few, "Fig. 6: releasing the paper's")
-    ours = session.release(PAPER_ARM, mtm.truth, session.zeroed(mtm.file), few, "Fig. 6: releasing ours")
+    ours = session.release(PAPER_ARM, mtm.truth, session.without_wrist_torque(mtm.file), few, "Fig. 6: releasing ours")
     figures = _plots(
         session.folder, "fig6", "joints 5-7 zeroed", ours, paper, published.FIGURE_6, published.FIGURE_6_MEANS
     )

@@ -16,11 +16,11 @@ from dvrk_drake.experiments.reproduction.step_response import (
     LINK_INERTIA,
     OUR_DURATION,
     PERIOD,
+    longest_period,
+    oscillation_modes,
     paper_simulated_arm,
     simulate_ours,
     simulate_paper_controller,
-    slowest_swing,
-    swings,
 )
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.reports.figures.style import save_figure
@@ -44,7 +44,16 @@ def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION)
     progress(1.0)
     _plot(folder / _FILE, faulty, ours)
     rows = (
-        ("published, read off", "-", f"{published.FIGURE_7_READ['J2 at 59 s']:.3f}", "-", "-", "-", "0.0220", "0.0155"),
+        (
+            "published, read off",
+            "-",
+            f"{published.FIGURE_7_VALUES['J2 at 59 s']:.3f}",
+            "-",
+            "-",
+            "-",
+            "0.0220",
+            "0.0155",
+        ),
         ("the paper's controller, as it was", *numbers(_late(faulty), "{:.4f}")),
         ("the same with velocities in all damping terms", *numbers(_late(damped), "{:.4f}")),
         (
@@ -52,13 +61,13 @@ def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION)
             *numbers(_late(ours, from_time=min(3.0, duration / 2)), "{:.1e}"),
         ),
     )
-    with_fault, without = (swings(theirs_arm, fault)[0].real.max() for fault in (True, False))
+    with_fault, without = (oscillation_modes(theirs_arm, fault)[0].real.max() for fault in (True, False))
     remarks = (
         "From J5 +3.13, J3 -0.79, J2 -0.22 rad to zero, gains and masses as published, 100 Hz. The paper's node fed "
         "the positions of joints 5-7 into their damping terms: a second stiffness, and no damping at all. We give "
         f"each link {LINK_INERTIA:g} kg m^2 as the paper's PSM file does; that this is so for its MTM follows from "
-        f"the period of its J2, {published.FIGURE_7_READ['J2 period']:.0f} s as published and "
-        f"{slowest_swing(theirs_arm):.0f} s here. About zero the least damped swing, joint 7's, decays by "
+        f"the period of its J2, {published.FIGURE_7_VALUES['J2 period']:.0f} s as published and "
+        f"{longest_period(theirs_arm):.0f} s here. About zero the least damped swing, joint 7's, decays by "
         f"{max(0.0, -with_fault):.3f} /s with the fault and can only grow under an integral; with velocities in all "
         f"damping terms it decays by {-without:.3f} /s or more. Joints 6 and 7 start at their published amplitudes "
         "here: the rest of the start lies in a plane and never moves them.",

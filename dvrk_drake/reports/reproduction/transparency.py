@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dvrk_drake.dynamics.friction_compensation import MAX_RATIO
-from dvrk_drake.experiments.reproduction.session import Lead, ReproductionSession, led
+from dvrk_drake.experiments.reproduction.session import OperatorCase, ReproductionSession, simulate_case
 from dvrk_drake.experiments.transparency import OperatorForces
 from dvrk_drake.reports.figures.transparency import plot_transparency
 from dvrk_drake.reports.reproduction.page import ResultTable, Section
@@ -21,11 +21,11 @@ def reproduce_transparency(session: ReproductionSession) -> Section:
         ("ours", mtm.file, 0.0),
         (f"ours, friction {MAX_RATIO:g}", mtm.file, MAX_RATIO),
     ]
-    leads = [Lead(name, mtm.truth.arm, str(model or ""), ratio, poses, seed) for name, model, ratio in rows]
+    cases = [OperatorCase(name, mtm.truth.arm, str(model or ""), ratio, poses, seed) for name, model, ratio in rows]
     forces = []
-    for one in session.executor.map(led, leads):
+    for one in session.executor.map(simulate_case, cases):
         forces.append(one)
-        session.progress("a hand leads the MTM", len(forces) / len(leads))
+        session.progress("a hand cases the MTM", len(forces) / len(cases))
     plot_transparency(session.folder / "transparency.png", mtm.truth.arm, forces)
     table = ResultTable(
         "transparency",

@@ -9,7 +9,7 @@ from rich.console import Console
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.experiments.demo import demo
-from dvrk_drake.experiments.ground_truth import perturbed_links, visiting_trajectory
+from dvrk_drake.experiments.ground_truth import perturbed_links, pose_visit_trajectory
 from dvrk_drake.models.arm import load_arm
 from dvrk_drake.recordings.recording import read_recording
 from dvrk_drake.reports.demo import print_demo
@@ -101,7 +101,7 @@ def test_perturbed_links_are_consistent_and_differ():
 def test_trajectory_rests_at_poses_inside_limits():
     arm = load_arm("mtml")
     poses = arm.sample_poses(6, np.random.default_rng(0), margin=0.02)
-    trajectory, settled = visiting_trajectory(arm, poses)
+    trajectory, settled = pose_visit_trajectory(arm, poses)
     for t, pose in zip(settled, poses, strict=True):
         np.testing.assert_allclose(trajectory.value(t).ravel(), pose, atol=1e-12)
         np.testing.assert_allclose(trajectory.EvalDerivative(t).ravel(), 0, atol=1e-12)

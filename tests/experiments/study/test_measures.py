@@ -105,9 +105,9 @@ def test_failed_run_has_worst_value(kind):
     scenario, simulation = stepped(0.4 * np.clip(T / 2, 0, 1))
     measure = Measure(kind)
     measure.check(scenario)
-    assert measure.is_answer == isinstance(measure(scenario, simulation), bool)
+    assert measure.is_boolean == isinstance(measure(scenario, simulation), bool)
     worst = measure.worst
-    assert worst is {"held": False, "ran_away": True}[kind] if measure.is_answer else worst == math.inf
+    assert worst is {"held": False, "ran_away": True}[kind] if measure.is_boolean else worst == math.inf
 
 
 @pytest.mark.parametrize(

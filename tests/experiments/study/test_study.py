@@ -252,10 +252,10 @@ def test_wilson_interval_counts_failed_runs_as_worst(tmp_path):
     assert exact.failed == wrong.failed > 0  # the same seeds
     held = exact.measures["held"]
     assert isinstance(held, Share)
-    assert held.yes > wrong.measures["held"].yes > 0
+    assert held.count > wrong.measures["held"].count > 0
     # Wilson: the bounds are the shares p that are 1.96 standard errors away from the observed share.
     for p in (held.lower, held.upper):
-        assert abs(held.yes / 120 - p) == pytest.approx(norm.ppf(0.975) * math.sqrt(p * (1 - p) / 120))
+        assert abs(held.count / 120 - p) == pytest.approx(norm.ppf(0.975) * math.sqrt(p * (1 - p) / 120))
     drift = exact.measures["drift"]
     assert isinstance(drift, Quantiles)
     values = sorted(rows[c.index].values.get("drift", math.inf) for c in study.cases if c.variation == "exact")
