@@ -152,7 +152,7 @@ def forces(console, verbose):
 def demonstrated(console, verbose):
     identified, validation = poses()
     t, q = np.arange(3.0), np.zeros((3, 7))
-    drift = {"identified": np.full(7, 0.0123), "as drawn": np.full(7, 1.234)}
+    drift = {"identified": np.full(7, 0.0123), "nominal": np.full(7, 1.234)}
     result = DemoResult(
         identified.model.arm, identified, validation, validation, t, q, q, drift, t, q, np.full(7, 1.2e-4)
     )

@@ -134,7 +134,7 @@ class Condition:
     ticks: int = 0
 
 
-NOMINAL = Condition("modelled")
+NOMINAL = Condition("nominal")
 
 
 @dataclass(frozen=True, eq=False)

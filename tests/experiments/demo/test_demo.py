@@ -73,7 +73,7 @@ def test_demo_identifies_simulated_springs(result):
 
 def test_demo_drifts_less_than_nominal_and_stops(result):
     _, outcome, _ = result
-    assert outcome.drift["identified"].max() < 0.3 * outcome.drift["as drawn"].max()
+    assert outcome.drift["identified"].max() < 0.3 * outcome.drift["nominal"].max()
     assert outcome.step_error.max() < 1e-3
 
 
