@@ -49,7 +49,7 @@ def record(
     recorder = Recorder(recorded, output, url, load_key(key))
     line = LiveLine(sys.stderr)
     stopped = stop_on_signals()
-    print(f"recording {recorded.name} on LCM {url}; end with Ctrl-C", flush=True)
+    print(f"recording {recorded.name} on LCM {url}; Ctrl-C ends the recording", flush=True)
     try:
         recorder.run(float("inf") if duration is None else duration, stopped, line.show)
     finally:
@@ -101,7 +101,7 @@ def _add_random_poses(name: str, path: str, count: int, seed: int) -> None:
     from dvrk_drake.recordings.pose_file import load_poses_if_any, save_poses
 
     if count < 1:
-        raise CollectionError(f"--random must be 1 pose or more; got {count}")
+        raise CollectionError(f"--random must be 1 or larger; got {count}")
     arm = load_arm(name)
     poses = load_poses_if_any(path, arm)
     # Near a joint limit the guard adds a restoring effort, and there is no room to approach a pose from both sides.
@@ -125,8 +125,8 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
     teacher = Teacher(controller, poses, at_rest=at_rest, requested=EnterKey(sys.stdin), report=_reporter(line))
-    when = "Enter, or a second's rest, takes" if at_rest else "Enter takes"
-    print(f"the weight of {controller.arm.name} is carried: move it by hand; {when} a pose, Ctrl-C ends", flush=True)
+    event = "Enter or one second of rest" if at_rest else "Enter"
+    print(f"{controller.arm.name} compensates gravity; move it by hand; {event} adds a pose, Ctrl-C ends", flush=True)
     try:
         control(
             link(),
@@ -138,7 +138,7 @@ def _teach(controlled: ControlledArm, poses: str, at_rest: bool) -> None:
     finally:
         teacher.close()
         line.clear()
-    print_written(poses, f"{len(teacher.poses)} poses; {controller.arm.name} holds by itself")
+    print_written(poses, f"{len(teacher.poses)} poses; the guard of {controller.arm.name} regulates the pose")
 
 
 def _visit(
@@ -158,14 +158,14 @@ def _visit(
     output = CollectionFile(output_file, arm, both_sides)
     num_done = output.finished(poses).sum()
     if num_done == len(poses):
-        print(f"{output_file}: has all {len(poses)} poses already")
+        print(f"{output_file}: contains all {len(poses)} poses already")
         return
     with interrupt_ends_process():
         controller, link, _ = ready_controller(controlled, "hold")
         stopped = stop_on_signals()
     line = LiveLine(sys.stderr)
     collector = Collector(poses, controller, output, settings, stopped=stopped, report=_reporter(line))
-    print(f"{len(poses) - num_done} poses of {arm.name} to visit; Ctrl-C stops, the same command goes on", flush=True)
+    print(f"{len(poses) - num_done} poses of {arm.name} remain; after Ctrl-C, the same command continues", flush=True)
     try:
         control(
             link(),
@@ -184,7 +184,7 @@ def _visit(
         raise KeyboardInterrupt
     if collector.unsettled:
         numbers = ", ".join(map(str, collector.unsettled))
-        raise CollectionError(f"poses left out: {numbers}; the arm did not come to rest there. Run again to try again")
+        raise CollectionError(f"the arm did not come to rest at poses {numbers}. Run the command again to repeat them")
 
 
 def _reporter(line: LiveLine) -> Callable[[str], None]:

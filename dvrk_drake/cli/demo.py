@@ -67,8 +67,8 @@ def teleop(
     if output is None:
         meshcat = start_scene(port)
         print(
-            f"MTML leads PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale under Open Controls; the "
-            "arms appear after some seconds; end with Stop, Escape or Ctrl-C",
+            f"MTML controls PSM at {meshcat.web_url()}; hand, clutch (Space), jaw and scale are under Open Controls; "
+            "the arms appear after some seconds; Stop, Escape or Ctrl-C ends",
             flush=True,
         )
         run_live_teleoperation(meshcat)
@@ -109,7 +109,7 @@ def reproduce(
     quiet_drake()
     recordings = PaperRecordings.find(data)
     if what == "fig4":
-        _ = recordings.poses  # reject missing recordings before creating a folder
+        _ = recordings.poses  # rejects a missing recording before the folder is created
     output = new_folder(folder, overwrite=overwrite)
     names = NAMES if what == "all" else (what,)
     with Steps(*names) as steps:

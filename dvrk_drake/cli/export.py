@@ -19,7 +19,7 @@ _SOURCE = one_of("Source (one is required)")
 _GRAVITY_COMPENSATION = Group("Options of --dvrk-gc (--gc-tolerance: also of --dvrk-kinematic-gc)")
 SourceArm = Annotated[Arm | None, Parameter(group=_SOURCE, help="Use the nominal model of this arm, from its SDF.")]
 SourceModel = Annotated[Model | None, Parameter(group=_SOURCE)]
-OfEachJoint = Annotated[
+PerJoint = Annotated[
     tuple[float, float, float, float, float, float, float] | None,
     Parameter(metavar="J1 .. J7", group=_GRAVITY_COMPENSATION),
 ]
@@ -39,10 +39,10 @@ def export(
     verbose: Verbose = False,
     gc_tolerance: Annotated[float | None, Parameter(metavar="NM", group=_GRAVITY_COMPENSATION)] = None,
     friction: Annotated[bool, Parameter(show_default=False, group=_GRAVITY_COMPENSATION)] = False,
-    coulomb: OfEachJoint = None,
-    friction_ratio: OfEachJoint = None,
-    dead_band: OfEachJoint = None,
-    saturation: OfEachJoint = None,
+    coulomb: PerJoint = None,
+    friction_ratio: PerJoint = None,
+    dead_band: PerJoint = None,
+    saturation: PerJoint = None,
 ) -> None:
     """Export a model as SDF, URDF or gravity-compensation file of the dVRK.
 
@@ -67,15 +67,15 @@ def export(
     from dvrk_drake.reports.export import print_export
     from dvrk_drake.reports.terminal_tables import make_console
 
-    named: dict[Format, str | None] = {
+    requested: dict[Format, str | None] = {
         "sdf": sdf,
         "urdf": urdf,
         "dvrk-gc": dvrk_gc,
         "dvrk-kinematic-gc": dvrk_kinematic_gc,
     }
-    outputs = {format: path for format, path in named.items() if path is not None}
+    outputs = {format: path for format, path in requested.items() if path is not None}
     if not outputs and not diff:
-        raise DvrkDrakeError(f"no output is given; use {', '.join('--' + format for format in named)} or --diff")
+        raise DvrkDrakeError(f"no output is given; use {', '.join('--' + format for format in requested)} or --diff")
     if friction and coulomb is not None:
         raise DvrkDrakeError("--friction and --coulomb exclude each other; give one of them")
     loaded = load_model(model, arm)
@@ -150,7 +150,9 @@ def compare_gc(
     if folder is not None:
         from dvrk_drake.reports.figures.export import plot_compensation
 
-        plot_compensation(folder / "compensation.png", comparison, f"{file} and {origin} over the joint box, at rest")
+        plot_compensation(
+            folder / "compensation.png", comparison, f"Static torque of {file} and {origin} over the joint range"
+        )
         print_written(folder)
     if json is not None:
         print_written(json)

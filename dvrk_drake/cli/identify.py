@@ -133,10 +133,12 @@ def validate(
         if save:
             check_output(model, recording, overwrite=True)
             if read.sha256 and read.sha256 == loaded.provenance.sha256:
-                raise ModelError(f"{read.source}: --save needs a recording that the model was not identified from")
+                raise ModelError(
+                    f"{read.source}: the model was identified from this recording; --save requires another one"
+                )
             if loaded.validation is not None and not overwrite:
                 saved = loaded.validation.recording
-                raise ModelError(f"{model}: has verdicts from {saved} already; replace them with --overwrite")
+                raise ModelError(f"{model}: contains verdicts from {saved}; use --overwrite to replace them")
         validation = dvrk.validate(loaded, read, low_speed_segments=low_speed_segments, progress=steps)
     # Save before printing: the reader of the output may close the pipe (head).
     if save:
@@ -253,15 +255,15 @@ def payload(
         raise ModelError("--gravity needs --arm; with --model, the gravity of the model is used")
     if json is not None:
         check_output(json, reference, loaded, overwrite=overwrite)
-    known = None if model is None else dvrk.IdentifiedModel.load(model)
-    recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity) if known is None else known.arm
-    with Steps(*_STEPS, *(["identifying"] if known is None else []), "estimating") as steps:
-        without, with_it = (
-            dvrk.read_recording(p, recorded_arm, coordinates, progress=steps) for p in (reference, loaded)
+    identified = None if model is None else dvrk.IdentifiedModel.load(model)
+    recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity) if identified is None else identified.arm
+    with Steps(*_STEPS, *(["identifying"] if identified is None else []), "estimating") as steps:
+        without_payload, with_payload = (
+            dvrk.read_recording(path, recorded_arm, coordinates, progress=steps) for path in (reference, loaded)
         )
-        for recording in (without, with_it):
+        for recording in (without_payload, with_payload):
             print_notes(recording.source, recording.notes)
-        result = dvrk.payload(without, with_it, known or recorded_arm, link, progress=steps)
+        result = dvrk.payload(without_payload, with_payload, identified or recorded_arm, link, progress=steps)
     if json is not None:
         write_json(json, result.as_dicts())
     console = make_console()

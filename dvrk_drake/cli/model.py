@@ -82,17 +82,17 @@ def view(
 
     quiet_drake()
     if lcm_url and not live:
-        raise DvrkDrakeError("--lcm-url needs --live")
+        raise DvrkDrakeError("--lcm-url requires --live")
     shown = load_arm(arm)
     url = open_lcm(lcm_url).get_lcm_url() if live else ""
     meshcat = start_meshcat(shown, port=port)
     arm_view = ArmView(shown, meshcat)
-    ending = "end with Stop, Escape or Ctrl-C"
+    ending = "Stop, Escape or Ctrl-C ends"
     if live:
         link = ArmLink(shown, url, replays=True)
         print(f"{shown.name} live at {meshcat.web_url()}; {ending}", flush=True)
         until_stopped(meshcat, lambda: show_status(arm_view, link))
         return
     arm_view.add_sliders()
-    print(f"{shown.name} at {meshcat.web_url()}; sliders under Open Controls; {ending}", flush=True)
+    print(f"{shown.name} at {meshcat.web_url()}; the sliders are under Open Controls; {ending}", flush=True)
     until_stopped(meshcat, arm_view.follow_sliders)

@@ -55,7 +55,7 @@ def check(
         if plot_report(folder, report, checked, recorded_arm):
             print_written(folder)
         else:
-            print_notes(recording, ["no plots: spectra need a motion with efforts at a known rate"])
+            print_notes(recording, ["no plots were written; spectra require a motion with efforts and time stamps"])
     for refusal in report.refusals[1:]:
         print(f"dvrk-drake: {refusal}", file=sys.stderr)
     if report.refusals:

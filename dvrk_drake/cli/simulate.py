@@ -49,7 +49,7 @@ def simulate(
 
     quiet_drake()
     if scenario in known_arms():
-        raise ScenarioError(f"{scenario} is an arm, not a scenario; name it with --arm {scenario}")
+        raise ScenarioError(f"{scenario} is an arm, not a scenario; use --arm {scenario}")
     source = arm or scenario or ""
     loaded = dvrk.load_scenario(source, set or [])
     folder = plots_folder(plots, overwrite=overwrite)
@@ -60,10 +60,10 @@ def simulate(
         print(f"{loaded.mounted_arm.name} at {page.web_url()}", flush=True)
     with Steps("simulating") as steps:
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
-    named = (scenario or f"--arm {arm}") if folder is None else None
+    argument = (scenario or f"--arm {arm}") if folder is None else None
     if output is not None:
         dvrk.write_recording(simulation.recording, output)
-    print_simulation(make_console(), simulation, loaded.mounted_arm, scenario=named, verbose=verbose)
+    print_simulation(make_console(), simulation, loaded.mounted_arm, scenario=argument, verbose=verbose)
     if output is not None:
         print_written(output, f"{len(simulation.recording)} rows")
     if folder is not None:
@@ -72,13 +72,13 @@ def simulate(
         plot_simulation(folder / "positions.png", simulation, loaded)
         print_written(folder)
     if page is not None:
-        print("the page can play the motion again; end with Stop, Escape or Ctrl-C", flush=True)
+        print("the page can replay the motion; Stop, Escape or Ctrl-C ends", flush=True)
         until_stopped(page)
 
 
 def _check_workers(_: object, value: int | None) -> None:
     if value is not None and not 1 <= value <= 1024:
-        raise ValueError("must be a number of processes, 1..1024")
+        raise ValueError("must be a number of processes from 1 to 1024")
 
 
 @app.command(group=SIMULATE)
@@ -220,14 +220,15 @@ def transparency(
     from dvrk_drake.reports.transparency import print_transparency, write_transparency
 
     quiet_drake()
-    led = load_arm(arm)
-    effects = led.effects.only(simulated_effects or ["all"])
-    followed = random_path(led)
+    moved_arm = load_arm(arm)
+    effects = moved_arm.effects.only(simulated_effects or ["all"])
+    followed = random_path(moved_arm)
     if path is not None:
-        followed = recorded_path(led, read_recording(path, led, coordinates), 1.0 if speed is None else speed)
+        motion = read_recording(path, moved_arm, coordinates)
+        followed = recorded_path(moved_arm, motion, 1.0 if speed is None else speed)
     elif speed is not None:
-        raise ScenarioError("--speed is that of a recorded motion; name one with --path")
-    compensations = _compensations(led, model or [], friction_ratio)
+        raise ScenarioError("--speed requires --path with a recorded motion")
+    compensations = _compensations(moved_arm, model or [], friction_ratio)
     if output is not None:
         if not output.endswith(".csv"):
             raise ScenarioError(f"{output}: --output must end in .csv; figures are written to --plots FOLDER")
@@ -239,17 +240,19 @@ def transparency(
         for name, compensation in zip(names, compensations, strict=True):
             progress = step_progress(steps, name)
             forces.append(
-                simulate_operator(led, followed, compensation, effects=effects, frame_name=frame, progress=progress)
+                simulate_operator(
+                    moved_arm, followed, compensation, effects=effects, frame_name=frame, progress=progress
+                )
             )
     if output is not None:
         write_transparency(Path(output), forces)
-    print_transparency(make_console(), led, forces, verbose=verbose)
+    print_transparency(make_console(), moved_arm, forces, verbose=verbose)
     if output is not None:
         print_written(output)
     if folder is not None:
         from dvrk_drake.reports.figures.transparency import plot_transparency
 
-        plot_transparency(folder / "transparency.png", led, forces)
+        plot_transparency(folder / "transparency.png", moved_arm, forces)
         print_written(folder)
 
 
@@ -268,9 +271,9 @@ def _compensations(arm: dvrk.Arm, paths: list[str], friction_ratio: float) -> li
     for path in paths:
         name = Path(path).stem
         if name in models:
-            raise ModelError(f"--model {path}: another model is named {name} too; rename one file")
+            raise ModelError(f"--model {path}: two models have the file name {name}; rename one of the files")
         if "=" in path and not Path(path).is_file():
-            raise ModelError(f"--model {path}: no such file; give a file alone, a model is named by its file")
+            raise ModelError(f"--model {path}: no such file; give only the path of the model file")
         models[name] = dvrk.IdentifiedModel.load(path, arm)
     if not models:
         models["SDF"] = dvrk.IdentifiedModel.from_arm(arm)

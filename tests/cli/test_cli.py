@@ -201,7 +201,7 @@ def test_an_existing_file_is_kept_without_overwrite(command, tmp_path, monkeypat
     error = fails(capsys, *command.split(), "mine.csv")
     assert error.startswith("dvrk-drake: error: mine.csv: exists already")
     if not command.startswith(KEEP_ALWAYS):
-        assert error.endswith("name another file, or replace it with --overwrite")
+        assert error.endswith("choose another file, or replace it with --overwrite")
     if "none" in command:
         assert "none" in fails(capsys, *command.split(), "mine.csv", "--overwrite")
     assert mine.read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
@@ -226,7 +226,7 @@ def test_a_folder_with_files_is_kept_without_overwrite(command, tmp_path, monkey
     (tmp_path / "full").mkdir()
     (tmp_path / "full/mine.txt").write_text("mine")
     error = fails(capsys, *command.split(), "full")
-    assert error.endswith("full: holds files already; name another folder, or write into it with --overwrite")
+    assert error.endswith("full: folder is not empty; choose another folder, or write into it with --overwrite")
     if "none" in command:
         assert "none" in fails(capsys, *command.split(), "full", "--overwrite")
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "mine.txt"]
@@ -256,7 +256,7 @@ def test_commands_print_what_they_wrote(command, written, folder, tmp_path, monk
 def test_validate_keeps_a_folder_with_files(folder, capsys):
     validate = ["validate", f"{folder}/other.csv", "--model", f"{folder}/model.yaml", "--plots", f"{folder}/plots"]
     before = {path: path.read_bytes() for path in (folder / "plots").iterdir()}
-    assert "holds files already" in fails(capsys, *validate)
+    assert "folder is not empty" in fails(capsys, *validate)
     assert {path: path.read_bytes() for path in (folder / "plots").iterdir()} == before
     assert main([*validate, "--overwrite"]) == 0
     assert f"wrote {folder}/plots\n" in capsys.readouterr().out
@@ -418,7 +418,7 @@ def test_two_outputs_of_one_name_are_refused(folder, tmp_path, monkeypatch, caps
     export = ["export", "--model", f"{folder}/model.yaml", "--sdf", "o.sdf", "--urdf"]
     identify = ["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", "o", "--plots", "o"]
     for command in ([*export, "./o.sdf"], identify):
-        assert "is named for two outputs" in fails(capsys, *command)
+        assert "is given for two outputs" in fails(capsys, *command)
     assert not list(tmp_path.iterdir())
 
 

@@ -60,9 +60,9 @@ def test_the_command_stops_goes_on_and_says_so(simulated, tmp_path, capsys):
 
     simulated.stopped, simulated.off_at = lambda sticky: False, None
     assert main(command) == 0
-    assert "1 poses of MTML to visit" in capsys.readouterr().out
+    assert "1 poses of MTML remain" in capsys.readouterr().out
     assert main(command) == 0
-    assert f"{output}: has all 2 poses already" in capsys.readouterr().out
+    assert f"{output}: contains all 2 poses already" in capsys.readouterr().out
     assert len(simulated.arms) == 3  # the arm was not asked again
     np.testing.assert_allclose(read_recording(output).q, near_poses(2), atol=2e-3)
 

@@ -87,7 +87,7 @@ def test_invalid_settings_give_one_line_error(change, message, study, capsys):
 def test_rejects_invalid_files_and_outputs(study, tmp_path, capsys):
     assert "no such file" in study_refusal(capsys, tmp_path / "other.yaml")
     assert "--set duration: a setting must be key=value" in study_refusal(capsys, study, "--set", "duration")
-    assert "cannot be made a folder" in study_refusal(capsys, study, "--plots", str(study))
+    assert "the folder cannot be created" in study_refusal(capsys, study, "--plots", str(study))
     (tmp_path / "folder.csv").mkdir()
     for output, message in (
         (tmp_path / "none" / "r.csv", "cannot be written: "),
