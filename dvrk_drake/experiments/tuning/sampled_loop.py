@@ -109,7 +109,7 @@ class SampledLoop:
         return bool(np.max(np.abs(np.linalg.eigvals(self.closed_loop(gains)))) < 1.0)
 
     def least_damped_mode(self, gains: Gains) -> tuple[float, NDArray[np.float64]]:
-        """Returns the growth factor of the least damped mode per period, and the shares (n,) of the joints in its energy.
+        """Returns the growth factor of the least damped mode per period, and the joints' shares (n,) of its energy.
 
         The energy is the kinetic energy without the coupling terms of the mass matrix.
         """

@@ -164,7 +164,9 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         session.folder, "fig5", "all torques on", ours, paper, published.FIGURE_5, published.FIGURE_5_MEANS
     )
     tables = (
-        drift_table("fig5", "all torques on", published.FIGURE_5, published.FIGURE_5_MEANS, paper, ours, approached, compensated),
+        drift_table(
+            "fig5", "all torques on", published.FIGURE_5, published.FIGURE_5_MEANS, paper, ours, approached, compensated
+        ),
         torque_table(session),
         rate_table(without_friction),
     )
@@ -182,7 +184,8 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         "and the friction here was identified on another MTM.",
         f"**Hand-guided**: the arm is moved to the pose from a distance of {APPROACH[0]:g} rad and regulated for "
         f"{SETTLING_TIME:g} s, which loads its friction. Then ours keeps all joints at "
-        f"{share(approached.num_held, len(approached.positions))} of the poses. Releases that fail, by joint: {_any_lost(approached)}. "
+        f"{share(approached.num_held, len(approached.positions))} of the poses. "
+        f"Releases that fail, by joint: {_any_lost(approached)}. "
         "Gravity compensation does not include the state of friction. Hysteresis with a width of 0.06-0.25 rad pushes "
         "joints 2 and 3 back, and less friction remains to resist the model error. The friction of joint 7 deflects by "
         "15 mrad before it slips. An exact model has the same drift. The published drifts of joints 2 and 3, up to "
