@@ -1,4 +1,4 @@
-"""Reproduction of the paper: published numbers against its data, ours against known solutions, and errors."""
+"""Reproduction of the paper: published numbers, simulations with known solutions, pages, and errors."""
 
 import csv
 import dataclasses
@@ -75,7 +75,7 @@ def test_paper_torque_matches_its_regressor(parameters):
 
 
 @pytest.mark.slow
-def test_paper_model_in_base_parameters_and_zeroed():
+def test_paper_model_and_zero_torque_of_joints():
     q = ARM.sample_poses(30, np.random.default_rng(3))
     model = paper_model(ARM)
     np.testing.assert_allclose(model.holding_torque(q), paper_torque(ARM, q), atol=1e-12)
@@ -102,7 +102,7 @@ def test_published_means_match_data(shared_data):
     with open(shared_data / "mtm_static/paper_fig5_fig6_drift_trials.csv") as stream:
         rows = list(csv.reader(stream))[1:]
     final = {row[0]: np.array(row[1:7], float) for row in rows}
-    # Values read off plots and rounded.
+    # The values are digitised from plots and rounded.
     np.testing.assert_allclose(published.FIGURE_5[:5], final["Errors8_FullTorques"][:5], atol=6e-4)
     np.testing.assert_allclose(published.FIGURE_6, final["Errors1"], atol=6e-4)
     full = [abs(values) for name, values in final.items() if "Full" in name]
@@ -163,17 +163,17 @@ def test_page_links_its_tables_and_figures(tmp_path):
         assert list(csv.reader(stream)) == [["", "J1"], ["ours", "1"], ["theirs", "a, b"]]
 
 
-def test_table_1_alone_is_a_page(no_recordings, tmp_path):
+def test_page_with_table_1_only(no_recordings, tmp_path):
     page = write_page(tmp_path, [reproduce_table_1()], [])
     assert "L3 = 0.3645 | 0.3645" in page.read_text()
     assert (tmp_path / "table1.csv").stat().st_size > 0
 
 
 def test_finished_figures_are_written_if_others_fail(no_recordings, monkeypatch, tmp_path):
-    def fails(session):
+    def fail(session):
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(run._MAKERS, "fig7", fails)
+    monkeypatch.setitem(run._MAKERS, "fig7", fail)
     with pytest.raises(KeyboardInterrupt):
         run.reproduce(["table1", "fig7"], tmp_path, PaperRecordings(None))
     page = (tmp_path / "index.md").read_text()
@@ -191,7 +191,7 @@ def test_shares_have_wilson_interval():
 
 def test_joint_is_held_if_it_never_leaves_band():
     positions = np.zeros((3, 5, 7))
-    positions[0, 2, 4] = 0.0151  # there and back
+    positions[0, 2, 4] = 0.0151  # moves out of the band and back
     positions[1, -1, 4] = -0.0149
     positions[2] += 1.0  # at rest at another pose
     drifts = Drifts(ARM, positions)
@@ -233,17 +233,17 @@ def test_ground_truth_arm_matches_its_model(truth):
     q = ARM.sample_poses(20, np.random.default_rng(7))
     effects = truth.model.holding_torque(q) - IdentifiedModel.from_arm(truth.arm).holding_torque(q)
     assert np.abs(effects[:, 3]).max() > 0.01  # cables
-    drawn = IdentifiedModel.from_arm(ARM).holding_torque(q)
-    assert np.abs(truth.model.holding_torque(q) - effects - drawn).max() > 0.02  # differs from the nominal model
+    nominal = IdentifiedModel.from_arm(ARM).holding_torque(q)
+    assert np.abs(truth.model.holding_torque(q) - effects - nominal).max() > 0.02  # differs from the nominal model
 
 
 def test_positions_in_damping_term_leave_joint_undamped(tmp_path):
     arm = paper_simulated_arm(ARM, tmp_path / "paper.sdf")
-    (faulty, shapes), (right, _) = oscillation_modes(arm, faulty=True), oscillation_modes(arm, faulty=False)
+    (faulty, shapes), (correct, _) = oscillation_modes(arm, faulty=True), oscillation_modes(arm, faulty=False)
     undamped = np.flatnonzero(np.abs(faulty.real) < 1e-9)
     assert len(undamped) == 1
     assert np.argmax(np.abs(shapes[:, undamped[0]])) == 6  # only joint 7
-    assert right.real.max() < -0.01
+    assert correct.real.max() < -0.01
     # Link inertias of 1 kg m^2 reproduce the published period of J2, within the accuracy of a digitised plot.
     assert longest_period(arm) == pytest.approx(published.FIGURE_7_VALUES["J2 period"], rel=0.25)
 
@@ -280,15 +280,15 @@ def test_hysteresis_compensation_holds_arm_after_approach(tmp_path):
     start = ARM.sample_poses(1, np.random.default_rng(10), margin=0.2)[0]
     case = Release(PAPER_ARM, arm, ("friction",), str(exact), start, with_approach=True, duration=1.5, seed=10)
     with ThreadPoolExecutor(1) as executor:
-        gone, kept = (
+        uncompensated, compensated = (
             Drifts(arm, positions[None]).largest[0]
             for positions in release_all([case, dataclasses.replace(case, hysteresis_ratio=0.9)], executor)
         )
-    assert np.all(gone[1:3] > 0.04) and np.all(kept < BAND[0])
+    assert np.all(uncompensated[1:3] > 0.04) and np.all(compensated < BAND[0])
 
 
 def exact_session(truth, folder, executor, sample_sizes):
-    """Session with an MTM that was identified without error."""
+    """Returns a session with an exactly identified MTM."""
     file = folder / "exact.yaml"
     truth.model.save(file)
     q = ARM.sample_poses(20, np.random.default_rng(9))

@@ -76,7 +76,7 @@ def single(kp, kd, ki=0.0):
 
 
 def analytic_ultimate(M, b, lag):
-    """Returns K and the period for which M s^2 + b s + K exp(-s lag) = 0 has the root s = j w."""
+    """Returns the gain K and the period for which M s^2 + b s + K exp(-s lag) = 0 has the root s = j w."""
     w = brentq(lambda w: np.tan(w * lag) * M * w - b, 1e-6, 0.499 * np.pi / lag)
     return M * w**2 / np.cos(w * lag), 2 * np.pi / w
 
@@ -138,7 +138,7 @@ def test_sticking_or_creeping_is_no_oscillation():
 
 
 def poles(loop, gains, sampling):
-    """Returns the closed-loop poles in s [rad/s], least damped first; those of a delay are at -infinity."""
+    """Returns the closed-loop poles in s [rad/s], least damped first. Poles of a delay are at -infinity."""
     z = np.linalg.eigvals(loop.closed_loop(gains)).astype(complex)
     with np.errstate(divide="ignore", invalid="ignore"):
         s = np.log(z) / sampling.period
@@ -161,7 +161,7 @@ def test_pole_placement_gives_desired_damping(ratio, ticks, viscous):
 
 
 def test_pole_placement_without_lags_is_inaccurate():
-    # Shows that the test above can fail: the textbook gains kp = M w^2, kd = 2 z M w exceed its tolerance.
+    # The previous test can fail: the gains kp = M w^2, kd = 2 z M w, which ignore the lags, exceed its tolerance.
     sampling, M, z = Sampling(ticks=3), 0.2, 0.8
     slowest = poles(SampledLoop(M, sampling), single(M * FAR_BELOW**2, 2 * z * M * FAR_BELOW), sampling)
     polynomial = np.real(np.poly(slowest[np.abs(slowest) > 1e-6][:2]))
@@ -176,8 +176,8 @@ def test_margins_match_stability_limits():
     for factor, stable in ((0.99 * margins.gain, True), (1.01 * margins.gain, False)):
         assert SampledLoop(M, sampling).is_stable(single(factor * kp, factor * kd, factor * ki)) == stable
     # A delay T changes the phase by w T, so the phase margin corresponds to a time.
-    spare = margins.phase / margins.crossover / sampling.period
-    for ticks, stable in ((int(spare), True), (int(spare) + 1, False)):
+    delay_margin = margins.phase / margins.crossover / sampling.period
+    for ticks, stable in ((int(delay_margin), True), (int(delay_margin) + 1, False)):
         delayed = Sampling(sampling.period, sampling.ticks + ticks, sampling.cut_off)
         assert SampledLoop(M, delayed).is_stable(single(kp, kd, ki)) == stable
 
@@ -233,7 +233,7 @@ def test_design_keeps_margins_and_reports_limitation():
     assert design.limited_by == "phase margin"
     assert min(margins.phase for margins in design.margins) == pytest.approx(PHASE_MARGIN, abs=0.02)
     assert min(margins.gain for margins in design.margins) > GAIN_MARGIN
-    # The integrator moves a sticking joint after a quarter of a second, unless Ki is at its upper bound.
+    # The integral term moves a sticking joint within 0.25 s, unless Ki is at its upper bound.
     assert design.ki <= (0.1 + 0.2 * 0.5) / (1e-3 * 0.25) + 1e-9
     coarse_encoder = dataclasses.replace(joint, count=1e-3, dry_friction=0.0)
     design = design_joint(coarse_encoder, sampling)
@@ -324,7 +324,7 @@ def test_scenario_reads_gains_file(tmp_path):
     assert load_scenario(str(scenario)).controller.gains == gains
 
 
-def test_holding_uses_gains_of_file(tmp_path):
+def test_mode_hold_uses_gains_of_file(tmp_path):
     arm, error = load_arm("mtml"), 0.01
     n, sender_commands = arm.num_joints, []
     status = lcmt_dvrk_status()
@@ -344,7 +344,7 @@ def test_holding_uses_gains_of_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("kp: [1]\nkd: [1]\n", "ki is missing"),
         (
@@ -359,37 +359,37 @@ def test_holding_uses_gains_of_file(tmp_path):
         ("- 1\n", "must be keys and values, not .*; allowed in a file of gains: kp, kd, ki"),
     ],
 )
-def test_rejects_invalid_gains_files(tmp_path, text, said):
+def test_rejects_invalid_gains_files(tmp_path, text, message):
     path = tmp_path / "gains.yaml"
     path.write_text(text)
-    with pytest.raises(ControllerError, match=said):
+    with pytest.raises(ControllerError, match=message):
         load_gains(path)
 
 
-def refused(capsys, *arguments):
+def error_line(capsys, *arguments):
     """Returns the single line that the command prints before it exits with code 2."""
     assert main(arguments) == 2
     return refusal(capsys.readouterr().err)
 
 
 def test_commands_reject_invalid_options(tmp_path, capsys):
-    assert 'unknown arm "mtm"' in refused(capsys, "tune", "--arm", "mtm")
-    assert 'Invalid value "guess" for --method' in refused(capsys, "tune", "--arm", "psm", "--method", "guess")
-    assert "its folder does not exist" in refused(
+    assert 'unknown arm "mtm"' in error_line(capsys, "tune", "--arm", "mtm")
+    assert 'Invalid value "guess" for --method' in error_line(capsys, "tune", "--arm", "psm", "--method", "guess")
+    assert "its folder does not exist" in error_line(
         capsys, "tune", "--arm", "psm", "--output", str(tmp_path / "no" / "g")
     )
-    assert "no such file" in refused(capsys, "simulate", "--arm", "mtml", "--set", "controller.gains=none.yaml")
+    assert "no such file" in error_line(capsys, "simulate", "--arm", "mtml", "--set", "controller.gains=none.yaml")
     few = tmp_path / "few.yaml"
     save_gains(Gains([1.0], [1.0], [1.0]), few, "of one joint")
-    assert "gains.kp has 1 number; allowed: 7" in refused(
+    assert "gains.kp has 1 number; allowed: 7" in error_line(
         capsys, "simulate", "--arm", "mtml", "--set", f"controller.gains={few}"
     )
-    assert "for --mode hold" in refused(capsys, "run", "--arm", "mtml", "--gains", str(few))
+    assert "for --mode hold" in error_line(capsys, "run", "--arm", "mtml", "--gains", str(few))
 
 
 @pytest.mark.slow
 def test_psm_insertion_ultimate_gain_matches_analytic():
-    """Simulates viscous friction and delay only. Drake's time stepping adds no lag to that of the ticks."""
+    """Simulates viscous friction and delay only. Drake's time stepping adds no delay."""
     b, arm = 2.0, load_arm("psm")
     effects = ArmEffects(
         friction=[DriveEffect("actuator.insertion", "viscous", coefficient=b)], delay=DelayEffect(measurement=1)
@@ -413,7 +413,7 @@ def test_designed_gains_settle_all_psm_joints(tmp_path, monkeypatch):
     assert tuning.found == {"model": tuning.design.gains}
     console = Console(record=True, width=120, file=io.StringIO())
     print_tuning(console, tuning, verbose=True)
-    said = console.export_text()
-    assert all(name in said for name in (*tuning.arm.joint_names, "the arm's own", "[s]", "[kg m^2; kg]"))
+    printed = console.export_text()
+    assert all(name in printed for name in (*tuning.arm.joint_names, "the arm's own", "[s]", "[kg m^2; kg]"))
     plot_steps(tmp_path / "steps.png", tuning.comparison)
     assert (tmp_path / "steps.png").stat().st_size > 10_000

@@ -17,7 +17,7 @@ T = np.arange(0, 20.001, 0.01)
 
 
 def state(q):
-    """Returns the true state; the recordings deviate from it by 10 mrad, which must not affect the measures."""
+    """Returns the true state. The recordings deviate from it by 10 mrad, which must not affect the measures."""
     return np.hstack([q, 0 * q])
 
 
