@@ -119,9 +119,9 @@ def teleoperate(path, seconds):
         for port, value in inputs.items():
             law.GetInputPort(port).FixValue(context, value)
         context.get_mutable_discrete_state().SetFrom(law.EvalUniquePeriodicDiscreteUpdate(context))
-        wanted = law.GetOutputPort("desired_state").Eval(context)
-        if now > 2.0 and np.all(np.isfinite(wanted)):
-            desired = wanted.copy()
+        follower_desired = law.GetOutputPort("desired_state").Eval(context)
+        if now > 2.0 and np.all(np.isfinite(follower_desired)):
+            desired = follower_desired.copy()
         follower.step()
         return interference(follower.guard)
 

@@ -50,7 +50,7 @@ CONDITIONS = {"alone": 0, "two busy processes": 2}
 #: Minimum and maximum time for which efforts act before the kill [s].
 ACTING = (0.3, 0.6)
 #: Maximum number of watchdog holds before the kill.
-MAX_TAKEOVERS = 50
+MAX_EARLY_HOLDS = 50
 EFFORT = describe_state(lcmt_dvrk_status.STATE_EFFORT)
 HOLD = describe_state(lcmt_dvrk_status.STATE_HOLD)
 
@@ -131,7 +131,7 @@ def measure(name: str, kills: int, busy: int, realtime: bool) -> tuple[list[floa
     forkserver = multiprocessing.get_context("forkserver")
     times: list[float] = []
     reasons: list[str] = []
-    before = 0
+    early_holds = 0
     with contextlib.ExitStack() as stack:
         process = stack.enter_context(started(__file__, "--run-arm", "--arm", name, *options, stdout=subprocess.PIPE))
         arm = Arm(process.stdout)  # type: ignore[arg-type]
@@ -142,23 +142,23 @@ def measure(name: str, kills: int, busy: int, realtime: bool) -> tuple[list[floa
             controller.start()
             acts = arm.until(EFFORT, 60.0, controller)
             if acts is None or arm.until(HOLD, random.uniform(*ACTING)):
-                before += 1
+                early_holds += 1
                 print("The watchdog held the arm before the kill. Repeating.", file=sys.stderr, flush=True)
                 controller.kill()
                 controller.join()
-                if process.poll() is not None or before > MAX_TAKEOVERS:
+                if process.poll() is not None or early_holds > MAX_EARLY_HOLDS:
                     raise SystemExit("The controller's efforts do not act for long enough. Stop other programs.")
                 continue
-            killed = time.monotonic_ns()
+            kill_time = time.monotonic_ns()
             controller.kill()
             held = arm.until(HOLD, 10.0)
             controller.join()
             if held is None:
                 raise SystemExit("The arm did not hold within 10 s.")
-            times.append(1e-9 * (held[0] - killed))
+            times.append(1e-9 * (held[0] - kill_time))
             reasons.append(held[1])
             print(f"kill {len(times)}: {1e3 * times[-1]:.1f} ms, {held[1]}", file=sys.stderr, flush=True)
-    return times, reasons, before
+    return times, reasons, early_holds
 
 
 def main() -> None:
@@ -179,10 +179,10 @@ def main() -> None:
     print("|---|---|---|---|---|---|")
     for condition, busy in CONDITIONS.items():
         if options.condition in (None, condition):
-            times, reasons, before = measure(options.arm, options.kills, busy, options.realtime)
+            times, reasons, early_holds = measure(options.arm, options.kills, busy, options.realtime)
             p50, by_wall = sorted(times)[len(times) // 2], sum("wall clock" in reason for reason in reasons)
             print(
-                f"| {condition:20} | {len(times)} | {1e3 * p50:.1f} | {1e3 * max(times):.1f} | {by_wall} | {before} |",
+                f"| {condition:20} | {len(times)} | {1e3 * p50:.1f} | {1e3 * max(times):.1f} | {by_wall} | {early_holds} |",
                 flush=True,
             )
 

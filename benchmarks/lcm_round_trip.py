@@ -60,24 +60,24 @@ class Times:
     """Times at which statuses were sent, and at which their first answers were received [s]."""
 
     def __init__(self) -> None:
-        self.out: list[float] = []
-        self.back: dict[int, float] = {}
+        self.sent: list[float] = []
+        self.answered: dict[int, float] = {}
 
     def start_trip(self) -> None:
         """Stores the current time. Call this before publishing, since publishing may let another process run first."""
-        self.out.append(time.monotonic())
+        self.sent.append(time.monotonic())
 
-    def received(self, data: bytes, first: int) -> lcmt_dvrk_command:
+    def store_answer(self, data: bytes, first: int) -> lcmt_dvrk_command:
         """Decodes a command and stores the time if it answers the last status. `first` is the first sequence number."""
         now, command = time.monotonic(), lcmt_dvrk_command.decode(data)
-        if command.sequence == first + len(self.out) - 1:
-            self.back.setdefault(len(self.out) - 1, now)
+        if command.sequence == first + len(self.sent) - 1:
+            self.answered.setdefault(len(self.sent) - 1, now)
         return command
 
     def trips(self, begin: int) -> np.ndarray:
         """Returns the round-trip times [s] from status number `begin` on, NaN for a status without an answer."""
         # The answer to the last status may not have arrived yet.
-        return np.array([self.back.get(k, np.nan) - out for k, out in enumerate(self.out)][begin:-1])
+        return np.array([self.answered.get(k, np.nan) - sent for k, sent in enumerate(self.sent)][begin:-1])
 
 
 class StandingArm:
@@ -111,14 +111,14 @@ class StandingArm:
             pace.wait()
             while handle_message(network, 0.0):
                 pass
-            self.status.sequence = len(self.times.out)
+            self.status.sequence = len(self.times.sent)
             self.status.utime = begin + 1000 * self.status.sequence
             self.times.start_trip()
             network.publish(status_channel(ARM), self.status.encode())
 
     def receive(self, channel: str, data: bytes) -> None:
         """Receives a command; the next statuses report it as the accepted command."""
-        command = self.times.received(data, first=0)
+        command = self.times.store_answer(data, first=0)
         self.sender_id = command.sender_id
         self.status.command_sender_id, self.status.command_sequence = command.sender_id, command.sequence
         self.status.command_utime, self.status.guard_state = command.utime, lcmt_dvrk_status.STATE_EFFORT
@@ -134,11 +134,11 @@ class TimedSimulatedArm(SimulatedArm):
     @property
     def acts(self) -> bool:
         """Returns whether commands act. The echo sends no efforts, so for the echo any answer is enough."""
-        return self.guard.state == lcmt_dvrk_status.STATE_EFFORT or bool(self.times.back)
+        return self.guard.state == lcmt_dvrk_status.STATE_EFFORT or bool(self.times.answered)
 
     def receive(self, channel: str, data: bytes) -> None:
         """Stores the time, then receives a command."""
-        self.times.received(data, first=1)
+        self.times.store_answer(data, first=1)
         super().receive(channel, data)
 
     def send(self, network: lcm.LCM) -> None:
@@ -231,8 +231,8 @@ def run_arm(peer: list[str], simulated: bool, condition: str, seconds: float, re
 
     def stopped() -> bool:
         if not begins and arm.acts:
-            begins.append(len(times.out) + 2000)
-        return bool(begins) and len(times.out) > begins[0] + 1000 * seconds
+            begins.append(len(times.sent) + 2000)
+        return bool(begins) and len(times.sent) > begins[0] + 1000 * seconds
 
     cores = os.sched_getaffinity(0)
     with contextlib.ExitStack() as stack:

@@ -49,10 +49,10 @@ def main() -> None:
     """Checks that the variables take effect, then runs the command."""
     variables = other_kernels()
     used = used_kernels(variables)
-    left = next(line for line in used if line.startswith("numpy:")).split()
+    remaining = next(line for line in used if line.startswith("numpy:")).split()
     disabled = variables["NPY_DISABLE_CPU_FEATURES"].split()
-    wanted = {f"Core: {variables['OPENBLAS_CORETYPE']}", f"numba: {variables['NUMBA_CPU_NAME']}"}
-    if not wanted <= set(used) or set(disabled) & set(left):
+    expected = {f"Core: {variables['OPENBLAS_CORETYPE']}", f"numba: {variables['NUMBA_CPU_NAME']}"}
+    if not expected <= set(used) or set(disabled) & set(remaining):
         sys.exit(f"other_kernels.py: the variables {variables} have no effect; in use: {'; '.join(used)}")
     print("kernels:", "; ".join(used), flush=True)
     os.execvpe(sys.argv[1], sys.argv[1:], os.environ | variables)

@@ -123,10 +123,10 @@ def fused(material: str, *solids: cad.Shape) -> Body:
         ValueError: The CAD kernel lost a solid. It does so silently if faces almost coincide. Move them apart.
     """
     union = solids[0].fuse(*solids[1:])
-    bounds, wanted = union.bounding_box(), cad.Compound(children=list(solids)).bounding_box()
-    if (bounds.min - wanted.min).length > 1e-3 or (bounds.max - wanted.max).length > 1e-3:
+    bounds, expected = union.bounding_box(), cad.Compound(children=list(solids)).bounding_box()
+    if (bounds.min - expected.min).length > 1e-3 or (bounds.max - expected.max).length > 1e-3:
         raise ValueError(
-            f"The union lost a solid: its bounding box is {bounds} instead of {wanted}. Move the faces apart."
+            f"The union lost a solid: its bounding box is {bounds} instead of {expected}. Move the faces apart."
         )
     return [(material, union)]
 
