@@ -181,10 +181,8 @@ def main() -> None:
         if options.condition in (None, condition):
             times, reasons, early_holds = measure(options.arm, options.kills, busy, options.realtime)
             p50, by_wall = sorted(times)[len(times) // 2], sum("wall clock" in reason for reason in reasons)
-            print(
-                f"| {condition:20} | {len(times)} | {1e3 * p50:.1f} | {1e3 * max(times):.1f} | {by_wall} | {early_holds} |",
-                flush=True,
-            )
+            cells = (f"{condition:20}", len(times), f"{1e3 * p50:.1f}", f"{1e3 * max(times):.1f}", by_wall, early_holds)
+            print(f"| {' | '.join(map(str, cells))} |", flush=True)
 
 
 if __name__ == "__main__":

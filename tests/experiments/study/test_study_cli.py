@@ -90,7 +90,7 @@ def test_rejects_invalid_files_and_outputs(study, tmp_path, capsys):
     assert "the folder cannot be created" in study_refusal(capsys, study, "--plots", str(study))
     (tmp_path / "folder.csv").mkdir()
     for output, message in (
-        (tmp_path / "none" / "r.csv", "cannot be written: "),
+        (tmp_path / "none" / "r.csv", "cannot be written"),
         (tmp_path / "folder.csv", "is not a regular file"),
         (tmp_path / "r.txt", "must end in .csv or .parquet"),
     ):
