@@ -36,10 +36,10 @@ class SampleSizes:
 
     Attributes:
         collected: Number of poses for the identification of an arm.
-        releases: Number of random release poses with our model.
-        paper_releases: Number of these poses for the paper's parameters.
-        hand_guided_releases: Number of these poses for our model with a previous approach.
-        psm_releases: Number of release poses of the PSM.
+        releases: Number of random release poses for our model.
+        paper_releases: Number of the first of these poses that are used for the paper's parameters.
+        hand_guided_releases: Number of the first of these poses that are used for our model after an approach.
+        psm_releases: Number of random release poses of the PSM.
         path_poses: Number of poses on the path of an operator.
         duration: Duration of a release [s].
     """

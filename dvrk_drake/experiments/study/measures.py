@@ -104,7 +104,7 @@ class Measure:
             displacement=(poses[-1] - poses[-2])[columns] if len(poses) > 1 else np.zeros(len(columns)),
             goal=reference[-1, columns],
         )
-        return KINDS[self.kind].of(run, self._band, self._time)
+        return KINDS[self.kind].compute(run, self._band, self._time)
 
     @property
     def _band(self) -> float:
@@ -193,14 +193,14 @@ class Kind(NamedTuple):
     """Kind of a measure.
 
     Attributes:
-        of: Function that computes the measure from a run, band and time.
+        compute: Function that computes the measure from a run, band and time.
         unit: Unit of the value, "" for shares and boolean measures.
         band: Default tolerance band [rad, m]; None if the kind has no band.
         time: Default duration [s]; None if the kind has no duration.
         worst: Value for a run that failed.
     """
 
-    of: Callable[[_Run, float, float], float | bool]
+    compute: Callable[[_Run, float, float], float | bool]
     unit: str
     band: float | None
     time: float | None
