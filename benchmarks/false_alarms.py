@@ -49,7 +49,7 @@ USES = {
 MAX_HOLDING_SHARE = 0.7
 
 
-def interference(guard):
+def alarm(guard):
     """Returns the reason of a fault or of a watchdog hold; "" for neither."""
     return guard.fault_text or guard.hold_reason
 
@@ -73,7 +73,7 @@ def step(arm, seconds, check=lambda: "", until=lambda: False):
     while arm.ticks * PERIOD < seconds and not until():
         arm.step()
         acted |= arm.guard.state in (lcmt_dvrk_status.STATE_EFFORT, lcmt_dvrk_status.STATE_POSITION)
-        if problem := interference(arm.guard) or check():
+        if problem := alarm(arm.guard) or check():
             return arm.ticks * PERIOD, problem
     idle = arm.controller is not None and not acted
     return arm.ticks * PERIOD, "no effort or position command was accepted" if idle else ""
@@ -123,7 +123,7 @@ def teleoperate(path, seconds):
         if now > 2.0 and np.all(np.isfinite(follower_desired)):
             desired = follower_desired.copy()
         follower.step()
-        return interference(follower.guard)
+        return alarm(follower.guard)
 
     return step(master, seconds, step_follower)
 

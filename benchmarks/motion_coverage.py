@@ -39,7 +39,7 @@ def main() -> int:
     print("coverage of the 95 % intervals, number of intervals, RMS error / standard error:")
     for name in ("mtmr", "psm"):
         arm = load_arm(name)
-        z, share, of_effects = map(
+        z, share, z_effects = map(
             np.concatenate,
             zip(*(errors(arm, seed, options.noise, options.spread) for seed in range(options.arms)), strict=True),
         )
@@ -47,7 +47,7 @@ def main() -> int:
         for lower, upper in zip((0.0, 0.1, 0.5), (0.1, 0.5, np.inf), strict=True):
             which = (share >= lower) & (share < upper)
             report(f"    standard error {lower:g} to {upper:g} times that of the prior", z[which])
-        report(f"{arm.name}, effects", of_effects)
+        report(f"{arm.name}, effects", z_effects)
     return 0
 
 
@@ -75,16 +75,16 @@ def errors(arm: Arm, seed: int, noise: float, spread: float) -> tuple[np.ndarray
     selection = problem.selection()
     selection.fit(chosen)
     fit = problem.consistent(chosen, selection.weights)
-    left = residuals(problem, chosen, fit)
+    residual = residuals(problem, chosen, fit)
     cut_off = grid.settings.effort_cut_off
-    covariance = parameter_covariance(problem, fit, left, grid.rate, cut_off, period)
+    covariance = parameter_covariance(problem, fit, residual, grid.rate, cut_off, period)
     p = problem.num_rigid
     B = derive_base_parameters(problem.regressor).combination[:, :p]
     B = B[np.any(B, axis=1)]
-    spread = np.sqrt(np.diag(B @ covariance[:p, :p] @ B.T))
-    before = np.sqrt(np.diag(B @ np.diag(problem.deviation**2) @ B.T))
-    z = B @ (fit.x[:p] - truth.parameters[:p]) / spread
-    return z, spread / before, (fit.x[p:] - truth.coefficients) / np.sqrt(np.diag(covariance))[p:]
+    standard_error = np.sqrt(np.diag(B @ covariance[:p, :p] @ B.T))
+    prior_error = np.sqrt(np.diag(B @ np.diag(problem.deviation**2) @ B.T))
+    z = B @ (fit.x[:p] - truth.parameters[:p]) / standard_error
+    return z, standard_error / prior_error, (fit.x[p:] - truth.coefficients) / np.sqrt(np.diag(covariance))[p:]
 
 
 if __name__ == "__main__":

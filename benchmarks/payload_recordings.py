@@ -110,8 +110,8 @@ def _print_seconds(model: IdentifiedModel, whole: Recording) -> None:
     for seconds in SECONDS:
         assert whole.t is not None
         result = refit_friction(model, _rows(whole, slice(0, int(np.searchsorted(whole.t, seconds)))))
-        left = [a.name for a in result.actuators if not a.kept]
-        print(f"{seconds:5.1f} s   {percent(result.model)}   not refitted: {', '.join(left) or 'none'}")
+        not_refitted = [a.name for a in result.actuators if not a.kept]
+        print(f"{seconds:5.1f} s   {percent(result.model)}   not refitted: {', '.join(not_refitted) or 'none'}")
 
 
 def _print_phases(model: IdentifiedModel, whole: Recording) -> None:
