@@ -108,7 +108,7 @@ def predict(model: IdentifiedModel, recording: Recording, *, progress: Progress 
     if model.dynamics is None or not find_poses(measured, arm).moves:
         step_progress(progress, "predicting")(0.0)
         return Prediction(predict_static(model, recording))
-    report = require_usable(measured, arm, progress, apart_from="no effort" if recording.tau is None else "")
+    report = require_usable(measured, arm, progress, ignored_kind="no effort" if recording.tau is None else "")
     share = step_progress(progress, "predicting")
     share(0.0)
     tau = predict_motion(model, recording)
