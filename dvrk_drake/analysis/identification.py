@@ -88,8 +88,8 @@ def _friction_in_segments(result: StaticIdentification, measured: NDArray[np.boo
     if measured is None or not commanded:
         return ()
     what = (
-        "friction in low-speed segments can look like gravity, also in the ten-fold error; the torque on "
-        f"{', '.join(commanded)} may be worse than zero torque elsewhere"
+        "friction in low-speed segments is not separated from gravity, so the torque of "
+        f"{', '.join(commanded)} may be worse than zero torque at other poses"
     )
-    advice = "validate the model on static poses before it commands an arm"
+    advice = "Cross-validation does not detect this error. Validate the model on static poses before you use it."
     return (Finding("warning", "low-speed segments", result.recording.source or "recording", what, advice),)

@@ -134,8 +134,8 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
     excited = fit.excited
     if not np.any(excited):
         raise RecordingError(
-            f"{recording.source or 'recording'}: no actuator moves both ways for {MIN_SHARE:.0%} of the time at "
-            f"{REST_SPEED[0]:g} rad/s, {REST_SPEED[1]:g} m/s RMS or more; friction shows only in such a motion"
+            f"{recording.source or 'recording'}: no actuator moves in both directions. Each direction requires "
+            f"{100 * MIN_SHARE:.0f} % of the time and an RMS speed of {REST_SPEED[0]:g} rad/s ({REST_SPEED[1]:g} m/s)."
         )
     refuse_opposite_efforts(recording, fit.names, fit.tau, fit.expected)
     before = fit.error(fit.nothing)
@@ -146,14 +146,14 @@ def refit_friction(model: IdentifiedModel, recording: Recording) -> Recalibratio
         after = fit.left_out_error(free)
     if not np.mean(np.minimum(before, after)) < MAX_ERROR:
         raise RecordingError(
-            f"{recording.source or 'recording'}: efforts differ from the model's by {np.mean(before):.0%} on average "
-            f"over the actuators, and by {np.mean(after):.0%} with its friction fitted; {MAX_ERROR:.0%} is "
-            "allowed: is it of this arm, in these coordinates?"
+            f"{recording.source or 'recording'}: the mean relative error of the model is {100 * np.mean(after):.0f} % "
+            f"with fitted friction ({100 * np.mean(before):.0f} % before); at most {100 * MAX_ERROR:.0f} % is allowed. "
+            "Check the arm and the coordinates of the recording."
         )
     x = fit.solve(free, np.ones(len(fit.tau), dtype=bool))
     actuators = []
     for i, name in enumerate(fit.names):
-        reason = "" if free[i] else "gains nothing" if excited[i] else "does not move both ways"
+        reason = "" if free[i] else "error not reduced" if excited[i] else "no motion in both directions"
         actuators.append(
             RecalibratedActuator(
                 name=name,

@@ -122,10 +122,12 @@ class Validation(ABC):
         """
         source = self.recording.source or "recording"
         if self.of_same_recording:
-            raise ModelError(f"{source}: verdicts need a recording that the model was not identified from")
+            raise ModelError(
+                f"{source}: the model was identified from this recording. Validate with another recording."
+            )
         if self.model.validation is not None and not overwrite:
             saved = self.model.validation.recording
-            raise ModelError(f"{path}: has verdicts from {saved} already; replace them with overwrite=True")
+            raise ModelError(f"{path} has verdicts from {saved} already. Replace them with overwrite=True.")
         if not self._is_own_file(path):
             refuse_existing(path, overwrite)
         summary = ValidationSummary(self.recording.source, self.recording.sha256, dict(self.verdicts))

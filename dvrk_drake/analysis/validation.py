@@ -64,16 +64,16 @@ def validate(
         found = _motion(poses.recording.motion(arm), report.source)
     share(1.0)
     if validation.of_same_recording:
-        what = "the model was identified from this recording, so these are errors of the fit"
-        found += (Finding("warning", "same recording", report.source, what, "validate with another one"),)
+        what = "the model was identified from this recording, so the errors are those of the fit"
+        found += (Finding("warning", "same recording", report.source, what, "Validate with another recording."),)
     return replace(validation, warnings=(*report.warnings, *found), note=poses.note)
 
 
 def _motion(motion: str, source: str) -> tuple[Finding, ...]:
     if not motion:
         return ()
-    what = f"the arm moves in this recording ({motion})"
-    advice = "the model is static: it has no inertia and no friction of motion"
+    what = f"the arm moves in this recording ({motion}), but the model is static"
+    advice = "A static model has no inertia and no friction. Validate with poses at rest."
     return (Finding("warning", "motion", source, what, advice),)
 
 

@@ -71,16 +71,19 @@ def unfit(verdicts: Mapping[str, str], required: Requirement) -> list[str]:
 
 
 def unexplained_effort(errors: Mapping[str, float | None]) -> tuple[Finding, ...]:
-    """Returns a warning that names the joints in motion whose efforts the model does not explain.
+    """Returns a warning for the joints whose relative error in motion exceeds `USABLE_RATIO_IN_MOTION`.
 
     Args:
         errors: Relative error of each joint [1]; None if nothing was measured.
     """
-    bad = [f"{name} ({e:.0%})" for name, e in errors.items() if e is not None and e > USABLE_RATIO_IN_MOTION]
+    bad = [f"{name} ({100 * e:.0f} %)" for name, e in errors.items() if e is not None and e > USABLE_RATIO_IN_MOTION]
     if not bad:
         return ()
-    advice = "is a sign, a unit or --coordinates wrong, or is it another arm? Do not use the model for these"
-    return (Finding("warning", "unexplained effort", ", ".join(bad), "most of the effort is not explained", advice),)
+    what = "the model error exceeds half of the effort"
+    advice = (
+        "Do not use the model for these joints. Check the arm, the signs and units of the columns, and --coordinates."
+    )
+    return (Finding("warning", "unexplained effort", ", ".join(bad), what, advice),)
 
 
 def cross_validated_verdicts(model: IdentifiedModel) -> dict[str, Verdict]:

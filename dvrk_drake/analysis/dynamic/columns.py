@@ -69,8 +69,8 @@ def drive_effects(arm: Arm, grid: MotionGrid) -> list[ActuatorEffect]:
     known = arm.identification.known_effects
     if unknown := set(known) - set(distinct_coordinates(arm)):
         raise ArmError(
-            f"{arm.source}: motion.known_effects: unknown coordinate {', '.join(sorted(unknown))}; "
-            f"known: {', '.join(distinct_coordinates(arm))}"
+            f"{arm.source}: motion.known_effects: unknown coordinate {', '.join(sorted(unknown))}. "
+            f"Allowed: {', '.join(distinct_coordinates(arm))}."
         )
     effects, travels = [], arm.identification.presliding_travels
     for name, x, v in _coordinates(arm, grid):
@@ -119,7 +119,7 @@ def _named(
     """Returns the effects that the arm file names `which`."""
     where = f"{arm.source}: motion.known_effects.{coordinate}"
     if which not in NAMED_EFFECTS:
-        raise ArmError(f'{where}: unknown "{which}"; known: {", ".join(NAMED_EFFECTS)}')
+        raise ArmError(f'{where}: unknown effect "{which}". Allowed: {", ".join(NAMED_EFFECTS)}.')
     if which == ASYMMETRIC:
         return [ActuatorEffect(coordinate, "coulomb forward", _rounded(DIRECTION_WIDTH * v.std()))]
     if which == "spring":

@@ -113,14 +113,21 @@ def identify_dynamic(
 
 
 def _refuse_worse_than_zero(recording: Recording, grid: MotionGrid, errors: NDArray[np.float64]) -> None:
-    """Raises IdentificationError if the cross-validated relative error (n,) of a moving actuator exceeds 1."""
+    """Raises IdentificationError if the cross-validated relative error of a moving actuator exceeds 1.
+
+    Args:
+        recording: Recording that the model was identified from, for the message.
+        grid: Resampled motion.
+        errors: Cross-validated relative errors (n,) of the actuators [1].
+    """
     arm = grid.arm
     moves = np.sqrt(np.mean(arm.transmission.velocity(grid.v) ** 2, axis=0)) > arm.per_joint(*REST_SPEED)
     if len(bad := np.flatnonzero(moves & (errors > 1))):
+        joints = ", ".join(f"{arm.joint_names[i]} ({100 * errors[i]:.0f} %)" for i in bad)
         raise IdentificationError(
-            f"{recording.source or 'recording'}: no model: its cross-validated error exceeds the effort itself on "
-            f"{', '.join(f'{arm.joint_names[i]} ({errors[i]:.0%})' for i in bad)}; check the arm, the coordinates, and "
-            "the order, signs and units of the columns (dvrk-drake check)"
+            f"{recording.source or 'recording'}: no model was identified, because the cross-validated error exceeds "
+            f"the effort itself on {joints}. Check the arm, the coordinates, and the order, signs and units of the "
+            "columns (dvrk-drake check)."
         )
 
 

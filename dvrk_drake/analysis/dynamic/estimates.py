@@ -40,7 +40,7 @@ class StrongCorrelation:
     def __str__(self) -> str:
         what = "difference" if self.correlation > 0 else "sum"
         pair = f"{self.first} and {self.second}"
-        return f"{pair}: correlation {self.correlation:+.3f}, only their scaled {what} is well known"
+        return f"{pair}: correlation {self.correlation:+.3f}, only a scaled {what} is identifiable"
 
 
 @dataclass(frozen=True, eq=False)

@@ -190,20 +190,21 @@ def _shift(reference: MotionGrid, other: MotionGrid, period: float | None, recor
     step = round(_STEP * GRID_RATE)
     start = other.t[0] - reference.t[0]
 
-    def apart(shift: int) -> float:
+    def distance(shift: int) -> float:
         """Returns half the mean squared difference between x[i + shift] and y[i]."""
         first, last = max(0, -shift), min(len(y), len(x) - shift)
         if last - first < MIN_OVERLAP * GRID_RATE:
             return np.inf
         return float(np.mean((x[first + shift : last + shift : step] - y[first:last:step]) ** 2)) / 2
 
-    reach = round((MAX_SHIFT if period is None else period / 2) * GRID_RATE)
-    coarse = min(range(-reach, reach + 1, step), key=apart)
-    best = min(range(coarse - step, coarse + step + 1), key=apart)
-    if not apart(best) < SAME_MOTION**2:
+    max_shift = round((MAX_SHIFT if period is None else period / 2) * GRID_RATE)
+    coarse = min(range(-max_shift, max_shift + 1, step), key=distance)
+    best = min(range(coarse - step, coarse + step + 1), key=distance)
+    if not distance(best) < SAME_MOTION**2:
         raise RecordingError(
-            f"{recording.source or 'recording'}: is not the motion of the reference: at the best alignment positions "
-            f"differ by {np.sqrt(apart(best)):.0%} of their standard deviation; at most {SAME_MOTION:.0%} is allowed"
+            f"{recording.source or 'recording'}: the motion differs from the reference. After alignment in time, the "
+            f"positions differ by {100 * np.sqrt(distance(best)):.0f} % of their standard deviation; at most "
+            f"{100 * SAME_MOTION:.0f} % is allowed."
         )
     inner = y[max(0, -best) + 1 : min(len(y), len(x) - best) - 1]
     at = np.arange(max(0, -best) + 1, max(0, -best) + 1 + len(inner)) + best

@@ -162,7 +162,8 @@ def estimate_payload(
     grid = difference.grid
     if np.sqrt(np.mean(difference.tau**2)) < MIN_DIFFERENCE * np.sqrt(np.mean(loaded.measured_effort() ** 2)):
         raise RecordingError(
-            f"{loaded.source or 'recording'}: shows no difference from the reference: they are the same recording"
+            f"{loaded.source or 'recording'}: the efforts equal the efforts of the reference. Use two different "
+            "recordings of the motion."
         )
     Y = regressor.regressor(grid.q, grid.v, grid.vd)
     J_inverse = model.arm.transmission.inverse.matrix
@@ -262,7 +263,7 @@ def check_links(regressor: DynamicRegressor, links: Sequence[str]) -> None:
     """Raises ModelError if a link does not move or does not exist. Called before a model is identified."""
     names = [link.link for link in regressor.links]
     if unknown := [link for link in links if link not in names]:
-        raise ModelError(f'unknown link "{unknown[0]}"; links of {regressor.arm.name} that move: {", ".join(names)}')
+        raise ModelError(f'unknown link "{unknown[0]}". Moving links of {regressor.arm.name}: {", ".join(names)}')
 
 
 def as_good(estimates: Sequence[Payload]) -> list[Payload]:
@@ -282,12 +283,12 @@ def better_link_warnings(payload: Payload, estimates: Sequence[Payload]) -> tupl
         return ()
     first = better[0]
     same = [other.link for other in as_good(estimates)]
-    mass = f", {first.body.mass:.3g} +- {first.mass_error:.2g} kg" if first.found else ""
+    mass = f" ({first.body.mass:.3g} +- {first.mass_error:.2g} kg)" if first.found else ""
     what = (
-        f"does not explain the change best: left-out error {payload.left_out:.1%}, but {first.left_out:.1%} with a "
-        f"payload on {' or '.join(same)}{mass}"
+        f"a payload on {' or '.join(same)}{mass} explains the change better (cross-validated error "
+        f"{100 * first.left_out:.1f} % instead of {100 * payload.left_out:.1f} %)"
     )
-    advice = f"use this result only if the payload is certainly on {payload.link}; else repeat with --link {first.link}"
+    advice = f"Unless the payload is certainly on {payload.link}, run again with --link {first.link}."
     return (Finding("warning", "other link", payload.link, what, advice),)
 
 

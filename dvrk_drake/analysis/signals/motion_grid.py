@@ -169,8 +169,8 @@ def motion_grid(recording: Recording, arm: Arm, settings: SignalSettings, clock:
     rate = (len(recording) - 1) / duration
     if duration < MIN_DURATION or rate < MIN_RATE:
         raise RecordingError(
-            f"{recording.source or 'recording'}: {duration:.1f} s at {rate:.0f} Hz; a dynamic model needs a motion of "
-            f"at least {MIN_DURATION:g} s at {MIN_RATE:g} Hz"
+            f"{recording.source or 'recording'}: the motion has {duration:.1f} s at {rate:.0f} Hz. A dynamic model "
+            f"requires at least {MIN_DURATION:g} s at {MIN_RATE:g} Hz or more."
         )
     t = _even_times(clock, GRID_RATE)
     raw = resample(clock.t, recording.q[clock.rows], t)

@@ -123,8 +123,9 @@ def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
     where = recording.source or "recording"
     if moving.qd is None or not (moving.is_motion and moving.has_increasing_times):
         raise IdentificationError(
-            f"{where}: slow parts need a motion: qd1..qd{arm.num_joints}, and t that increases by less than "
-            f"{MAX_PERIOD} s, over {MIN_ROWS} rows or more"
+            f"{where}: the recording is not a motion, so it has no low-speed segments. Low-speed segments require the "
+            f"columns qd1..qd{arm.num_joints}, times t that increase by less than {MAX_PERIOD} s, and at least "
+            f"{MIN_ROWS} rows."
         )
     moving = _thinned(moving)
     tau, t = moving.measured_effort(), np.asarray(moving.t)
@@ -139,8 +140,8 @@ def low_speed_segments(recording: Recording, arm: Arm) -> LowSpeedSegments:
     ]
     if not parts:
         raise IdentificationError(
-            f"{where}: no joint is slow (below {SLOW_SPEED:.0%} of its speed and {SLOW_ACCELERATION:.0%} of its "
-            "acceleration) anywhere; record poses at rest"
+            f"{where}: the motion has no low-speed segments (below {100 * SLOW_SPEED:.0f} % of the largest speed and "
+            f"{100 * SLOW_ACCELERATION:.0f} % of the largest acceleration of a joint). Record poses at rest."
         )
     measured = np.zeros((len(parts), arm.num_joints), dtype=bool)
     measured[range(len(parts)), [joint for joint, _ in parts]] = True
@@ -213,8 +214,8 @@ def _parts_of(is_slow: NDArray[np.bool_], joint: int, moving: Recording, arm: Ar
 
 #: Note on models that are identified from low-speed segments.
 LOW_SPEED_NOTE = (
-    "low-speed segments are treated as static poses; their torques contain friction, and other joints may move: judge "
-    "the model by its cross-validated errors and by another recording, not by the errors of the fit"
+    "Low-speed segments are treated as static poses. Their torques contain friction, and other joints may move. Use "
+    "the cross-validated errors or another recording to evaluate the model, not the errors of the fit."
 )
 
 
@@ -250,7 +251,7 @@ def find_poses(recording: Recording, arm: Arm, with_low_speed_segments: bool = F
     _check_times(recording, arm)
     rests = static_poses(recording, arm)
     if rests is not None and len(rests) >= MIN_POSES:
-        return Poses(rests, None, f"{len(rests)} poses at which the arm rests are taken; {len(recording)} rows")
+        return Poses(rests, None, f"Static poses found in the motion: {len(rests)}, in {len(recording)} rows.")
     if with_low_speed_segments:
         return Poses(*low_speed_segments(recording, arm), note=LOW_SPEED_NOTE)
     return Poses(recording, None, "", moves=rests is not None and bool(recording.motion(arm)))
@@ -264,6 +265,6 @@ def _check_times(recording: Recording, arm: Arm) -> None:
     if recording.is_motion or recording.motion(arm):
         row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
         raise RecordingError(
-            f"{recording.where(row)}: time t does not increase; rows of a motion must follow in time: sort them, and "
-            "write one clock's times [s]"
+            f"{recording.where(row)}: time t does not increase. Sort the rows by time, and use the times of one clock "
+            "[s]."
         )

@@ -171,13 +171,13 @@ def increasing_times(recording: Recording) -> NDArray[np.float64]:
         RecordingError: There are no times, or they do not increase.
     """
     if recording.t is None:
-        raise RecordingError(f"{recording.source or 'recording'}: has no times; a motion needs a column t [s]")
+        raise RecordingError(f"{recording.source or 'recording'}: the recording has no times. Add a column t [s].")
     back = np.flatnonzero(np.diff(recording.t) <= 0)
     if len(back):
         row = int(back[0]) + 1
         raise RecordingError(
             f"{recording.where(row)}: t = {recording.t[row]:g} s does not increase, after {recording.t[row - 1]:g} s "
-            "in the row before; rows must follow in time"
+            "in the previous row. Sort the rows by time."
         )
     return recording.t
 

@@ -114,8 +114,8 @@ def identify_static(
     if method == "paper":
         if rank < Y.shape[2]:
             raise IdentificationError(
-                f"{recording.source}: {len(recording)} poses determine only {rank} of {Y.shape[2]} base parameters; "
-                "least squares has no unique answer: record more varied poses or use --method robust"
+                f"{recording.source or 'recording'}: {len(recording)} poses determine only {rank} of {Y.shape[2]} base "
+                "parameters, so least squares has no unique solution. Record more varied poses, or use --method robust."
             )
         fit = weighted_fit(Y, tau, measured.astype(float), np.zeros(Y.shape[2]))
         # With unit weights, the covariance is scaled by the residual variance, as in textbooks.
@@ -209,16 +209,16 @@ def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:
 def _check_rest(recording: Recording, arm: Arm) -> None:
     if motion := recording.motion(arm):
         raise IdentificationError(
-            f"{recording.source}: the arm moves ({motion}); static identification needs poses at rest, below "
-            f"{REST_SPEED[0]} rad/s, or the slow parts of a motion (--low-speed-segments)"
+            f"{recording.source or 'recording'}: the arm moves ({motion}). Static identification requires poses at "
+            f"rest (below {REST_SPEED[0]} rad/s) or the low-speed segments of a motion (--low-speed-segments)."
         )
 
 
 def _check_poses(recording: Recording, arm: Arm) -> None:
     if len(recording) < MIN_POSES:
         raise IdentificationError(
-            f"{recording.source}: has {len(recording)} distinct pose{'s' * (len(recording) != 1)}, too few to identify "
-            f"from; at least {MIN_POSES}, better 40 or more that cover the arm's range"
+            f"{recording.source or 'recording'}: {len(recording)} distinct pose{'s' * (len(recording) != 1)} found. "
+            f"Identification requires at least {MIN_POSES}. Record 40 or more poses that cover the range of the arm."
         )
     check_effort_unit(recording, arm)
 

@@ -48,9 +48,9 @@ def test_effects_of_the_arm_file_are_mandatory():
     [
         (
             {"pitch": ["magnet"]},
-            'actuator.pitch: unknown "magnet"; known: spring, cable 1, cable 2, asymmetric friction',
+            'actuator.pitch: unknown effect "magnet". Allowed: spring, cable 1, cable 2, asymmetric friction',
         ),
-        ({"elbow": ["spring"]}, "unknown coordinate actuator.elbow; known: actuator.yaw"),
+        ({"elbow": ["spring"]}, "unknown coordinate actuator.elbow. Allowed: actuator.yaw"),
         ({"insertion": ["cable 1"]}, "cable sine is of an angle, and actuator.insertion slides"),
     ],
 )

@@ -104,9 +104,7 @@ def test_an_arm_without_payload_has_none():
 
 def test_a_recording_against_itself_is_refused():
     model, reference, _ = two_days("psm", "end_link", 0.0, [0.0, 0.0, 0.0], 0)
-    with pytest.raises(
-        RecordingError, match=r"simulated: shows no difference from the reference: .* the same recording"
-    ):
+    with pytest.raises(RecordingError, match=r"simulated: the efforts equal the efforts of the reference"):
         estimate_payload(reference, reference, model, ["end_link"])
 
 
@@ -136,7 +134,7 @@ def assert_end_link_explains(estimates, capsys):
     wrong = [by_link["insertion_link"], by_link["bottom_bar_link"]]
     for payload in wrong:
         (warning,) = map(str, better_link_warnings(payload, estimates))
-        assert f"{payload.link}: does not explain the change best" in warning and "on end_link" in warning
+        assert f"{payload.link}: a payload on" in warning and "on end_link" in warning
         assert "\n" not in warning and "--link end_link" in warning
         assert payload.as_dict(estimates)["better_links"][0] == "end_link"
         print_payload(make_console(), result_of(payload, estimates))
@@ -177,11 +175,11 @@ def test_a_reference_that_begins_later_is_aligned():
 
 def test_refusals():
     model, reference, loaded = two_days("psm", "end_link", 0.2, [0.0, 0.0, 0.4], 0)
-    with pytest.raises(ModelError, match='unknown link "arm"; links of PSM that move: yaw_link, back_crank_link'):
+    with pytest.raises(ModelError, match=r'unknown link "arm"\. Moving links of PSM: yaw_link, back_crank_link'):
         estimate_payload(reference, loaded, model, ["arm"])
     backwards = Recording(loaded.q[::-1], loaded.tau[::-1], -loaded.qd[::-1], loaded.t, source="other.csv")
     with pytest.raises(
-        RecordingError, match=r"other.csv: is not the motion of the reference: .* at most 10% is allowed"
+        RecordingError, match=r"other.csv: the motion differs from the reference. .* at most 10 % is allowed"
     ):
         estimate_payload(reference, backwards, model, ["end_link"])
 
@@ -218,7 +216,7 @@ def test_a_named_link_is_compared_with_all_others(tmp_path, capsys):
     assert main([*command, "insertion_link"]) == 0
     said = capsys.readouterr()
     (warning,) = messages(said.err)
-    assert warning.startswith("dvrk-drake: warning: insertion_link: does not explain the change best")
+    assert warning.startswith("dvrk-drake: warning: insertion_link: a payload on")
     assert "end_link" in warning
     assert "explains the change" in " ".join(said.out.split()) and "below" not in said.out
     assert main([*command, link]) == 0

@@ -94,7 +94,7 @@ def test_times_that_do_not_increase_are_rejected():
             RecordingError, match=r"motion\.csv: row 151: t = 0\.7\d* s does not increase, after 0\.745"
         ):
             increasing_times(replace(recording, t=times))
-    with pytest.raises(RecordingError, match="has no times"):
+    with pytest.raises(RecordingError, match="the recording has no times"):
         increasing_times(replace(recording, t=None))
 
 
