@@ -41,9 +41,9 @@ def main() -> None:
         before = (problem.fold == (first - 1) % FOLDS) & problem.edge[:, 1]
         after = (problem.fold == (first + NUM_HELD_OUT_FOLDS) % FOLDS) & problem.edge[:, 0]
         choice = select_effects(problem.subset(~(left_out | before | after)))
-        fit = choice.problem.consistent(choice.chosen, choice.weights)
+        fit = choice.problem.consistent(choice.effects, choice.weights)
         part = replace(problem.subset(left_out), tilt=choice.problem.tilt)
-        errors = np.sum(residuals(part, choice.chosen, fit) ** 2, axis=0)
+        errors = np.sum(residuals(part, choice.effects, fit) ** 2, axis=0)
         squares += errors
         show(f"phases {first}-{first + NUM_HELD_OUT_FOLDS - 1} of {FOLDS}", errors, np.sum(part.columns.tau**2, axis=0))
     show("all of them", squares, np.sum(problem.columns.tau**2, axis=0))

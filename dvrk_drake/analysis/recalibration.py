@@ -204,7 +204,7 @@ class _Fit:
         self.names = model.arm.joint_names
         self.rate = grid.rate
         expected = drive_efforts(model, grid)
-        self.tau = grid.behind_filter(recording.in_actuator_coordinates(model.arm).measured_effort())
+        self.tau = grid.filter_efforts(recording.in_actuator_coordinates(model.arm).measured_effort())
         self.other = expected.other
         self.keys = list(expected.friction)
         self.friction = np.stack([expected.friction[key] for key in self.keys], axis=2)

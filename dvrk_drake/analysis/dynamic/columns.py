@@ -156,10 +156,10 @@ def dynamic_columns(
         if delay not in by_delay:
             acting = np.flatnonzero(np.any(rows[:, delays == delay], axis=1))
             by_delay[delay] = np.zeros((len(rigid), len(effects)))
-            by_delay[delay][:, acting] = grid.behind_filter(grid.at_rows(on_grid[:, acting], i))
+            by_delay[delay][:, acting] = grid.filter_efforts(grid.at_rows(on_grid[:, acting], i))
     shapes = tuple(by_delay[delay] for delay in delays)
     return DynamicColumns(
-        tau=grid.behind_filter(tau),
+        tau=grid.filter_efforts(tau),
         base=columns.base,
         rigid=rigid,
         tilts=np.array(tilts).reshape(-1, *rigid.shape),
@@ -212,7 +212,7 @@ def _filtered(grid: MotionGrid, Y: NDArray[np.float64], columns: BaseColumns) ->
     out = np.zeros((len(range(*grid.inner.indices(len(grid.row_times)))), Y.shape[1], len(columns.independent)))
     for i, drives in enumerate(grid.arm.transmission.inverse.matrix.T):
         own, of_actuator = columns.of_actuator(Y, drives)
-        out[:, i, own] = grid.behind_filter(grid.at_rows(of_actuator, i))
+        out[:, i, own] = grid.filter_efforts(grid.at_rows(of_actuator, i))
     return out
 
 

@@ -113,7 +113,7 @@ def parameter_covariance(
     A = _inverse(fit.information + fit.prior_precision)
     to_base = problem.to_base(len(fit.chosen))
     middle = np.zeros((len(to_base),) * 2)
-    columns = [problem.chosen_columns(i, fit.chosen) for i in range(len(fit.weights))]
+    columns = [problem.actuator_columns(i, fit.chosen) for i in range(len(fit.weights))]
     unseen = _unseen_residuals(problem, fit, residuals, columns, to_base)
     for i, (weight, (own, X)) in enumerate(zip(fit.weights, columns, strict=True)):
         covariance = error_covariance(residuals[rows, i], unseen[rows, i], rate / step, period)

@@ -52,7 +52,7 @@ class DynamicProblem:
         fold: Fold of each row, see `phase_folds`.
         edge: Edges of the folds, see `phase_folds`.
         independent: Number of rows that are independent measurements of an effort.
-        num_always: Number of effects, the first ones, that are in every model. The others are candidates.
+        num_mandatory: Number of effects, the first ones, that are in every model. The others are candidates.
     """
 
     columns: DynamicColumns
@@ -60,7 +60,7 @@ class DynamicProblem:
     fold: NDArray[np.int_]
     edge: NDArray[np.bool_]
     independent: float
-    num_always: int
+    num_mandatory: int
     tilt: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
 
     @property
@@ -76,7 +76,7 @@ class DynamicProblem:
     @property
     def candidates(self) -> NDArray[np.int_]:
         """Indices of the effects that are included only if they reduce the error."""
-        return np.arange(self.num_always, self.num_effects)
+        return np.arange(self.num_mandatory, self.num_effects)
 
     @cached_property
     def efforts(self) -> NDArray[np.float64]:
@@ -121,7 +121,7 @@ class DynamicProblem:
         for k, effect in enumerate(self.columns.effects):
             if effect.dissipative:
                 deviation[k] = FRICTION_DEVIATION
-            elif k < self.num_always and effect.kind in POSITION_KINDS and effect.kind != "offset":
+            elif k < self.num_mandatory and effect.kind in POSITION_KINDS and effect.kind != "offset":
                 deviation[k] = KNOWN_DEVIATION
         return np.asarray(size) / deviation**2 + 1e-9
 
@@ -172,7 +172,7 @@ class DynamicProblem:
         own = np.concatenate([moved, first + acting, first + len(chosen) + np.arange(len(tilt_efforts))])
         return own, np.column_stack([rigid[:, moved], effects, *(x[:, i] for x in tilt_efforts)])
 
-    def chosen_columns(
+    def actuator_columns(
         self, i: int, chosen: NDArray[np.int_], tilt_efforts: NDArray[np.float64] | None = None
     ) -> OwnColumns:
         """Returns the columns of one actuator: rigid-body base parameters, then chosen effects, b + e in all.
@@ -240,7 +240,7 @@ class ConsistentFit:
         program = ConsistentProgram(problem, chosen)
         self.lower = program.lower
         tau, effects = problem.columns.tau, len(chosen)
-        columns = (problem.chosen_columns(i, chosen) for i in range(tau.shape[1]))
+        columns = (problem.actuator_columns(i, chosen) for i in range(tau.shape[1]))
         total = NormalEquations.of(columns, problem.rigid.shape[2] + effects, tau).total
         to_base = problem.to_base(effects + 1)
         sums = to_base.T @ total.weighted(weights) @ to_base

@@ -120,7 +120,7 @@ def validate_motion(model: IdentifiedModel, recording: Recording) -> DynamicVali
     arm = model.arm
     tau = recording.in_actuator_coordinates(arm).measured_effort()
     grid = motion_grid(recording, arm, dynamics.section.signals)
-    measured, predicted = grid.behind_filter(tau), grid.behind_filter(_efforts(model, grid))
+    measured, predicted = grid.filter_efforts(tau), grid.filter_efforts(_efforts(model, grid))
     a = grid.efforts_at_rows(arm.transmission.position(grid.q))[grid.inner]
     v = grid.efforts_at_rows(arm.transmission.velocity(grid.v))[grid.inner]
     period = period_of(grid)

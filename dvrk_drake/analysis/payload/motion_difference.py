@@ -147,7 +147,7 @@ def _efforts(
     recording: Recording, grid: MotionGrid, expected: DriveEfforts, model: DynamicModel
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns the filtered efforts of the actuators (r, n), measured and minus those predicted by the model."""
-    tau = grid.behind_filter(recording.in_actuator_coordinates(model.arm).measured_effort())
+    tau = grid.filter_efforts(recording.in_actuator_coordinates(model.arm).measured_effort())
     refuse_opposite_efforts(recording, model.arm.joint_names, tau, expected.total())
     return tau, tau - expected.total()
 
@@ -155,10 +155,10 @@ def _efforts(
 def _changes(model: DynamicModel, grid: MotionGrid, expected: DriveEfforts) -> NDArray[np.float64]:
     """Returns the columns (r, n, 3 + PIECES + 1) for changes of the drives at the inner rows."""
     transmission = model.arm.transmission
-    speed = grid.behind_filter(grid.efforts_at_rows(transmission.velocity(grid.v)))
+    speed = grid.filter_efforts(grid.efforts_at_rows(transmission.velocity(grid.v)))
     a = transmission.position(grid.q)
     shapes = np.stack([_shapes(x) for x in a.T], axis=1)
-    flat = grid.behind_filter(np.stack([grid.at_rows(shapes[:, i], i) for i in range(a.shape[1])], axis=1))
+    flat = grid.filter_efforts(np.stack([grid.at_rows(shapes[:, i], i) for i in range(a.shape[1])], axis=1))
     simple = np.stack([np.ones_like(speed), expected.friction_part("dry"), speed], axis=2)
     return np.concatenate([simple, flat], axis=2)
 

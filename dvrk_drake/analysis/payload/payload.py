@@ -356,7 +356,7 @@ class _Problems:
         """Creates the problems. The autoregression is fitted to the unwhitened residuals, then once more."""
         grid, n = difference.grid, difference.grid.arm.num_joints
         at_rows = np.stack([grid.at_rows(columns[:, i], i) for i in range(n)], axis=1)
-        filtered = grid.behind_filter(at_rows)[difference.rows]
+        filtered = grid.filter_efforts(at_rows)[difference.rows]
         both = [np.hstack([filtered[:, i], difference.changes[:, i]]) for i in range(n)]
         problem = plain = _problem(link, both, difference, Whitening.none(n))
         body, plain_weights, _ = plain.fit()

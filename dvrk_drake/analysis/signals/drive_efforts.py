@@ -59,8 +59,8 @@ def drive_efforts(model: DynamicModel, grid: MotionGrid) -> DriveEfforts:
         else:
             other = other + effort
     return DriveEfforts(
-        grid.behind_filter(grid.efforts_at_rows(other)),
-        {key: grid.behind_filter(grid.efforts_at_rows(x)) for key, x in friction.items()},
+        grid.filter_efforts(grid.efforts_at_rows(other)),
+        {key: grid.filter_efforts(grid.efforts_at_rows(x)) for key, x in friction.items()},
     )
 
 

@@ -127,7 +127,7 @@ class MotionGrid:
         share = np.clip(place - before, 0.0, 1.0).reshape(-1, *[1] * (x.ndim - 1))
         return (1 - share) * x[before] + share * x[before + 1]
 
-    def behind_filter(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def filter_efforts(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Applies the low-pass filter of the efforts to x (r, ...) and omits the ends."""
         flat = low_pass(x.reshape(len(x), -1), self.rate, self.settings.effort_cut_off)
         return flat.reshape(x.shape)[self.inner]

@@ -105,4 +105,4 @@ def test_present_effects_are_selected_and_noise_is_not():
             independent=0.1,
         )
         for part in (selection, selection.without(4, 2)):
-            np.testing.assert_array_equal(part.choose(np.array([0]), np.arange(1, 22)), [0, 1])
+            np.testing.assert_array_equal(part.select(np.array([0]), np.arange(1, 22)), [0, 1])
