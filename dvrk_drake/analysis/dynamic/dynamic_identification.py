@@ -29,7 +29,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
-#: Smallest RMS effort of an effect in the model, as a share of the RMS effort of the actuators.
+#: Smallest coefficient of an effect in the model, in units of its prior standard deviation.
 MIN_EFFECT = 1e-4
 
 

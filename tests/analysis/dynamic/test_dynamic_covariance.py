@@ -61,7 +61,7 @@ def test_standard_errors_are_the_spread_of_repeated_fits(repeating):
     )
     information = sum(weight * x.T @ x for weight, x in zip(weights, X, strict=True))
     fit = SimpleNamespace(
-        information=information, prior_precision=prior, weights=weights, chosen=np.arange(0), lower=np.full(6, -np.inf)
+        information=information, prior_precision=prior, weights=weights, effects=np.arange(0), lower=np.full(6, -np.inf)
     )
     estimates, predicted = [], []
     for _ in range(100):
@@ -87,7 +87,7 @@ def test_uninformed_parameters_keep_the_prior_variance():
         information=2.0 * X.T @ X,
         prior_precision=prior,
         weights=weights,
-        chosen=np.arange(0),
+        effects=np.arange(0),
         x=np.zeros(2),
         lower=np.full(2, -np.inf),
     )
