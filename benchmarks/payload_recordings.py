@@ -28,7 +28,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm, load_arm
 from dvrk_drake.recordings.recording import Recording, read_recording
 
-#: File, link, mass [kg], place in the link's frame [m]; docs/payload.md says how the places are read.
+#: File, link, mass [kg], position in the link's frame [m]; docs/payload.md says how the places are read.
 WEIGHTS = [
     ("psm_one_105g_parallel", "bottom_bar_link", 0.105, [0.0, 0.165, 0.0563]),
     ("psm_one_205g_insertion", "end_link", 0.205, [0.0, 0.023, 0.3913]),
@@ -47,50 +47,52 @@ def main() -> int:
 
     models = {name: identify_dynamic(read(name), arm).model for name in ("psm_one_no_weight", "psm_one")}
     for reference, model in models.items():
-        for name, link, mass, place in WEIGHTS:
+        for name, link, mass, position in WEIGHTS:
             (payload,) = estimate_payload(read(reference), read(name), model.dynamic_model, [link])
-            _print_payload(arm, read(name), reference, name, payload, mass, np.array(place))
+            _print_payload(arm, read(name), reference, name, payload, mass, np.array(position))
     # The arm without payload on the other day, and the torque of a payload that is known exactly.
     for reference, other in (("psm_one_no_weight", "psm_one"), ("psm_one", "psm_one_no_weight")):
         model = models[reference].dynamic_model
-        for _, link, mass, place in WEIGHTS:
-            loaded = _with_payload(read(other), model, link, mass, np.array(place))
+        for _, link, mass, position in WEIGHTS:
+            loaded = _with_payload(read(other), model, link, mass, np.array(position))
             (payload,) = estimate_payload(read(reference), loaded, model, [link])
             name = f"{other} with {1000 * mass:.0f} g added to its efforts"
-            _print_payload(arm, loaded, reference, name, payload, mass, np.array(place))
+            _print_payload(arm, loaded, reference, name, payload, mass, np.array(position))
     _print_seconds(models["psm_one"], read("psm_one_no_weight"))
     _print_phases(models["psm_one"], read("psm_one_no_weight"))
     return 0
 
 
-def _with_payload(recording: Recording, model: DynamicModel, link: str, mass: float, place: np.ndarray) -> Recording:
+def _with_payload(recording: Recording, model: DynamicModel, link: str, mass: float, position: np.ndarray) -> Recording:
     """The recording with the efforts that a point mass on a link would have added."""
     arm = model.arm
     recording = recording.in_actuator_coordinates(arm)
     grid = motion_grid(recording, arm, model.section.signals)
     k = [link.link for link in model.regressor.links].index(link)
     Y = model.regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
-    added = Y @ point_mass_parameters(mass, place) @ arm.transmission.inverse.matrix
+    added = Y @ point_mass_parameters(mass, position) @ arm.transmission.inverse.matrix
     return dataclasses.replace(recording, tau=recording.measured_effort() + grid.efforts_at_rows(added))
 
 
 def _print_payload(
-    arm: Arm, recording: Recording, reference: str, name: str, payload: Payload, mass: float, place: np.ndarray
+    arm: Arm, recording: Recording, reference: str, name: str, payload: Payload, mass: float, position: np.ndarray
 ) -> None:
-    body, offset = payload.body, payload.place_in_base - payload.body.place
+    body, offset = payload.body, payload.position_in_base - payload.body.position
     print(f"{name} against {reference}, {payload.link}")
     print(f"  mass {1000 * body.mass:.0f} +- {1000 * payload.mass_error:.0f} g (true {1000 * mass:.0f})")
     for axis in range(3):
         estimate = "not determined"
         if body.determined[axis]:
-            estimate = f"{100 * payload.place_in_base[axis]:+.1f} +- {100 * payload.place_error[axis]:.1f} cm"
-        print(f"  {'xyz'[axis]} from the remote centre: {estimate} (true {100 * (place + offset)[axis]:+.1f})")
+            estimate = f"{100 * payload.position_in_base[axis]:+.1f} +- {100 * payload.position_error[axis]:.1f} cm"
+        print(f"  {'xyz'[axis]} from the remote centre: {estimate} (true {100 * (position + offset)[axis]:+.1f})")
     regressor = DynamicRegressor(arm)
     grid = motion_grid(recording, arm, default_settings(arm))
     k = [link.link for link in regressor.links].index(payload.link)
     Y = regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
     # Without their means, which no recording tells from an offset of the drive.
-    ours, true = (tau - np.mean(tau, axis=0) for tau in (Y @ body.parameters, Y @ point_mass_parameters(mass, place)))
+    ours, true = (
+        tau - np.mean(tau, axis=0) for tau in (Y @ body.parameters, Y @ point_mass_parameters(mass, position))
+    )
     share = np.sum(ours * true, axis=0)[:2] / np.sum(true**2, axis=0)[:2]
     print(f"  its torque along the true one: yaw {share[0]:.0%}, pitch {share[1]:.0%}")
 
