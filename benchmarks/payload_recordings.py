@@ -20,7 +20,7 @@ from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.payload.payload import Payload, estimate_payload
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
-from dvrk_drake.analysis.recalibration import predict_other_phases, refit_friction
+from dvrk_drake.analysis.recalibration import cross_validated_errors, refit_friction
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -120,7 +120,7 @@ def _print_phases(model: IdentifiedModel, whole: Recording) -> None:
     def errors(which: IdentifiedModel) -> list[float]:
         return [a.relative_error or 0.0 for a in validate_motion(which, second).actuators]
 
-    before, after = predict_other_phases(model, whole, 2)
+    before, after = cross_validated_errors(model, whole, 2)
     for name, values in (
         ("same phases, second half of the time: before", errors(model)),
         ("same phases, refitted to the first half of the time", errors(refit_friction(model, first).model)),

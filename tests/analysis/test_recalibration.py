@@ -9,7 +9,7 @@ from loaded_arm import friction, other_day
 from motions import fourier_motion, recorded, true_dynamics
 
 from dvrk_drake.analysis.dynamic.validation import validate_motion
-from dvrk_drake.analysis.recalibration import predict_other_phases, refit_friction
+from dvrk_drake.analysis.recalibration import cross_validated_errors, refit_friction
 from dvrk_drake.analysis.signals.drive_efforts import FRICTION_PARTS
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
@@ -158,13 +158,13 @@ def test_refit_is_validated_on_held_out_phases():
     """Friction that differs in one half of the phases does not improve the prediction of the other half."""
     model, truth, generator = days("psm")
     recording = motion(truth, generator, seconds=16.0)
-    before, after = predict_other_phases(model, recording, 2)
+    before, after = cross_validated_errors(model, recording, 2)
     np.testing.assert_allclose(before, errors(model, recording), atol=1e-9)
     assert np.mean(after) < 0.5 * np.mean(before)
     half = (np.asarray(recording.t) - 1.0) % 8.0 < 4.0  # phases are counted from where the filters end
     old = motion(model.dynamic_model, np.random.default_rng(0), seconds=16.0)
     mixed = dataclasses.replace(old, tau=np.where(half[:, None], recording.tau, old.tau))
-    before, after = predict_other_phases(model, mixed, 2)
+    before, after = cross_validated_errors(model, mixed, 2)
     # Each refit estimates friction that the other half does not have.
     assert np.mean(after) > np.mean(before)
 
