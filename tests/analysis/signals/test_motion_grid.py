@@ -68,7 +68,7 @@ def test_predicted_efforts_have_the_effort_delay(grid):
 
 @pytest.mark.parametrize(("seconds", "rate"), [(4.9, 200.0), (12.0, 45.0)])
 def test_short_and_coarse_motions_are_rejected(seconds, rate):
-    with pytest.raises(RecordingError, match=rf"motion\.csv: {seconds} s at {rate:g} Hz; .* at least 5 s at 50 Hz"):
+    with pytest.raises(RecordingError, match=rf"motion\.csv: .* {seconds} s at {rate:g} Hz. .* at least 5 s"):
         motion_grid(recorded(seconds, rate), ARM, default_settings(ARM))
 
 
