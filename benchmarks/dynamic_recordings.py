@@ -34,7 +34,7 @@ from rich.table import Table
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
-from dvrk_drake.analysis.recalibration import predict_other_phases
+from dvrk_drake.analysis.recalibration import cross_validated_errors
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
 from dvrk_drake.errors import RecordingError
@@ -83,7 +83,7 @@ def main() -> None:
                 recording = read_public(options.folder / other, arm)
                 errors = validate_motion(model, recording).actuators
                 rows[f"ours on {other}"] = [100 * (e.relative_error or 0.0) for e in errors]
-                rows[f"{other}, refitted friction"] = 100 * predict_other_phases(model, recording, 2)[1]
+                rows[f"{other}, refitted friction"] = 100 * cross_validated_errors(model, recording, 2)[1]
         print_table(f"{arm.name}: relative RMS effort error of the actuators [%]", arm, rows)
         box = (arm.position_lower, arm.position_upper)
         q = np.random.default_rng(0).uniform(*box, (options.poses, arm.num_joints))

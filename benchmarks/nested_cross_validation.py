@@ -41,9 +41,9 @@ def main() -> None:
         before = (problem.fold == (first - 1) % FOLDS) & problem.edge[:, 1]
         after = (problem.fold == (first + NUM_HELD_OUT_FOLDS) % FOLDS) & problem.edge[:, 0]
         selection = select_effects(problem.subset(~(left_out | before | after)))
-        fit = selection.problem.consistent(selection.chosen, selection.weights)
+        fit = selection.problem.consistent(selection.effects, selection.weights)
         part = replace(problem.subset(left_out), tilt=selection.problem.tilt)
-        errors = np.sum(residuals(part, selection.chosen, fit) ** 2, axis=0)
+        errors = np.sum(residuals(part, selection.effects, fit) ** 2, axis=0)
         squares += errors
         show(f"phases {first}-{first + NUM_HELD_OUT_FOLDS - 1} of {FOLDS}", errors, np.sum(part.columns.tau**2, axis=0))
     show("all phases", squares, np.sum(problem.columns.tau**2, axis=0))

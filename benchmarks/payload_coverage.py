@@ -31,14 +31,14 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=40)
     options = parser.parse_args()
     inside = []
-    for name, link, mass, place in CASES:
+    for name, link, mass, position in CASES:
         errors, sizes = [], []
         for seed in range(options.seeds):
-            model, reference, loaded = two_days(name, link, mass, place, seed)
+            model, reference, loaded = two_days(name, link, mass, position, seed)
             (payload,) = estimate_payload(reference, loaded, model, [link])
             known = np.append(True, payload.body.determined)
-            difference = np.append(payload.body.mass - mass, payload.body.place - place)[known]
-            spread = np.append(payload.mass_error, payload.place_error)[known]
+            difference = np.append(payload.body.mass - mass, payload.body.position - position)[known]
+            spread = np.append(payload.mass_error, payload.position_error)[known]
             errors.append(difference / spread)
             inside += list(np.abs(difference) < payload.quantile * spread)
             sizes.append(payload.mass_error)

@@ -22,7 +22,7 @@ from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.payload.payload import Payload, estimate_payload
 from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
-from dvrk_drake.analysis.recalibration import predict_other_phases, refit_friction
+from dvrk_drake.analysis.recalibration import cross_validated_errors, refit_friction
 from dvrk_drake.analysis.signals.motion_grid import default_settings, motion_grid
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -49,50 +49,50 @@ def main() -> int:
 
     models = {name: identify_dynamic(read(name), arm).model for name in ("psm_one_no_weight", "psm_one")}
     for reference, model in models.items():
-        for name, link, mass, place in WEIGHTS:
+        for name, link, mass, position in WEIGHTS:
             (payload,) = estimate_payload(read(reference), read(name), model.dynamic_model, [link])
-            _print_payload(arm, read(name), reference, name, payload, mass, np.array(place))
+            _print_payload(arm, read(name), reference, name, payload, mass, np.array(position))
     # Add the torque of an exactly known payload to the recording without payload of the other day.
     for reference, other in (("psm_one_no_weight", "psm_one"), ("psm_one", "psm_one_no_weight")):
         model = models[reference].dynamic_model
-        for _, link, mass, place in WEIGHTS:
-            loaded = _with_payload(read(other), model, link, mass, np.array(place))
+        for _, link, mass, position in WEIGHTS:
+            loaded = _with_payload(read(other), model, link, mass, np.array(position))
             (payload,) = estimate_payload(read(reference), loaded, model, [link])
             name = f"{other} with the torque of {1000 * mass:.0f} g added"
-            _print_payload(arm, loaded, reference, name, payload, mass, np.array(place))
+            _print_payload(arm, loaded, reference, name, payload, mass, np.array(position))
     _print_seconds(models["psm_one"], read("psm_one_no_weight"))
     _print_phases(models["psm_one"], read("psm_one_no_weight"))
     return 0
 
 
-def _with_payload(recording: Recording, model: DynamicModel, link: str, mass: float, place: np.ndarray) -> Recording:
+def _with_payload(recording: Recording, model: DynamicModel, link: str, mass: float, position: np.ndarray) -> Recording:
     """Returns the recording plus the efforts of a point mass on a link."""
     arm = model.arm
     recording = recording.in_actuator_coordinates(arm)
     grid = motion_grid(recording, arm, model.section.signals)
     k = [link.link for link in model.regressor.links].index(link)
     Y = model.regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
-    added = Y @ point_mass_parameters(mass, place) @ arm.transmission.inverse.matrix
+    added = Y @ point_mass_parameters(mass, position) @ arm.transmission.inverse.matrix
     return dataclasses.replace(recording, tau=recording.measured_effort() + grid.efforts_at_rows(added))
 
 
 def _print_payload(
-    arm: Arm, recording: Recording, reference: str, name: str, payload: Payload, mass: float, place: np.ndarray
+    arm: Arm, recording: Recording, reference: str, name: str, payload: Payload, mass: float, position: np.ndarray
 ) -> None:
-    body, offset = payload.body, payload.place_in_base - payload.body.place
+    body, offset = payload.body, payload.position_in_base - payload.body.position
     print(f"{name}, reference {reference}, payload on {payload.link}")
     print(f"  mass {1000 * body.mass:.0f} +- {1000 * payload.mass_error:.0f} g (true {1000 * mass:.0f})")
     for axis in range(3):
         estimate = "not determined"
         if body.determined[axis]:
-            estimate = f"{100 * payload.place_in_base[axis]:+.1f} +- {100 * payload.place_error[axis]:.1f} cm"
-        print(f"  {'xyz'[axis]} from the remote centre: {estimate} (true {100 * (place + offset)[axis]:+.1f})")
+            estimate = f"{100 * payload.position_in_base[axis]:+.1f} +- {100 * payload.position_error[axis]:.1f} cm"
+        print(f"  {'xyz'[axis]} from the remote centre: {estimate} (true {100 * (position + offset)[axis]:+.1f})")
     regressor = DynamicRegressor(arm)
     grid = motion_grid(recording, arm, default_settings(arm))
     k = [link.link for link in regressor.links].index(payload.link)
     Y = regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
     # Subtract the means, which are not identifiable separately from the offset of the drive.
-    ours, true = (tau - np.mean(tau, axis=0) for tau in (Y @ body.parameters, Y @ point_mass_parameters(mass, place)))
+    ours, true = (tau - np.mean(tau, axis=0) for tau in (Y @ body.parameters, Y @ point_mass_parameters(mass, position)))
     share = np.sum(ours * true, axis=0)[:2] / np.sum(true**2, axis=0)[:2]
     print(f"  estimated torque, projected on the true torque: yaw {100 * share[0]:.0f} %, pitch {100 * share[1]:.0f} %")
 
@@ -121,7 +121,7 @@ def _print_phases(model: IdentifiedModel, whole: Recording) -> None:
     def errors(which: IdentifiedModel) -> list[float]:
         return [a.relative_error or 0.0 for a in validate_motion(which, second).actuators]
 
-    before, after = predict_other_phases(model, whole, 2)
+    before, after = cross_validated_errors(model, whole, 2)
     print("\nrelative RMS effort error of each actuator and mean [%]")
     for name, values in (
         ("same phases, second half of the time: before", errors(model)),

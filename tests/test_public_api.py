@@ -98,7 +98,7 @@ def test_warnings_are_of_the_recording_and_of_the_result(poses):
     assert ("no effort", "wrist_roll") in {(warning.kind, warning.where) for warning in result.warnings}
     errors = dvrk.validate(result.model, recording)
     assert [warning.kind for warning in errors.warnings] == ["same recording"]
-    with pytest.raises(dvrk.DvrkDrakeError, match="not identified from"):
+    with pytest.raises(dvrk.DvrkDrakeError, match="was identified from this recording"):
         errors.save("model.yaml")
 
 

@@ -12,9 +12,9 @@ from dvrk_drake.analysis.payload.payload import (
     CONFIDENCE,
     Payload,
     PayloadIdentification,
-    as_good,
     better_links,
-    shown_elsewhere,
+    contradicting_links,
+    equally_good_links,
 )
 from dvrk_drake.analysis.payload.point_mass import MAX_MASS
 from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
@@ -32,10 +32,10 @@ def print_payload(
         verbose: Whether to print the estimate on each link, and the efforts that the payload explains.
     """
     payload, estimates = result.payload, result.estimates
-    others = as_good(estimates) if result.link is None else better_links(payload, estimates)
+    others = equally_good_links(estimates) if result.link is None else better_links(payload, estimates)
     names = [other.link for other in others if other is not payload]
     if not payload.found:
-        answer = _none_found(payload, shown_elsewhere(payload, estimates))
+        answer = _none_found(payload, contradicting_links(payload, estimates))
     else:
         answer = f"Payload: {payload.body.mass:.4f} +- {payload.mass_error:.4f} kg on {payload.link}."
     if payload.found and names and result.link is None:
@@ -59,7 +59,9 @@ def _estimate_table(payload: Payload) -> Table:
     columns = ("", "estimate", "standard error", f"{100 * CONFIDENCE:.0f} % interval", "base frame, q = 0")
     table = make_table(f"Mass and position of the payload in the frame of {payload.link}", *columns)
     rows = [("mass [kg]", payload.body.mass, payload.mass_error, "")]
-    for axis, x, error, base in zip("xyz", payload.body.place, payload.place_error, payload.place_in_base, strict=True):
+    for axis, x, error, base in zip(
+        "xyz", payload.body.position, payload.position_error, payload.position_in_base, strict=True
+    ):
         rows.append((f"{axis} [m]", x, error, f"{base:+.4f}"))
     for k, (name, value, error, base) in enumerate(rows):
         if k and not payload.body.determined[k - 1]:
@@ -76,13 +78,13 @@ def _print_links(console: Console, estimates: Sequence[Payload]) -> None:
     """Prints the estimate on each link, best first."""
     table = make_table("Estimates by link, best first", "", "error*", "mass [kg]", "+- [kg]", "")
     table.columns[-1].justify = "left"
-    good = as_good(estimates)
+    good = equally_good_links(estimates)
     for payload in estimates:
         note = "" if payload not in good else "best" if payload is estimates[0] else "equally good"
         mass, error = "none found", ""
         if payload.found:
             mass, error = f"{payload.body.mass:.4f}", f"{payload.mass_error:.4f}"
-        error_share = f"{100 * payload.left_out:.1f} %"
+        error_share = f"{100 * payload.relative_error:.1f} %"
         table.add_row(payload.link, error_share, mass, error, note if payload.found else "")
     console.print(table)
     print_note(
@@ -107,7 +109,7 @@ def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
     answer = f"No payload found on {payload.link}: the interval of its mass includes 0. "
     if elsewhere:
         first = elsewhere[0]
-        share = f"{100 * first.left_out:.1f} %"
+        share = f"{100 * first.relative_error:.1f} %"
         return answer + f"A payload on {first.link} explains the change (cross-validated error {share})."
     if payload.largest_at_com > MAX_MASS:
         return answer + "This motion cannot detect a mass at the centre of mass of the link."
