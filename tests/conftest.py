@@ -28,7 +28,7 @@ ONE_PYTHON = (
     "analysis/static/",
     *("experiments/test_reproduction", "experiments/study/", "experiments/test_transparency"),
     "experiments/test_tuning",
-    *("processes/test_collector", "processes/test_leg", "processes/test_live_line", "processes/test_teacher"),
+    *("processes/test_collector", "processes/test_trajectory", "processes/test_live_line", "processes/test_teacher"),
     "cli/test_collect",
 )
 

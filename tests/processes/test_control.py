@@ -109,8 +109,10 @@ def test_a_stopped_controller_ends_and_an_operator_resumes(controller, seconds):
     if seconds < 0.05:
         control(link, controller, lambda: link.now() > end, lambda status: None)
         return
-    why = rf"MTML took over and holds: the last command expired: .* ms old by the arm's clock.*; .*too slow.*\. {LOOK}"
-    with pytest.raises(ControllerError, match=why):
+    reason = (
+        rf"MTML took over and holds: the last command expired: .* ms old by the arm's clock.*; .*too slow.*\. {LOOK}"
+    )
+    with pytest.raises(ControllerError, match=reason):
         control(link, controller, lambda: link.now() > end, lambda status: None)
     assert link.guard.state == Status.STATE_HOLD and link.now() < end
     sent = len(link.commands)

@@ -63,8 +63,8 @@ def test_frame_pose_and_jacobian_match_drake():
     J = frame.jacobian(Q)
     for i, step in enumerate(h * np.eye(7)):
         plus, minus = frame.pose(Q + step), frame.pose(Q - step)
-        turn = (plus.rotation() @ minus.rotation().inverse()).ToAngleAxis()
-        np.testing.assert_allclose(J[:3, i], turn.angle() * turn.axis() / (2 * h), atol=1e-8)
+        rotation = (plus.rotation() @ minus.rotation().inverse()).ToAngleAxis()
+        np.testing.assert_allclose(J[:3, i], rotation.angle() * rotation.axis() / (2 * h), atol=1e-8)
         np.testing.assert_allclose(J[3:, i], (plus.translation() - minus.translation()) / (2 * h), atol=1e-8)
 
 

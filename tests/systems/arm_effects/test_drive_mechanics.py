@@ -16,7 +16,7 @@ def test_joints_of_drive_coordinates_follow_the_arm(name):
     run = Run(arm, arm.effects.only(["friction", "stops"]))
     plant = run.station.plant
     plant_context = plant.GetMyContextFromRoot(run.context)
-    added = run.station._parts.drive._added
+    added = run.station._plant_effects.drive._added
     assert len(added) == {"mtml": 2, "mtmr": 2, "psm": 4}[name]
     moved = run.q
     for _ in range(100):

@@ -76,10 +76,10 @@ class HeldArm:
 
     def in_hand(self):
         """Returns the energy of the hand's springs: quadratic up to their limits, linear beyond."""
-        turn = (self.wanted.rotation() @ self.X_BG.rotation().inverse()).ToAngleAxis().angle()
+        rotation = (self.wanted.rotation() @ self.X_BG.rotation().inverse()).ToAngleAxis().angle()
         way = np.linalg.norm(self.wanted.translation() - self.X_BG.translation())
         springs = (
-            (self.grip.rotational_stiffness, turn, self.grip.max_torque),
+            (self.grip.rotational_stiffness, rotation, self.grip.max_torque),
             (self.grip.stiffness, way, self.grip.max_force),
         )
         return sum(0.5 * k * x**2 if k * x <= most else most * x - 0.5 * most**2 / k for k, x, most in springs)

@@ -366,9 +366,9 @@ def test_copy_is_independent(mode):
     other.run(mode, 300)
     assert (other.output.control_mode, other.guard.fault_code) == (mode, Status.FAULT_NONE)
     # Equal inputs from here on give equal outputs.
-    twin = copy.copy(other)
-    twin.guard = copy.deepcopy(other.guard)
-    for guarded in (other, twin):
+    duplicate = copy.copy(other)
+    duplicate.guard = copy.deepcopy(other.guard)
+    for guarded in (other, duplicate):
         guarded.run(mode, 20, position=list(Q + 0.01), effort=list(0.5 * LIMIT))
     for name in ("position", "velocity", "effort", "joint_flags"):
-        np.testing.assert_array_equal(getattr(other.output, name), getattr(twin.output, name))
+        np.testing.assert_array_equal(getattr(other.output, name), getattr(duplicate.output, name))

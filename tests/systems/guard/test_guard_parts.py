@@ -51,7 +51,7 @@ def test_measurement_age_is_checked(age, good):
     measured = measurement()
     problem = measured.store(NOW - age, GOOD + 1, GOOD + 2, GOOD + 3)
     assert (problem == "") == good
-    assert measured.bad == (not good)
+    assert measured.num_invalid == (not good)
     for kept, added in ((measured.q, 1), (measured.v, 2), (measured.effort, 3)):
         np.testing.assert_array_equal(kept, GOOD + added if good else GOOD)
     assert good or "allowed is 0 to 0.02 s" in problem
@@ -66,10 +66,10 @@ def test_measurement_size_and_numbers_are_checked(which, bad):
     for count in (1, 2):
         text = "the measured positions, velocities or efforts are not 3 finite numbers each"
         assert measured.store(NOW, *vectors) == text
-        assert measured.bad == count
+        assert measured.num_invalid == count
     np.testing.assert_array_equal(measured.q, GOOD)
     assert measured.store(NOW, GOOD, GOOD, GOOD) == ""
-    assert measured.bad == 0
+    assert measured.num_invalid == 0
 
 
 def test_interval_is_between_good_measurements():
@@ -85,7 +85,7 @@ def test_repeated_and_older_measurements():
     assert measured.store(NOW, GOOD + 1, GOOD, GOOD) == ""
     assert measured.store(NOW, GOOD + 2, GOOD, GOOD) == "" and measured.dt == 0.0
     problem = measured.store(NOW - 2 * MS, GOOD + 3, GOOD, GOOD)
-    assert problem == "the measurement is 0.002000 s older than the previous one" and measured.bad == 1
+    assert problem == "the measurement is 0.002000 s older than the previous one" and measured.num_invalid == 1
     np.testing.assert_array_equal(measured.q, GOOD + 1)
     # After the arm's clock went back, times begin anew.
     measured.advance(NOW - 1000 * MS)
@@ -96,7 +96,7 @@ def test_first_pose_can_be_implausible():
     measured = measurement()
     assert measured.store(NOW, GOOD + 100, GOOD, GOOD, lambda q: f"{q[0]:g} is far away") == "100 is far away"
     np.testing.assert_array_equal(measured.q, GOOD)
-    assert measured.bad == 1
+    assert measured.num_invalid == 1
 
 
 def test_measurement_is_copied():
@@ -181,12 +181,12 @@ def test_sender_restarts_after_jump_and_expiry(jump):
     stream.send(0)
     first = stream.send(MS, **jump)
     assert first in (Status.REFUSAL_CLOCK_JUMP, Status.REFUSAL_SEQUENCE_JUMP, Status.REFUSAL_OUT_OF_ORDER)
-    goes_on = {"ahead": size} if name == "ahead" else {}
+    changes = {"ahead": size} if name == "ahead" else {}
     for k in range(2, 51):
-        assert stream.send(k * MS, **goes_on) == first
-    assert stream.send(50 * MS + 1, **goes_on) is False
+        assert stream.send(k * MS, **changes) == first
+    assert stream.send(50 * MS + 1, **changes) is False
     assert stream.stream.lost == 0
-    assert stream.send(51 * MS + 1, **goes_on) is False
+    assert stream.send(51 * MS + 1, **changes) is False
 
 
 def test_stopped_sender_clock_is_a_jump():
@@ -221,8 +221,10 @@ def test_off_requires_hold_of_the_same_sender():
 
 def test_reset_is_a_change_from_false_to_true():
     stream = Stream()
-    asked = [stream.send(k * MS, reset=reset) for k, reset in enumerate([True, True, False, True, True, False, True])]
-    assert asked == [False, False, False, True, False, False, True]
+    requested = [
+        stream.send(k * MS, reset=reset) for k, reset in enumerate([True, True, False, True, True, False, True])
+    ]
+    assert requested == [False, False, False, True, False, False, True]
     # The flag of another sender does not count.
     stream.send(8 * MS)
     assert stream.send(60 * MS, sender=6, reset=True) is False
@@ -241,13 +243,13 @@ def test_forget_discards_the_sender():
 
 def test_command_in_force_is_copied():
     command = Bench().command(effort=np.ones(N))
-    force = CommandInForce()
-    force.replace(command)
+    in_force = CommandInForce()
+    in_force.replace(command)
     command.effort[:] = 9.0
-    np.testing.assert_array_equal(force.effort, np.ones(N))
-    np.testing.assert_array_equal(force.position, command.position)
-    np.testing.assert_array_equal(force.velocity, np.zeros(N))
-    assert force.status_utime == command.status_utime and force.command is command
+    np.testing.assert_array_equal(in_force.effort, np.ones(N))
+    np.testing.assert_array_equal(in_force.position, command.position)
+    np.testing.assert_array_equal(in_force.velocity, np.zeros(N))
+    assert in_force.status_utime == command.status_utime and in_force.command is command
 
 
 @pytest.mark.parametrize("mode", [Command.OFF, Command.HOLD, Command.POSITION, Command.EFFORT])

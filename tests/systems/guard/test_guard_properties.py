@@ -128,7 +128,7 @@ def check(data, modes):
     guard.step(script.utime, script.utime, script.q, np.zeros(script.n), np.zeros(script.n))
     if script.mode != Command.HOLD:
         # Commands act immediately, without the periods of the start check.
-        guard._force.replace(script.command())
+        guard._in_force.replace(script.command())
         guard._stream.accept(guard.last_command, script.utime)
         guard._act(script.mode)
     for _ in range(10):

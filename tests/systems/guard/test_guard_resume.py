@@ -228,20 +228,20 @@ class WallBench(Bench):
 @MODES
 @pytest.mark.parametrize("first", ["receive", "step"])
 @pytest.mark.parametrize(
-    ("milliseconds", "goes_on"), [(20, True), (48, True), (48.001, False), (50, False), (200, False), (1000, False)]
+    ("milliseconds", "continues"), [(20, True), (48, True), (48.001, False), (50, False), (200, False), (1000, False)]
 )
-def test_bridge_stall_expires_command_by_wall_clock(mode, first, milliseconds, goes_on):
+def test_bridge_stall_expires_command_by_wall_clock(mode, first, milliseconds, continues):
     """The first event after it is a command or a step. The command was 1 ms old on arrival."""
     bench = WallBench().started(mode)
     assert bench.send(mode, status_utime=bench.utime - MS) == Status.REFUSAL_NONE
     bench.stall(milliseconds)
     bench.utime += MS
     if first == "receive":
-        assert bench.send(mode) == (Status.REFUSAL_NONE if goes_on else Status.REFUSAL_RESUME)
+        assert bench.send(mode) == (Status.REFUSAL_NONE if continues else Status.REFUSAL_RESUME)
     bench.q = Q + 1e-3
     bench.output = output = bench.step()
     guard = bench.guard
-    if goes_on:
+    if continues:
         assert (output.control_mode, guard.counts.expired, guard.hold_reason) == (mode, 0, "")
         assert first == "receive" or bench.send(mode) == Status.REFUSAL_NONE
         bench.tick()
@@ -255,16 +255,16 @@ def test_bridge_stall_expires_command_by_wall_clock(mode, first, milliseconds, g
 
 @MODES
 @pytest.mark.parametrize(
-    ("milliseconds", "goes_on"), [(20, True), (50, True), (51, False), (200, False), (1000, False)]
+    ("milliseconds", "continues"), [(20, True), (50, True), (51, False), (200, False), (1000, False)]
 )
-def test_sender_stall_expires_command_by_arm_clock(mode, milliseconds, goes_on):
+def test_sender_stall_expires_command_by_arm_clock(mode, milliseconds, continues):
     bench = WallBench().started(mode)
     bench.run(mode, 1)  # received one tick before the time that the bench has now
     bench.tick(milliseconds - 1)
     code = bench.send(mode)
-    assert code == (Status.REFUSAL_NONE if goes_on else Status.REFUSAL_RESUME)
-    assert bench.tick().control_mode == (mode if goes_on else Command.HOLD)
-    assert goes_on == (bench.guard.hold_reason == "")
+    assert code == (Status.REFUSAL_NONE if continues else Status.REFUSAL_RESUME)
+    assert bench.tick().control_mode == (mode if continues else Command.HOLD)
+    assert continues == (bench.guard.hold_reason == "")
 
 
 def test_answer_to_old_measurement_has_its_wall_clock_age():
