@@ -374,7 +374,7 @@ def test_commands_reject_invalid_options(tmp_path, capsys):
     assert "gains.kp has 1 number; allowed: 7" in refused(
         capsys, "simulate", "--arm", "mtml", "--set", f"controller.gains={few}"
     )
-    assert "for --mode hold" in refused(capsys, "run", "--arm", "mtml", "--gains", str(few))
+    assert "requires --mode hold" in refused(capsys, "run", "--arm", "mtml", "--gains", str(few))
 
 
 @pytest.mark.slow
