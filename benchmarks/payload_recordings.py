@@ -92,7 +92,9 @@ def _print_payload(
     k = [link.link for link in regressor.links].index(payload.link)
     Y = regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
     # Subtract the means, which are not identifiable separately from the offset of the drive.
-    ours, true = (tau - np.mean(tau, axis=0) for tau in (Y @ body.parameters, Y @ point_mass_parameters(mass, position)))
+    ours, true = (
+        tau - np.mean(tau, axis=0) for tau in (Y @ body.parameters, Y @ point_mass_parameters(mass, position))
+    )
     share = np.sum(ours * true, axis=0)[:2] / np.sum(true**2, axis=0)[:2]
     print(f"  estimated torque, projected on the true torque: yaw {100 * share[0]:.0f} %, pitch {100 * share[1]:.0f} %")
 

@@ -71,7 +71,9 @@ Arm = Annotated[
     str, Parameter(metavar="ARM", completer=_complete_arm, help="mtml, mtmr, psm, or the path of an arm file (YAML).")
 ]
 Model = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file, written by identify.")]
-Coordinates = Annotated[Literal["joint", "actuator"], Parameter(help="Coordinates of q and tau in a CSV recording.")]
+Coordinates = Annotated[
+    Literal["joint", "actuator"], Parameter(help="Coordinates of q, qd and tau in a CSV recording.")
+]
 Gravity = Annotated[
     tuple[float, float, float] | None,
     Parameter(

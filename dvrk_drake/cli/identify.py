@@ -159,7 +159,7 @@ def validate(
     if json is not None:
         print_written(json)
     if save:
-        print_written(model, "with the verdicts")
+        print_written(model, "verdicts stored")
     if require is not None and (failed := validation.unfit(require)):
         raise ModelError(
             f"{model}: not {require} on {read.source}: {', '.join(failed)}; identify from a recording with more varied "
@@ -252,7 +252,7 @@ def payload(
     from dvrk_drake.reports.terminal_tables import make_console
 
     if model is not None and gravity is not None:
-        raise ModelError("--gravity needs --arm; with --model, the gravity of the model is used")
+        raise ModelError("--gravity requires --arm; with --model, the gravity vector of the model is used")
     if json is not None:
         check_output(json, reference, loaded, overwrite=overwrite)
     identified = None if model is None else dvrk.IdentifiedModel.load(model)

@@ -102,7 +102,7 @@ def check_output(path: str, *inputs: str, overwrite: bool) -> None:
     target = Path(os.path.realpath(path))
     _refuse_twice(path)
     if not target.parent.is_dir():
-        raise DvrkDrakeError(f"{path}: cannot be written, because its folder does not exist")
+        raise DvrkDrakeError(f"{path}: cannot be written: its folder does not exist")
     if os.path.exists(target) and not target.is_file():
         raise DvrkDrakeError(f"{path}: is not a regular file and cannot be replaced; give the path of a file")
     try:

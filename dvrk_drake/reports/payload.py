@@ -57,7 +57,7 @@ def print_payload(
 
 def _estimate_table(payload: Payload) -> Table:
     columns = ("", "estimate", "standard error", f"{100 * CONFIDENCE:.0f} % interval", "base frame, q = 0")
-    table = make_table(f"Mass and position of the payload in the frame of {payload.link}", *columns)
+    table = make_table(f"Payload on {payload.link}, position in the frame of the link", *columns)
     rows = [("mass [kg]", payload.body.mass, payload.mass_error, "")]
     for axis, x, error, base in zip(
         "xyz", payload.body.position, payload.position_error, payload.position_in_base, strict=True

@@ -29,7 +29,7 @@ class TableConsole(Console):
     def print(self, *objects: Any, **options: Any) -> None:
         """Prints objects like `rich.console.Console`."""
         width = self.width
-        for table in (thing for thing in objects if isinstance(thing, Table)):
+        for table in (item for item in objects if isinstance(item, Table)):
             headings = [str(column.header) for column in table.columns]
             for lines in range(2, 6):
                 if self._width_of(table) <= width:

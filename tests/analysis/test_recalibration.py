@@ -178,7 +178,7 @@ def test_recalibrate_command(tmp_path, capsys):
     assert main(["recalibrate", paths["short.csv"], "--model", paths["model.yaml"], "--output", paths["new.yaml"]]) == 0
     assert IdentifiedModel.load(paths["new.yaml"]).provenance.method.endswith(f"recalibrated on {paths['short.csv']}")
     table = capsys.readouterr().out
-    assert all(name in table for name in ("before", "after the refit", "wrist_yaw", "motions like the recalibration"))
+    assert all(name in table for name in ("before", "after the refit", "wrist_yaw", "valid for similar motions"))
     again = ["--output", paths["new.yaml"], "--overwrite"]
     assert main(["recalibrate", paths["short.csv"], "--model", paths["static.yaml"], *again]) == 2
     command = ["recalibrate", paths["short.csv"], "--model", paths["model.yaml"]]

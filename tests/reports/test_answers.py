@@ -1,4 +1,4 @@
-"""Output of the commands: the answer first, then the next step, then tables of at most 80 columns."""
+"""Tests of the terminal reports: answer, next step, then tables of at most 80 columns."""
 
 import os
 import re
@@ -45,7 +45,7 @@ pytestmark = pytest.mark.slow
 
 @cache
 def poses():
-    """A static model, and errors of it on other poses, where one joint's effort is wrong."""
+    """Returns a static identification, and its validation on poses with wrong efforts of one joint."""
     arm, recordings, generator = dvrk.load_arm("mtml"), [], np.random.default_rng(0)
     for _ in range(2):
         q = arm.sample_poses(40, generator)
@@ -60,7 +60,7 @@ def poses():
 
 @cache
 def motions():
-    """Two recordings of a motion, without and with a payload, and the model of the first."""
+    """Returns two recordings of a motion, without and with a payload, and the identification of the first."""
     _, reference, loaded = two_days("psm", "end_link", 0.2, [0.02, 0.02, 0.39], 0)
     return reference, loaded, dvrk.identify(reference, dvrk.load_arm("psm"))
 
@@ -160,7 +160,7 @@ def demonstrated(console, verbose):
 
 
 VERDICT = r"Verdict: (good|usable|do not use) ?[(.]"
-#: Case -> how the answer begins, and what prints it.
+#: Mapping from a case to a pattern for the start of the answer, and the function that prints it.
 CASES = {
     "identify poses": (VERDICT, lambda c, v: identification.print_identification(c, poses()[0], verbose=v)),
     "identify motion": (VERDICT, lambda c, v: identification.print_identification(c, motions()[2], verbose=v)),
@@ -233,13 +233,13 @@ def printed(case, verbose):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_answer_comes_first_and_all_fits_80_columns(case):
+def test_answer_comes_first_and_output_fits_80_columns(case):
     short, whole = printed(case, False), printed(case, True)
     for text in (short, whole):
         answer, _, rest = text.partition("\nNext: ")
         assert re.match(CASES[case][0], " ".join(answer.split())), text
         assert answer.count("\n") < 3 and rest.split("\n")[1] == ""
-        # A finding is one line, so that it can be searched for.
+        # Findings are not wrapped, so that they can be searched.
         lines = [line for line in text.splitlines() if not line.startswith(("warning: ", "note: "))]
         assert max(len(line.rstrip()) for line in lines) <= 80, text
         assert "…" not in text

@@ -32,8 +32,8 @@ def drift_table(
     means: Sequence[float],
     paper: Drifts,
     ours: Drifts,
-    approached: Drifts | None = None,
-    compensated: Drifts | None = None,
+    hand_guided: Drifts | None = None,
+    hysteresis_compensated: Drifts | None = None,
 ) -> ResultTable:
     """Returns a table of the drifts with the paper's model and ours, and of the published drifts.
 
@@ -44,8 +44,8 @@ def drift_table(
         means: Published mean drifts (6,) of joints 2-7 [rad].
         paper: Drifts with the paper's model.
         ours: Drifts with our model.
-        approached: Drifts with our model if a hand guided the arm to the pose, or None.
-        compensated: Like `approached`, with compensated hysteresis, or None.
+        hand_guided: Drifts with our model if a hand guided the arm to the pose, or None.
+        hysteresis_compensated: Like `hand_guided`, with compensated hysteresis, or None.
     """
     rows: tuple[tuple[str, ...], ...] = (
         ("published, trial of the figure (final)", *_UNPUBLISHED, *numbers(np.abs(trial), "{:.4f}")),
@@ -57,15 +57,15 @@ def drift_table(
         ("the paper's, share held", *_shares(paper)),
         ("ours, share held", *_shares(ours)),
     )
-    if approached is not None:
+    if hand_guided is not None:
         rows += (
-            (f"ours, hand-guided, {len(approached.positions)} poses (largest at any time)", *_largest(approached)),
-            ("ours, hand-guided, share held", *_shares(approached)),
+            (f"ours, hand-guided, {len(hand_guided.positions)} poses (largest at any time)", *_largest(hand_guided)),
+            ("ours, hand-guided, share held", *_shares(hand_guided)),
         )
-    if compensated is not None:
+    if hysteresis_compensated is not None:
         rows += (
-            ("ours, hand-guided, hysteresis compensated (largest at any time)", *_largest(compensated)),
-            ("ours, hand-guided, hysteresis compensated, share held", *_shares(compensated)),
+            ("ours, hand-guided, hysteresis compensated (largest at any time)", *_largest(hysteresis_compensated)),
+            ("ours, hand-guided, hysteresis compensated, share held", *_shares(hysteresis_compensated)),
         )
     return ResultTable(name, f"Absolute drift after release [rad], {what}", ("", *_JOINTS), rows)
 
@@ -125,7 +125,7 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
     few = poses[: sample_sizes.paper_releases]
     ours = session.release(PAPER_ARM, mtm.truth, mtm.file, poses, "Fig. 5: releasing ours")
     paper = session.release(PAPER_ARM, mtm.truth, session.paper_file, few, "Fig. 5: releasing the paper's")
-    approached = session.release(
+    hand_guided = session.release(
         PAPER_ARM,
         mtm.truth,
         mtm.file,
@@ -133,7 +133,7 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         "Fig. 5: hand-guiding and releasing ours",
         with_approach=True,
     )
-    compensated = session.release(
+    hysteresis_compensated = session.release(
         PAPER_ARM,
         mtm.truth,
         mtm.file,
@@ -165,7 +165,14 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
     )
     tables = (
         drift_table(
-            "fig5", "all torques on", published.FIGURE_5, published.FIGURE_5_MEANS, paper, ours, approached, compensated
+            "fig5",
+            "all torques on",
+            published.FIGURE_5,
+            published.FIGURE_5_MEANS,
+            paper,
+            ours,
+            hand_guided,
+            hysteresis_compensated,
         ),
         torque_table(session),
         rate_table(without_friction),
@@ -184,15 +191,14 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         "and the friction here was identified on another MTM.",
         f"**Hand-guided**: the arm is moved to the pose from a distance of {APPROACH[0]:g} rad and regulated for "
         f"{SETTLING_TIME:g} s, which loads its friction. Then ours keeps all joints at "
-        f"{share(approached.num_held, len(approached.positions))} of the poses. "
-        f"Releases that fail, by joint: {_any_lost(approached)}. "
-        "Gravity compensation does not include the state of friction. Hysteresis with a width of 0.06-0.25 rad pushes "
-        "joints 2 and 3 back, and less friction remains to resist the model error. The friction of joint 7 deflects by "
-        "15 mrad before it slips. An exact model has the same drift. The published drifts of joints 2 and 3, up to "
-        "0.13 rad, have a similar size.",
+        f"{share(hand_guided.num_held, len(hand_guided.positions))} of the poses. Releases that fail, by joint: "
+        f"{_any_lost(hand_guided)}. Gravity compensation does not include the state of friction. Hysteresis with a "
+        "width of 0.06-0.25 rad pushes joints 2 and 3 back, and less friction remains to resist the model error. "
+        "The friction of joint 7 deflects by 15 mrad before it slips. An exact model has the same drift. The "
+        "published drifts of joints 2 and 3, up to 0.13 rad, have a similar size.",
         f"**With compensated hysteresis** (`run --hysteresis-ratio {MAX_HYSTERESIS_RATIO:g}`, exact friction model), "
-        f"releases that fail, by joint: {_any_lost(compensated)} of {len(compensated.positions)}. The largest drift is "
-        f"{_furthest(compensated)} mrad.",
+        f"releases that fail, by joint: {_any_lost(hysteresis_compensated)} of "
+        f"{len(hysteresis_compensated.positions)}. The largest drift is {_furthest(hysteresis_compensated)} mrad.",
         "**Without friction**, only an exact model keeps an arm at rest, because a small torque error accelerates "
         f"the wrist by tens of rad/s^2. Within {FRICTIONLESS_DURATION:g} s, the arm reaches its joint limits with "
         f"both models. It stays away from them at {_num_staying(frictionless_paper)} (paper's) and "
