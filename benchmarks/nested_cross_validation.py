@@ -37,12 +37,12 @@ def main() -> None:
     squares = np.zeros(arm.num_joints)
     print("relative RMS effort error of each actuator and mean [%], 6-fold cross-validation over the phase")
     for first in range(0, FOLDS, NUM_HELD_OUT_FOLDS):
-        left_out = (problem.fold >= first) & (problem.fold < first + NUM_HELD_OUT_FOLDS)
+        held_out = (problem.fold >= first) & (problem.fold < first + NUM_HELD_OUT_FOLDS)
         before = (problem.fold == (first - 1) % FOLDS) & problem.edge[:, 1]
         after = (problem.fold == (first + NUM_HELD_OUT_FOLDS) % FOLDS) & problem.edge[:, 0]
-        selection = select_effects(problem.subset(~(left_out | before | after)))
+        selection = select_effects(problem.subset(~(held_out | before | after)))
         fit = selection.problem.consistent(selection.effects, selection.weights)
-        part = replace(problem.subset(left_out), tilt=selection.problem.tilt)
+        part = replace(problem.subset(held_out), tilt=selection.problem.tilt)
         errors = np.sum(residuals(part, selection.effects, fit) ** 2, axis=0)
         squares += errors
         show(f"phases {first}-{first + NUM_HELD_OUT_FOLDS - 1} of {FOLDS}", errors, np.sum(part.columns.tau**2, axis=0))

@@ -103,7 +103,7 @@ def random_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int =
 
 
 def recorded_path(arm: Arm, recording: Recording, speed: float = 1.0) -> PiecewisePolynomial:
-    """Returns the motion of a recording, clipped to the arm's limits and accelerated by the factor `speed`.
+    """Returns the motion of a recording, clipped to the arm's limits and played at `speed` times its original speed.
 
     Raises:
         ScenarioError: The recording has no times, the speed is out of range, or the motion exceeds the limits by more

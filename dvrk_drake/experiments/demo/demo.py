@@ -52,15 +52,15 @@ NO_DRY_FRICTION = (
 
 @dataclass(frozen=True)
 class DemoPlan:
-    """Plan of the demo for one type of arm, with poses in rad and m.
+    """Effects, poses and settings of the demo for one type of arm.
 
     Attributes:
         effects: Effects of the ground-truth arm that are not in the nominal model [N m].
-        release: Pose of the release.
-        step: Start pose of the step to `home`.
-        home: Final pose of the release and of the step.
+        release: Pose (n,) of the release [rad, m].
+        step: Start pose (n,) of the step to `home` [rad, m].
+        home: Final pose (n,) of the release and of the step [rad, m].
         step_title: Title of the plot of the step.
-        closure: Method that closes the loops of the ground-truth arm's linkage, see `add_arm`.
+        closure: Method for closing the loops of the ground-truth arm's linkage, see `add_arm`.
     """
 
     effects: tuple[DriveEffect, ...]
@@ -108,8 +108,8 @@ class DemoResult:
     Attributes:
         arm: Arm of the demo.
         identification: Identification from the collected poses.
-        fresh: Errors of the identified model at poses that were not used for identification.
-        fresh_paper: Errors of the paper's least-squares method at the same poses.
+        fresh: Errors of the identified model at new poses, which are not used for identification.
+        fresh_paper: Errors of the paper's least-squares method at these new poses.
         release_time: Times (m,) of the release [s].
         released: Positions (m, n) with the identified model [rad, m].
         released_nominal: Positions (m, n) with the nominal model, which is that of the SDF [rad, m].

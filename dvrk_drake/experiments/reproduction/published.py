@@ -28,7 +28,13 @@ LENGTHS = {"0": 0.0, "L1": 0.0, "L2": 0.2794, "L3": 0.3645, "L4": 0.1506}
 
 
 class TableRow(NamedTuple):
-    """Row of Table I: sign and offset [rad] with theta = sign q + offset, then d and a as symbols, and alpha [rad]."""
+    """Row of Table I, the DH table of the MTM.
+
+    Attributes:
+        sign, offset: Sign and offset [rad] of the joint angle theta = sign q + offset.
+        d, a: Names of the lengths along z and x, see `LENGTHS`.
+        alpha: Twist angle [rad].
+    """
 
     sign: int
     offset: float

@@ -139,14 +139,14 @@ NOMINAL = Condition("nominal")
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Response of the n joints at m times [s; rad, N m; m, N for a prismatic joint].
+    """Step response of the n joints at m times.
 
     Attributes:
-        t: Times (m,).
-        q: True positions (m, n).
-        q_measured: Delayed positions (m, n) from the encoders.
-        effort: Commanded efforts (m, n).
-        q_desired: Desired positions (n,).
+        t: Times (m,) [s].
+        q: True positions (m, n) [rad, m].
+        q_measured: Delayed positions (m, n) from the encoders [rad, m].
+        effort: Commanded efforts (m, n) [N m, N].
+        q_desired: Desired positions (n,) [rad, m].
     """
 
     t: NDArray[np.float64]

@@ -33,16 +33,17 @@ POSES, NUM_STABILITY_POSES = 200, 20
 
 @dataclass(frozen=True)
 class JointProperties:
-    """Properties of one joint that determine its gains [kg m^2, N m, rad; kg, N, m].
+    """Properties of one joint that determine its gains.
 
     Attributes:
-        inertia: Smallest inertia (other joints free) and largest inertia (other joints locked).
-        dry_friction: Maximum dry friction.
-        viscous: Coefficient of viscous friction.
-        gravity: Largest gravity torque.
-        count: Resolution of the encoder, in joint coordinates.
-        band: Settling band.
-        effort_limit: Maximum effort.
+        inertia: Smallest inertia (other joints free) and largest inertia (other joints locked)
+            [kg m^2, kg].
+        dry_friction: Dry friction [N m, N].
+        viscous: Coefficient of viscous friction [N m s/rad, N s/m].
+        gravity: Largest gravity torque [N m, N].
+        count: Resolution of the encoder in joint coordinates [rad, m].
+        band: Settling band [rad, m].
+        effort_limit: Maximum effort [N m, N].
     """
 
     inertia: tuple[float, float]
@@ -59,7 +60,7 @@ class JointDesign:
     """Gains of one joint and their derivation.
 
     Attributes:
-        kp, kd, ki: Gains.
+        kp, kd, ki: Gains [N m/rad, N m s/rad, N m/(rad s)], with N/m instead of N m/rad for a prismatic joint.
         frequency: Natural frequency of the closed loop at the largest inertia [rad/s].
         margins: Margins at the smallest and at the largest inertia.
         limited_by: Requirement that the next higher frequency violates.

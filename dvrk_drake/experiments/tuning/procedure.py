@@ -22,7 +22,7 @@ class Oscillation:
     Attributes:
         swings: Number of swings. The first swing is not evaluated, since friction and integral are zero at its start.
         growth: Mean ratio of the amplitudes of consecutive swings; 0 for too few swings.
-        period: Duration of two swings [s]; infinite for too few swings.
+        period: Period of the oscillation, i.e. duration of two swings [s]; infinite for too few swings.
     """
 
     swings: int
@@ -123,7 +123,7 @@ class JointProcedure:
     """Result of the procedure for one joint.
 
     Attributes:
-        kp, kd, ki: Gains.
+        kp, kd, ki: Gains [N m/rad, N m s/rad, N m/(rad s)], with N/m instead of N m/rad for a prismatic joint.
         ultimate: Ultimate gain of the joint.
         kp_ratio: Ratio of the final Kp to the ultimate gain; 1 if Kp was not reduced.
         damped: False if no Kv damped the joint.
