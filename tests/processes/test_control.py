@@ -244,7 +244,7 @@ def test_friction_needs_a_bound_on_the_gravity_error(tmp_path, capsys):
     IdentifiedModel.from_arm(ARM).save(path)
     assert main(["run", "--arm", "mtml", "--model", path, "--friction-ratio", "0.5"]) == 2
     said = capsys.readouterr().err
-    assert "--friction-ratio needs a --model from identify of poses at rest" in said and said.count("\n") == 1
+    assert "--friction-ratio requires a --model identified from static poses" in said and said.count("\n") == 1
 
 
 def test_rate_and_round_trip_of_the_report():

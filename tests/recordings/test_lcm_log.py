@@ -233,7 +233,7 @@ def test_log_of_a_moving_arm_is_identified_by_static_segments(tmp_path, capsys):
         messages.append(status)
     log = write_log(tmp_path / "moving.log", messages)
     assert main(["identify", str(log), "--arm", "mtml", "--output", str(tmp_path / "model.yaml")]) == 0
-    assert f"16 poses at which the arm rests are taken; {len(messages)} rows" in capsys.readouterr().out
+    assert f"Static poses found in the motion: 16, in {len(messages)} rows." in capsys.readouterr().out
     fresh = ARM.sample_poses(100, generator)
     truth = IdentifiedModel.from_arm(ARM).holding_torque(fresh)
     error = IdentifiedModel.load(tmp_path / "model.yaml").holding_torque(fresh) - truth

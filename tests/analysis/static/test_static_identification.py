@@ -110,9 +110,9 @@ def test_poses_at_a_stop_are_excluded_and_named(arm):
     tau[11, 3] = 2.0  # eight times what the motor can give
     dirty = dataclasses.replace(recording, q=q, tau=tau)
     reasons = {(d.row, d.joints): d.reason for d in find_excluded(dirty, arm)}
-    assert "parallelogram at -0.350 rests on its stop" in reasons[3, (1, 2)]
-    assert "wrist_yaw at 0.785 rests on its stop" in reasons[7, (5,)]
-    assert "wrist_platform effort 2 exceeds its limit 0.309" in reasons[11, (3,)]
+    assert "parallelogram at -0.350 rad is at its stop" in reasons[3, (1, 2)]
+    assert "wrist_yaw at 0.785 rad is at its stop" in reasons[7, (5,)]
+    assert "wrist_platform effort 2 N m exceeds its limit of 0.309 N m" in reasons[11, (3,)]
     clean_rows = np.ones(40, bool)
     clean_rows[[3, 7, 11]] = False
     clean = dataclasses.replace(recording, q=q[clean_rows], tau=tau[clean_rows])

@@ -177,14 +177,14 @@ def test_scenario_cable_stretches():
     [
         ("stretch.elbow={stiffness: 100.0}", "simulated arm: stretch: unknown actuator elbow"),
         ("stretch.outer_yaw={stiffness: -1.0}", "stretch.outer_yaw.stiffness is -1; allowed: "),
-        ("hand.path=[{time: 0.1, pose: [0, 0, 0, 0, 0, 0, 0]}]", "hand.path needs two poses or more"),
+        ("hand.path=[{time: 0.1, pose: [0, 0, 0, 0, 0, 0, 0]}]", "hand.path must have 2 or more poses"),
         ("hand.path=[{time: 0.1, pose: [0, 0, 0]}]", r"hand.path\[0\].pose has 3 numbers"),
         ("hand.grip=1", "allowed"),
         (
             "controller.compensated_effects=[friction]",
             'controller.compensated_effects is "friction"; allowed: cables, springs',
         ),
-        ("controller.friction_ratio=0.5", 'controller.friction_ratio needs mode "gravity"'),
+        ("controller.friction_ratio=0.5", 'controller.friction_ratio requires controller.mode "gravity"'),
     ],
 )
 def test_invalid_scenario_is_refused(setting, message):
