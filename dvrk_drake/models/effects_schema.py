@@ -181,11 +181,11 @@ class ArmEffects:
                 raise ArmError(f"{where}: scale of {effect.kind} is 0; allowed: more than 0")
             if effect.fall_speed and effect.kind != "presliding":
                 raise ArmError(f"{where}: fall_speed of {effect.kind} is {effect.fall_speed:g}; allowed: 0")
-        for group, effects in (("cables", self.cables), ("springs", self.springs)):
-            for effect in effects:
-                if effect.kind not in POSITION_KINDS:
-                    where = f"{group} of {effect.coordinate}"
-                    raise ArmError(f'{where}: kind is "{effect.kind}"; allowed: {", ".join(POSITION_KINDS)}')
+        for group, laws in (("cables", self.cables), ("springs", self.springs)):
+            for law in laws:
+                if law.kind not in POSITION_KINDS:
+                    where = f"{group} of {law.coordinate}"
+                    raise ArmError(f'{where}: kind is "{law.kind}"; allowed: {", ".join(POSITION_KINDS)}')
 
 
 #: Kinds that `friction` accepts: dissipative effects that a solver can apply at the end of a step.
