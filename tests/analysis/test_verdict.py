@@ -206,21 +206,21 @@ def test_identification_recording_gives_no_saved_verdicts(files, tmp_path, capsy
     assert main(["validate", good, "--model", model]) == 0
     assert "the model was identified from this recording" in capsys.readouterr().err
     assert main(["validate", good, "--model", model, "--save"]) == 2
-    assert "--save needs a recording that the model was not identified from" in capsys.readouterr().err
+    assert "the model was identified from this recording; --save requires another one" in capsys.readouterr().err
     assert (tmp_path / "model.yaml").read_bytes() == before
 
 
 def test_run_warns_of_saved_verdicts(files, capsys):
     model, good, bad = files
     loaded = IdentifiedModel.load(model)
-    assert "no other recording has validated this model; cross-validated: " in model_warning(model, loaded)
+    assert "not validated on another recording; verdict by cross-validation: " in model_warning(model, loaded)
     assert main(["validate", bad, "--model", model, "--save"]) == 0
     saved = IdentifiedModel.load(model)
     assert dataclasses.replace(saved, validation=None) == loaded
     warning = model_warning(model, saved)
-    assert f"did not pass validation on {bad}: shoulder_pitch (do not use);" in warning and "\n" not in warning
+    assert f"failed validation on {bad}: shoulder_pitch (do not use);" in warning and "\n" not in warning
     assert main(["validate", good, "--model", model, "--save"]) == 2
-    assert f"has verdicts from {bad} already" in capsys.readouterr().err
+    assert f"contains verdicts from {bad}" in capsys.readouterr().err
     assert main(["validate", good, "--model", model, "--save", "--overwrite"]) == 0
     assert model_warning(model, IdentifiedModel.load(model)) == ""
 

@@ -207,7 +207,7 @@ def test_an_arm_file_can_refer_to_the_exported_sdf(name, tmp_path, capsys):
     (tmp_path / "arm.yaml").write_text(text)
     own = load_arm(str(tmp_path / "arm.yaml"))
     assert main(["export", "--arm", str(tmp_path / "arm.yaml"), "--sdf", str(tmp_path / "again.sdf")]) == 0
-    assert "The SDF states the inertias of the arm's own SDF." in capsys.readouterr().out
+    assert "The SDF has the same inertias as the SDF of the arm." in capsys.readouterr().out
     assert own.joint_names == arm.joint_names and own.sdf == (str(tmp_path / "identified.sdf"),)
     np.testing.assert_allclose(own.transmission.matrix, arm.transmission.matrix, rtol=0, atol=1e-12)
     np.testing.assert_allclose(derive_gravity(own).base_values, 1.1 * derive_gravity(arm).base_values, atol=1e-12)

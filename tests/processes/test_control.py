@@ -212,7 +212,7 @@ def test_live_status_describes_new_refusals():
     maker = LiveStatusMaker(7, first)
     live = maker.make(status, 0.2, 0)
     assert live.problem == (
-        "refused: starting too far from the present efforts or pose, the last command expired and the arm took over"
+        "refused: start too far from the present efforts or pose, the last command expired and the arm took over"
     )
     assert str(live).endswith(live.problem)
     assert not maker.make(status, 0.4, 0).problem
@@ -244,7 +244,7 @@ def test_friction_requires_holding_error(tmp_path, capsys):
     IdentifiedModel.from_arm(ARM).save(path)
     assert main(["run", "--arm", "mtml", "--model", path, "--friction-ratio", "0.5"]) == 2
     said = capsys.readouterr().err
-    assert "--friction-ratio needs a --model from identify of poses at rest" in said and said.count("\n") == 1
+    assert "--friction-ratio requires a --model identified from static poses" in said and said.count("\n") == 1
 
 
 def test_live_status_has_rate_and_round_trip():

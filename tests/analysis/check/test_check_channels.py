@@ -88,7 +88,7 @@ def test_effort_saturated_both_ways_is_one_finding():
     whole = clean_motion()
     limit = np.quantile(np.abs(whole.tau[:, 0]), 0.8)
     (finding,) = found(changed(whole, "tau", 0, lambda x: np.clip(x, -limit, limit)))["saturated effort"]
-    assert f"at {limit:.4g} in" in finding.what and f"at {-limit:.4g} in" in finding.what
+    assert f"at {limit:.4g} N m in" in finding.what and f"at {-limit:.4g} N m in" in finding.what
 
 
 @pytest.mark.parametrize("step", [0.0, 1e-3])

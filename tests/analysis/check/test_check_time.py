@@ -72,7 +72,7 @@ def test_times_that_go_back_are_refused():
     assert "row 501" in refusal.what
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "milliseconds"), (1e9, "nanoseconds"), (7 / 6, "rate right")])
+@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "milliseconds"), (1e9, "nanoseconds"), (7 / 6, "wrong rate")])
 def test_times_in_another_unit_are_refused(factor, unit):
     whole = clean_motion()
     refusal = found(replace(whole, t=whole.t * factor))["wrong time"][0]

@@ -37,13 +37,13 @@ def motion(seconds, rate, speed=1.0):
 
 
 REFUSED = {
-    "one row": (lambda: poses(1), "has 1 distinct pose, too few to identify from; at least 8"),
-    "few poses": (lambda: poses(7), "has 7 distinct poses, too few to identify from; at least 8"),
-    "still": (lambda: motion(6, 100, 0.0), "has 1 distinct pose, too few"),
-    "short": (lambda: motion(3, 100), "3.0 s at 100 Hz; a dynamic model needs a motion of at least 5 s at 50 Hz"),
-    "slow": (lambda: motion(10, 30), "10.0 s at 30 Hz; a dynamic model needs"),
-    "few rows": (lambda: motion(0.5, 100), "static identification needs poses at rest"),
-    "no times": (lambda: replace(motion(6, 100), t=None), "static identification needs poses at rest"),
+    "one row": (lambda: poses(1), "1 distinct pose found. Identification requires at least 8"),
+    "few poses": (lambda: poses(7), "7 distinct poses found. Identification requires at least 8"),
+    "still": (lambda: motion(6, 100, 0.0), "1 distinct pose found"),
+    "short": (lambda: motion(3, 100), "3.0 s at 100 Hz. A dynamic model requires at least 5 s at 50 Hz or more."),
+    "slow": (lambda: motion(10, 30), "10.0 s at 30 Hz. A dynamic model requires"),
+    "few rows": (lambda: motion(0.5, 100), "Static identification requires poses at rest"),
+    "no times": (lambda: replace(motion(6, 100), t=None), "Static identification requires poses at rest"),
 }
 
 

@@ -192,7 +192,7 @@ def test_command_says_that_poses_have_no_spectra(tmp_path, capsys):
     write_recording(poses(load_arm("mtml")), tmp_path / "poses.csv")
     arguments = ["check", str(tmp_path / "poses.csv"), "--arm", "mtml", "--plots", str(tmp_path / "plots")]
     assert main(arguments) == 0
-    assert "no plots: spectra need a motion with efforts" in capsys.readouterr().err
+    assert "spectra require a motion with efforts" in capsys.readouterr().err
 
 
 def test_command_refuses_with_exit_code_2(tmp_path, capsys):

@@ -48,9 +48,9 @@ def test_effects_of_the_arm_file_are_mandatory():
     [
         (
             {"pitch": ["magnet"]},
-            'actuator.pitch: unknown "magnet"; known: spring, cable 1, cable 2, asymmetric friction',
+            'actuator.pitch: unknown effect "magnet". Allowed: spring, cable 1, cable 2, asymmetric friction',
         ),
-        ({"elbow": ["spring"]}, "unknown coordinate actuator.elbow; known: actuator.yaw"),
+        ({"elbow": ["spring"]}, "unknown coordinate actuator.elbow. Allowed: actuator.yaw"),
         ({"insertion": ["cable 1"]}, "cable sine requires a revolute coordinate, but actuator.insertion is prismatic"),
     ],
 )
@@ -105,4 +105,4 @@ def test_present_effects_are_selected_and_noise_is_not():
             independent=0.1,
         )
         for part in (selection, selection.without(4, 2)):
-            np.testing.assert_array_equal(part.choose(np.array([0]), np.arange(1, 22)), [0, 1])
+            np.testing.assert_array_equal(part.select(np.array([0]), np.arange(1, 22)), [0, 1])

@@ -22,11 +22,11 @@ def test_the_autoregression_is_found_and_what_is_left_is_white():
     true = np.array([[1.2, -0.5], [0.0, 0.0]])
     x = np.column_stack([red(own, 5000, generator) for own in true])
     whitening = Whitening.of(x, 2, RATE, CUT_OFF)
-    assert whitening.step == STEP and whitening.lost == 2 * STEP
+    assert whitening.step == STEP and whitening.num_removed == 2 * STEP
     np.testing.assert_allclose(whitening.coefficients, true, atol=0.03)
     for channel in range(2):
         white = whitening(x[:, channel], channel)
-        assert len(white) == len(x) - whitening.lost
+        assert len(white) == len(x) - whitening.num_removed
         assert abs(np.corrcoef(white[STEP:], white[:-STEP])[0, 1]) < 0.02
 
 

@@ -40,7 +40,7 @@ def test_rests_of_a_motion_are_found_and_identify_the_arm(arm):
     # Yaw, pitch and insertion carry weight. The small torques of the wrist are below its noise, as on a real arm.
     assert np.all(error[:3] < 0.05 * torque[:3])
     assert np.all(error <= torque + 2e-3 * arm.effort_limits)
-    with pytest.raises(IdentificationError, match=r"the arm moves \(joint \d at .* or the slow parts of a motion"):
+    with pytest.raises(IdentificationError, match=r"the arm moves \(joint \d at .* or the low-speed segments"):
         identify_static(recording, arm)
 
 
@@ -90,7 +90,7 @@ def test_rests_are_poses_of_all_joints(arm, rate, with_speeds):
     assert np.all(np.abs(rests.tau - truth) < 1e-3 * arm.effort_limits)
     found = find_poses(recording, arm)
     assert found.measured is None
-    assert found.note == f"12 poses at which the arm rests are taken; {len(recording)} rows"
+    assert found.note == f"Static poses found in the motion: 12, in {len(recording)} rows."
 
 
 def test_recording_without_rests_is_unchanged(arm):
@@ -119,7 +119,7 @@ def test_recording_without_low_speed_segments_is_rejected(arm):
         low_speed_segments(Recording(q=q, qd=q, t=t), arm)
     t = np.arange(2000) / RATE
     qd = np.tile(np.cos(2 * np.pi * t)[:, None], (1, 7))
-    with pytest.raises(IdentificationError, match="no joint is slow"):
+    with pytest.raises(IdentificationError, match="has no low-speed segments"):
         low_speed_segments(Recording(q=np.sin(2 * np.pi * t)[:, None] + 0 * qd, qd=qd, tau=qd, t=t), arm)
 
 

@@ -69,7 +69,7 @@ def test_poses_come_from_rests_or_are_unchanged():
     poses, recording = moving(count=12)
     found = find_poses(recording, ARM)
     np.testing.assert_allclose(found.recording.q, poses, atol=1e-3)
-    assert "12 poses at which the arm rests" in found.note and not found.moves
+    assert "found in the motion: 12" in found.note and not found.moves
     few = find_poses(moving(count=3)[1], ARM)
     assert few.moves and few.measured is None and len(few.recording) > 100
     slow = find_poses(moving(count=3)[1], ARM, with_low_speed_segments=True)
