@@ -116,11 +116,11 @@ def test_result_replaces_a_file_only_on_request(poses, tmp_path):
     arm, model, recording = poses
     result = dvrk.identify(recording, arm, method="paper")
     result.save(tmp_path / "model.yaml")
-    with pytest.raises(dvrk.DvrkDrakeError, match=r"model.yaml: exists already; .* overwrite=True"):
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"model.yaml already exists\. .* overwrite=True"):
         result.save(tmp_path / "model.yaml")
     result.save(tmp_path / "model.yaml", overwrite=True)
     dvrk.export_model(model, tmp_path / "arm.urdf")
-    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.urdf: exists already"):
+    with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.urdf already exists"):
         dvrk.export_model(model, tmp_path / "arm.urdf")
     with pytest.raises(dvrk.DvrkDrakeError, match=r"arm.xml: its format is not clear; state one of sdf, urdf"):
         dvrk.export_model(model, tmp_path / "arm.xml")
@@ -231,7 +231,7 @@ def test_nan_is_rejected_with_its_row(exact, name):
     arm, recording = exact
     values = getattr(recording, name).copy()
     values[3, 1] = np.nan
-    with pytest.raises(RecordingError, match=rf"poses.csv: row 4: {name}2 = nan is no reading of an arm"):
+    with pytest.raises(RecordingError, match=rf"poses.csv, row 4: {name}2 = nan is not plausible"):
         dvrk.identify(dataclasses.replace(recording, **{name: values}), arm)
 
 
@@ -276,7 +276,7 @@ def test_verdicts_do_not_replace_other_files(exact, tmp_path):
     q = arm.sample_poses(40, np.random.default_rng(1))
     tau = dvrk.IdentifiedModel.from_arm(arm).holding_torque(q)
     validation = dvrk.validate(result.model, dvrk.Recording(q=q, tau=tau, source="others.csv"))
-    with pytest.raises(DvrkDrakeError, match="exists already"):
+    with pytest.raises(DvrkDrakeError, match="already exists"):
         validation.save(other)
     assert other.read_text() == "mine"
     validation.save(own)

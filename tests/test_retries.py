@@ -17,7 +17,7 @@ import own_network
 from own_network import inside, outside, run_inside, watchdog
 
 own_network.unshare, own_network.NETWORK = lambda: ["env"], "true"
-own_network.STANDSTILL = {standstill}
+own_network.STALL_TIME = {standstill}
 
 
 @outside

@@ -54,7 +54,7 @@ def record(
         recorder.run(float("inf") if duration is None else duration, stopped, line.show)
     finally:
         line.clear()
-    print_written(output, f"{recorder.stream.num_taken} rows")
+    print_written(output, f"{recorder.stream.num_used} rows")
     print_notes(output, recorder.notes())
 
 

@@ -104,9 +104,9 @@ class Recorder:
         if status is None:
             return f"waiting for {self._channel}"
         if not self._arrivals or self._arrivals[-1] < now - SILENCE:
-            return f"{self._arm.name}: no more statuses; {self.stream.num_taken} rows"
+            return f"{self._arm.name}: no more statuses; {self.stream.num_used} rows"
         parts = [
-            f"{self._arm.name}: {self.stream.num_taken} rows",
+            f"{self._arm.name}: {self.stream.num_used} rows",
             f"{len(self._arrivals)} Hz",
             f"{self.stream.num_lost} lost",
             describe_state(status.guard_state, status.fault_text),

@@ -152,10 +152,10 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
         ("duration=long", 'psm: duration is "long"; allowed: a number'),
         ("controller.parameter_error=abc", 'psm: controller.parameter_error is "abc"; allowed: a number'),
         ("controler.mode=hold", 'key "controler" is unknown; did you mean "controller"? allowed in a scenario'),
-        ("simulated_effects=all", 'psm: simulated_effects is "all"; allowed: a list of texts, e.g. [all]'),
+        ("simulated_effects=all", 'psm: simulated_effects is "all"; allowed: a list of strings, e.g. [all]'),
         ("simulated_effects=[al]", "unknown effect al; allowed: all, friction"),
-        ("targets=3", "targets is 3; allowed: a list of tables with the keys time, pose"),
-        ("seed=1.5", "seed is 1.5; allowed: a whole number"),
+        ("targets=3", "targets is 3; allowed: a list of mappings with the keys time, pose"),
+        ("seed=1.5", "seed is 1.5; allowed: an integer"),
         ("stretch.yaw.stiffness=soft", 'stretch.yaw.stiffness is "soft"; allowed: a number'),
         ("controller.gains.kp=[1, a]", 'controller.gains.kp[1] is "a"; allowed: a number'),
         ("duration=", "duration is empty; allowed: a number"),
@@ -184,7 +184,7 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
         ("seed=-1", "seed is -1"),
         ("arm=psm9", 'unknown arm "psm9"; did you mean "psm"? known arms: mtml, mtmr, psm'),
         ("duration", "--set duration: a setting must be key=value"),
-        ("start=[0,", "--set start=[0,: not YAML"),
+        ("start=[0,", "--set start=[0,: invalid YAML"),
     ],
 )
 def test_invalid_settings_give_one_line_error(setting, message, capsys, tmp_path):
@@ -199,8 +199,8 @@ def test_rejects_files_that_are_not_scenarios(tmp_path):
     with pytest.raises(ScenarioError, match="no such file"):
         load_scenario(str(path))
     for text, message in (
-        ("[1, 2]", "must be keys and values"),
-        ("arm: [", "not YAML"),
+        ("[1, 2]", "must have keys and values"),
+        ("arm: [", "invalid YAML"),
         ("duration: 2", "arm is missing"),
     ):
         path.write_text(text)

@@ -25,10 +25,10 @@ def test_links_of_the_sdf_fit_their_boxes(name):
 
 def test_box_encloses_collision_shapes_with_margin_of_its_file():
     boxes = bounding_boxes(load_arm("psm"))
-    # One box each in the SDF: 0.028 x 0.536 x 0.02 m about (0, 0.258, 0) in psm.sdf.
+    # The collision shape in psm.sdf is a box of 0.028 x 0.536 x 0.02 m about (0, 0.258, 0).
     np.testing.assert_allclose(boxes["bottom_bar_link"].lower, [-0.054, -0.05, -0.05], atol=1e-9)
     np.testing.assert_allclose(boxes["bottom_bar_link"].upper, [0.054, 0.566, 0.05], atol=1e-9)
-    # A shaft of radius 4.2 mm in the instrument's, whose margin is 1 cm.
+    # The shaft of the instrument has a radius of 4.2 mm, and the margin of the instrument is 1 cm.
     assert boxes["roll_link"].half_width[0] == pytest.approx(0.0142, abs=2e-4)
 
 
@@ -39,7 +39,7 @@ def point_mass(mass, p):
 
 
 def test_margin_of_a_point_depends_on_distance_from_centre():
-    """Checks the margin 1 - (d / w)^2 along each axis. Bodies inside the box have a positive one."""
+    """Checks that the margin is 1 - (d / w)^2 along each axis. It is positive for bodies inside the box."""
     box = BoundingBox(np.array([-0.1, 0.0, 0.2]), np.array([0.3, 0.2, 0.3]))
     p = np.array([0.2, 0.1, 0.32])
     expected = 1 - ((p - box.center) / box.half_width) ** 2

@@ -248,7 +248,7 @@ def test_a_refusal_without_a_pause_is_named(tmp_path):
         command.utime -= 10**6
         arm.step(command)
     problem = problem_after(made, 0.0)
-    assert "last refused command: after a jump of the sender's clock" in problem
+    assert "last refused command: jump of the sender's clock" in problem
 
 
 def test_a_refusal_of_an_earlier_time_is_not_named():
@@ -258,7 +258,7 @@ def test_a_refusal_of_an_earlier_time_is_not_named():
     status.guard_state = Status.STATE_HOLD
     assert takeover_reason(status, before, AnswerTimes()) == "its state is hold"
     status.num_refused += 1
-    assert takeover_reason(status, before, AnswerTimes()) == "last refused command: from a second sender"
+    assert takeover_reason(status, before, AnswerTimes()) == "last refused command: sent by a second sender"
     status.num_refused, status.num_ignored, status.ignored_code = 3, 1, Status.REFUSAL_NOT_AUTHENTIC
     problem = takeover_reason(status, before, AnswerTimes())
     assert problem == "the arm ignores messages: not signed with the arm's key (--key)"

@@ -212,7 +212,7 @@ def test_what_was_refused_since_the_last_report_is_in_words():
     maker = LiveStatusMaker(7, first)
     live = maker.make(status, 0.2, 0)
     assert live.problem == (
-        "refused: starting too far from the present efforts or pose, the last command expired and the arm took over"
+        "refused: start too far from the present efforts or pose, the last command expired and the arm took over"
     )
     assert str(live).endswith(live.problem)
     assert not maker.make(status, 0.4, 0).problem

@@ -143,16 +143,16 @@ def test_driver_file(tmp_path):
         with pytest.raises(StationError, match=r"driver\.yaml: "):
             load_driver(path)
     for text, message in (
-        ("guard: 3", "guard is 3; allowed: a table with the keys expiry, "),
+        ("guard: 3", "guard is 3; allowed: a mapping with the keys expiry, "),
         ("gard: {}", 'key "gard" is unknown; did you mean "guard"\\? allowed in .*: lcm_url, '),
         (
             "control_modes: [off]",
-            r"control_modes\[0\] is False; allowed: a text; quote a word, e\.g\. \"off\": YAML reads off and no "
+            r"control_modes\[0\] is False; allowed: a string; quote a word, e\.g\. \"off\": YAML reads off and no "
             "without quotes as false",
         ),
         ("control_modes: off", r"control_modes is False; .* quote a word, e\.g\. \[\"off\"\]: YAML reads off"),
         ("lcm_url: yes", r"lcm_url is True; .*\"on\": YAML reads on and yes without quotes as true"),
-        ("control_modes: effort", r"control_modes is \"effort\"; allowed: a list of texts, e\.g\. \[effort\]"),
+        ("control_modes: effort", r"control_modes is \"effort\"; allowed: a list of strings, e\.g\. \[effort\]"),
     ):
         path.write_text(text)
         with pytest.raises(StationError, match=rf"driver\.yaml: .*{message}"):
@@ -192,4 +192,4 @@ def test_why_an_arm_took_over():
     assert takeover_reason(status, before, AnswerTimes()) == "commands arrived too late (use --realtime)"
     status.num_expired, status.num_refused = 0, 1
     status.refusal_code = lcmt_dvrk_status.REFUSAL_START_FAR
-    assert "starting too far" in takeover_reason(status, before, AnswerTimes())
+    assert "start too far" in takeover_reason(status, before, AnswerTimes())

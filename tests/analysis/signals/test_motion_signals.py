@@ -91,7 +91,7 @@ def test_times_that_do_not_increase_are_rejected():
         times = recording.t.copy()
         times[row] = t
         with pytest.raises(
-            RecordingError, match=r"motion\.csv: row 151: t = 0\.7\d* s does not increase, after 0\.745"
+            RecordingError, match=r"motion\.csv, row 151: t = 0\.7\d* s does not increase, after 0\.745"
         ):
             increasing_times(replace(recording, t=times))
     with pytest.raises(RecordingError, match="the recording has no times"):

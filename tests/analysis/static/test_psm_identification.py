@@ -100,7 +100,7 @@ def test_long_parameter_names_keep_all_digits(capsys):
     ("spoil", "message"),
     [
         (lambda r: Recording(q=r.q[:, :6], tau=r.tau[:, :6]), "missing column q7; "),
-        (lambda r: Recording(q=r.q * [1, 1, 1000, 1, 1, 1, 1], tau=r.tau), "are these millimetres or centimetres?"),
+        (lambda r: Recording(q=r.q * [1, 1, 1000, 1, 1, 1, 1], tau=r.tau), "Are the positions in millimetres"),
         (lambda r: Recording(q=r.q * [3, 1, 1, 1, 1, 1, 1], tau=r.tau), "yaw (q1) = "),
         (lambda r: Recording(q=r.q, tau=r.tau + 1000 * np.eye(7)[2]), "insertion (tau3) exceed its limit of 9.88"),
     ],

@@ -250,7 +250,7 @@ def test_model_file_round_trip_and_rejections(arm, tmp_path):
             r"joints\[1\]\.feedforward_scale is 2; allowed: 0\.\.1",
         ),
         (text.replace("arm: ", "arms: ", 1), 'key "arms" is unknown; did you mean "arm"'),
-        ("]", "not YAML: line 1"),
+        ("]", "invalid YAML: line 1"),
     ):
         assert bad != text
         (tmp_path / "bad.yaml").write_text(bad)
@@ -277,7 +277,7 @@ def test_moved_model_files_and_version_2_files_are_loaded(tmp_path):
         old = new.replace("model 4", "model 2").replace("package://dvrk_drake/arms/mtmr.yaml", name)
         old = old.replace("coefficient:", "value:").replace("feedforward_scale:", "trust:")  # an earlier key
         (tmp_path / "old.yaml").write_text(old.replace("_included:", "_undoubted:"))
-        with pytest.warns(FutureWarning, match='key "trust" is now "feedforward_scale"'):  # an earlier key
+        with pytest.warns(FutureWarning, match='key "trust" was renamed to "feedforward_scale"'):  # an earlier key
             read = IdentifiedModel.load(tmp_path / "old.yaml")
         assert (read.arm, read.effects) == (load_arm(name), effects)
     with pytest.raises(ModelError, match=r"new\.yaml: is of MTMR, not of PSM"):
@@ -339,6 +339,6 @@ def test_prediction_of_another_day_beats_zero_torque(arm, shared_data):
 def test_poses_at_a_stop_are_named_in_a_real_recording(arm, shared_data):
     result = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"), arm)
     # Line numbers of the file. Line 72 repeats the pose of line 62.
-    line = {d: int(d.where.rpartition(":")[2]) for d in result.excluded}
+    line = {d: int(d.where.rpartition(" ")[2]) for d in result.excluded}
     assert {62, 64, 68, 74, 78} <= {line[d] for d in result.excluded if "parallelogram" in d.reason}
     assert 47 in line.values()

@@ -49,7 +49,7 @@ def study_refusal(capsys, path, *options):
         ),
         (("scenario: psm", "scenario: psm\nseeds: [1, 1]"), "seeds must not contain a number twice; got [1, 1]"),
         (("scenario: psm", "scenario: psm\nseeds: [-1]"), "seeds[0] is -1; allowed: 0..9223372036854775807"),
-        (("scenario: psm", "scenario: psm\nseeds: [a]"), 'seeds[0] is "a"; allowed: a whole number'),
+        (("scenario: psm", "scenario: psm\nseeds: [a]"), 'seeds[0] is "a"; allowed: an integer'),
         (("scenario: psm", "scenario: psm\nseeds: []"), "seeds, variations and measures must not be empty"),
         (
             ("scenario: psm", "scenario: psm\nvariations: [{name: a}, {name: a}]"),

@@ -73,9 +73,13 @@ def test_unknown_part_is_an_error(tmp_path):
             "effects.saturation.outer_yaw is -1.861; allowed: 0.001..2000 N m or N",
         ),
         ("measurement: 1", "measurement: -1", "effects.delay.measurement is -1; allowed: 0..100 time steps"),
-        ("presliding, scale: 0.015", "stiction, scale: 0.015", 'effects.friction: kind "stiction"; allowed'),
-        ("scale: 0.015", "scale: 0.0", "has scale 0"),
-        ("coefficient: 0.0011", "coefficient: -0.0011", "has coefficient -0.0011"),
+        (
+            "presliding, scale: 0.015",
+            "stiction, scale: 0.015",
+            'effects.friction of actuator.wrist_roll: kind is "stiction"; allowed',
+        ),
+        ("scale: 0.015", "scale: 0.0", "scale of presliding is 0"),
+        ("coefficient: 0.0011", "coefficient: -0.0011", "coefficient of presliding is -0.0011"),
     ):
         assert old in text
         (tmp_path / "m.yaml").write_text(text.replace(old, new))
