@@ -138,7 +138,7 @@ def effort(source: System, context: Context) -> np.ndarray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", metavar="FILE", help="write the results to this file")
-    parser.add_argument("--repetitions", type=int, default=15)
+    parser.add_argument("--repetitions", type=int, default=15, help="number of repetitions; default: %(default)s")
     parser.add_argument("--seconds", type=float, default=0.5, help="simulated time of one repetition")
     arguments = parser.parse_args()
     arm = load_arm("mtml")

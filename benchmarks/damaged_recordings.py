@@ -122,9 +122,11 @@ def outcome(folder: Path, name: str, number: int) -> tuple[str, str, str, str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, help="folder of the recordings, see above")
     parser.add_argument("name", nargs="*", default=DEFAULT, help=f"motions; allowed: {', '.join(MOTIONS)}")
-    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count(), help="number of worker processes; default: %(default)s"
+    )
     options = parser.parse_args()
     for name, arm_name in MOTIONS.items():
         arm = load_arm(arm_name)

@@ -51,7 +51,7 @@ PUBLISHED = {
 def main() -> None:
     """Prints one table per arm."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, help="folder of the recordings, see above")
     parser.add_argument(
         "--poses", type=int, default=2000, help="number of random poses at which the eigenvalues of M(q) are computed"
     )

@@ -83,9 +83,9 @@ def benchmark(name: str, samples: int, repetitions: int) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", metavar="FILE")
-    parser.add_argument("--samples", type=int, default=6000)
-    parser.add_argument("--repetitions", type=int, default=15)
+    parser.add_argument("--json", metavar="FILE", help="write the results to this file")
+    parser.add_argument("--samples", type=int, default=6000, help="number of samples; default: %(default)s")
+    parser.add_argument("--repetitions", type=int, default=15, help="number of repetitions; default: %(default)s")
     options = parser.parse_args()
     write_json(options.json, {name: benchmark(name, options.samples, options.repetitions) for name in ("mtml", "psm")})
 

@@ -26,9 +26,9 @@ CALLS = 20_000
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", metavar="FILE")
-    parser.add_argument("--poses", type=int, default=10_000)
-    parser.add_argument("--repetitions", type=int, default=15)
+    parser.add_argument("--json", metavar="FILE", help="write the results to this file")
+    parser.add_argument("--poses", type=int, default=10_000, help="number of poses; default: %(default)s")
+    parser.add_argument("--repetitions", type=int, default=15, help="number of repetitions; default: %(default)s")
     options = parser.parse_args()
 
     arm = load_arm("mtml")

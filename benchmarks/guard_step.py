@@ -63,8 +63,8 @@ def cost(checkout: Path, arm: str) -> tuple[float, float]:
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
     command = [sys.executable, "-c", WORKER, arm]
     output = subprocess.run(command, cwd=checkout, env=environment, check=True, capture_output=True).stdout
-    tick, message = map(float, output.split())
-    return tick, message
+    guard, message = map(float, output.split())
+    return guard, message
 
 
 def main() -> None:
@@ -74,10 +74,10 @@ def main() -> None:
     other = parser.parse_args().other
     rows = {}
     for arm in ("mtml", "psm"):
-        turns = [(*cost(ROOT, arm), cost(other, arm)[0] if other else float("nan")) for _ in range(REPETITIONS)]
-        tick, message, theirs = (min(turn[i] for turn in turns) for i in range(3))
-        compared = [f"{theirs:.1f}", f"{tick / theirs:.2f}"] if other else []
-        rows[arm] = [f"{tick:.1f}", f"{message:.1f}", f"{tick / message:.2f}", *compared]
+        measurements = [(*cost(ROOT, arm), cost(other, arm)[0] if other else float("nan")) for _ in range(REPETITIONS)]
+        guard, message, other_guard = (min(times[i] for times in measurements) for i in range(3))
+        compared = [f"{other_guard:.1f}", f"{guard / other_guard:.2f}"] if other else []
+        rows[arm] = [f"{guard:.1f}", f"{message:.1f}", f"{guard / message:.2f}", *compared]
     compared = ["guard of the other checkout [us]", "ratio this / other"] if other else []
     headings = ["guard [us]", "encode and decode [us]", "ratio", *compared]
     print_table("CPU time per command and step", headings, rows)

@@ -92,18 +92,18 @@ def _errors(model: dict) -> tuple[float, ...]:
 
 def show(what: str, runs: list[tuple[Run, Run]]) -> None:
     """Prints one row: times of the other checkout and of this one, ratios, and the difference between the results."""
-    (cpu_before, wall_before), (cpu, wall) = (
+    (cpu_other, wall_other), (cpu, wall) = (
         np.median([(pair[k].cpu, pair[k].wall) for pair in runs], axis=0) for k in range(2)
     )
-    before, after = runs[0]
-    if before.errors:
-        difference = np.max(np.abs(np.subtract(before.errors, after.errors)))
+    other, this = runs[0]
+    if other.errors:
+        difference = np.max(np.abs(np.subtract(other.errors, this.errors)))
         same = f"errors differ by at most {100 * difference:.1g} percentage points"
     else:
-        same = "equal formulas" if before.output == after.output else "different formulas"
+        same = "equal formulas" if other.output == this.output else "different formulas"
     print(
-        f"{what:24} {cpu_before:7.2f} {cpu:7.2f} {cpu / cpu_before:6.2f}   "
-        f"{wall_before:7.2f} {wall:7.2f} {wall / wall_before:6.2f}   {same}",
+        f"{what:24} {cpu_other:7.2f} {cpu:7.2f} {cpu / cpu_other:6.2f}   "
+        f"{wall_other:7.2f} {wall:7.2f} {wall / wall_other:6.2f}   {same}",
         flush=True,
     )
 
@@ -113,7 +113,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--base", type=Path, required=True, help="folder of the other checkout")
     parser.add_argument("--recordings", type=Path, help="folder that contains mtm_one.csv and psm_one.csv")
-    parser.add_argument("--repetitions", type=int, default=5)
+    parser.add_argument("--repetitions", type=int, default=5, help="number of repetitions; default: %(default)s")
     options = parser.parse_args()
     base = options.base.resolve()
     columns = f"{'other':>7} {'this':>7} {'ratio':>6}"

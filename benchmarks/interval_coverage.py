@@ -28,9 +28,16 @@ TRUE_EFFECTS = {
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--recordings", type=int, default=30)
-    parser.add_argument("--poses", type=int, default=40)
-    parser.add_argument("--noise", type=float, default=0.02)
+    parser.add_argument(
+        "--recordings", type=int, default=30, help="number of simulated recordings; default: %(default)s"
+    )
+    parser.add_argument("--poses", type=int, default=40, help="number of poses per recording; default: %(default)s")
+    parser.add_argument(
+        "--noise",
+        type=float,
+        default=0.02,
+        help="standard deviation of the noise, as a share of the effort limits; default: %(default)s",
+    )
     options = parser.parse_args()
     arm = load_arm("mtmr")
     truth = compile_static_model(arm, tuple(TRUE_EFFECTS))

@@ -88,7 +88,7 @@ class Controller:
 def main() -> None:
     """Prints one row per kind of work."""
     parser = argparse.ArgumentParser(description="Measures the computing time of message authentication per period.")
-    parser.add_argument("--repetitions", type=int, default=20_000)
+    parser.add_argument("--repetitions", type=int, default=20_000, help="number of repetitions; default: %(default)s")
     options = parser.parse_args()
     bare, keyed = Arm(None), Arm(KEY)
     bare_controller, keyed_controller = Controller(bare), Controller(keyed)

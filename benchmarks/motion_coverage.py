@@ -32,9 +32,16 @@ RATE = 1000.0
 def main() -> int:
     """Prints the coverage for each arm."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arms", type=int, default=16)
-    parser.add_argument("--noise", type=float, default=0.05)
-    parser.add_argument("--spread", type=float, default=0.15)
+    parser.add_argument("--arms", type=int, default=16, help="number of simulated arms; default: %(default)s")
+    parser.add_argument(
+        "--noise",
+        type=float,
+        default=0.05,
+        help="standard deviation of the noise, as a share of the efforts; default: %(default)s",
+    )
+    parser.add_argument(
+        "--spread", type=float, default=0.15, help="size of the changes of the links, see above; default: %(default)s"
+    )
     options = parser.parse_args()
     print("coverage of the 95 % intervals, number of intervals, RMS error / standard error:")
     for name in ("mtmr", "psm"):

@@ -25,9 +25,14 @@ from dvrk_drake.recordings.recording import read_recording
 def main() -> None:
     """Prints one row per fold, and the error over all folds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("motion")
-    parser.add_argument("--arm", required=True)
-    parser.add_argument("--coordinates", choices=("joint", "actuator"), default="joint")
+    parser.add_argument("motion", help="recording of the motion")
+    parser.add_argument("--arm", required=True, help="name of the arm")
+    parser.add_argument(
+        "--coordinates",
+        choices=("joint", "actuator"),
+        default="joint",
+        help="coordinates of the recording; default: %(default)s",
+    )
     options = parser.parse_args()
     arm = load_arm(options.arm)
     recording = read_recording(options.motion, arm, options.coordinates)

@@ -28,7 +28,7 @@ CASES = [
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=40)
+    parser.add_argument("--seeds", type=int, default=40, help="number of simulated arms per case; default: %(default)s")
     options = parser.parse_args()
     inside = []
     for name, link, mass, position in CASES:

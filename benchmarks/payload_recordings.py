@@ -40,7 +40,7 @@ SECONDS = (5.5, 6.0, 7.0, 8.0, 10.0)
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, help="folder of the recordings, see above")
     options = parser.parse_args()
     arm = load_arm("psm")
 

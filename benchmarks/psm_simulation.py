@@ -206,7 +206,7 @@ def closure_errors(row: StationRow | CenicRow, seconds: float) -> tuple[float, f
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", metavar="FILE", help="write the results to this file")
-    parser.add_argument("--repetitions", type=int, default=11)
+    parser.add_argument("--repetitions", type=int, default=11, help="number of repetitions; default: %(default)s")
     parser.add_argument("--seconds", type=float, default=1.0, help="simulated time of one repetition")
     arguments = parser.parse_args()
     trajectory = motion(arguments.seconds)

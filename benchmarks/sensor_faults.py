@@ -81,10 +81,10 @@ def print_table(title, arm, tasks, trials):
 def main():
     """Prints one table per arm and use."""
     parser = ArgumentParser(description=__doc__)
-    parser.add_argument("--arms", nargs="+", default=["mtml", "psm"])
-    parser.add_argument("--uses", nargs="+", default=["effort", "position", "hold"])
-    parser.add_argument("--faults", nargs="+", default=list(FAULTS))
-    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--arms", nargs="+", default=["mtml", "psm"], help="names of the arms; default: %(default)s")
+    parser.add_argument("--uses", nargs="+", default=["effort", "position", "hold"], help="uses to simulate")
+    parser.add_argument("--faults", nargs="+", default=list(FAULTS), help="sensor faults to simulate")
+    parser.add_argument("--processes", type=int, default=2, help="number of parallel processes; default: %(default)s")
     arguments = parser.parse_args()
     for name in arguments.arms:
         for use in arguments.uses:

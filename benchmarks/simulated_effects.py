@@ -71,10 +71,15 @@ def start(arm: Arm, effects: ArmEffects | None, closure: Closure) -> Simulator:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arm", default="mtml")
-    parser.add_argument("--closure", default="mimic", choices=["mimic", "ball"])
-    parser.add_argument("--repetitions", type=int, default=7)
-    parser.add_argument("--json", default="")
+    parser.add_argument("--arm", default="mtml", help="name of the arm; default: %(default)s")
+    parser.add_argument(
+        "--closure",
+        default="mimic",
+        choices=["mimic", "ball"],
+        help="method for closing the loops of the linkage; default: %(default)s",
+    )
+    parser.add_argument("--repetitions", type=int, default=7, help="number of repetitions; default: %(default)s")
+    parser.add_argument("--json", default="", help="write the results to this file")
     args = parser.parse_args()
     arm = load_arm(args.arm)
     effects, stretching = arm.effects, with_cables(arm)

@@ -28,7 +28,7 @@ from dvrk_drake.recordings.recording import Recording, read_recording
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, help="folder of the recordings, see above")
     parser.add_argument("--arm", default="mtmr", help="name of the arm; default: mtmr")
     options = parser.parse_args()
     arm = load_arm(options.arm)

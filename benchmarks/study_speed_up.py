@@ -21,9 +21,15 @@ EXAMPLE = Path(__file__).parent.parent / "examples" / "release_study.yaml"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("study", nargs="?", default=str(EXAMPLE))
-    parser.add_argument("--workers", nargs="+", type=int, default=[1, os.cpu_count() or 1])
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("study", nargs="?", default=str(EXAMPLE), help="study file")
+    parser.add_argument(
+        "--workers",
+        nargs="+",
+        type=int,
+        default=[1, os.cpu_count() or 1],
+        help="numbers of worker processes; default: %(default)s",
+    )
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="setting of the scenario")
     options = parser.parse_args()
     study = load_study(options.study, options.set)
     first, table = None, {}

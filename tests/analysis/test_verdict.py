@@ -176,9 +176,9 @@ def test_require_sets_the_exit_code_and_names_the_joints(files, tmp_path, capsys
     for required in ("usable", "good"):
         command = ["validate", bad, "--model", model, "--require", required]
         assert main([*command, "--json", str(report), "--overwrite"]) == 2
-        said = capsys.readouterr()
-        assert f"not {required} on {bad}: shoulder_pitch (do not use)" in refusal(said.err)
-        assert said.out.startswith("Verdict: do not use (shoulder_pitch). ")
+        output = capsys.readouterr()
+        assert f"not {required} on {bad}: shoulder_pitch (do not use)" in refusal(output.err)
+        assert output.out.startswith("Verdict: do not use (shoulder_pitch). ")
         found = json.loads(report.read_text())
         assert found["verdict"] == "do not use" and found["rule"] == rule_text(in_motion=False)
         assert [j["verdict"] for j in found["joints"]] == ["off", "do not use", "good", "good", "good", "good", "off"]

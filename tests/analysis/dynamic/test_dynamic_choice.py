@@ -15,7 +15,7 @@ from dvrk_drake.models.arm import load_arm
 FOLDS, ROWS = 12, 1200
 
 
-def arm_that_knows(**known):
+def arm_with_known_effects(**known):
     arm = load_arm("psm")
     known_effects = {f"actuator.{joint}": kinds for joint, kinds in known.items()}
     return replace(arm, identification=replace(arm.identification, known_effects=known_effects))
@@ -31,7 +31,7 @@ def of(effects, coordinate):
 
 
 def test_effects_of_the_arm_file_are_mandatory():
-    arm = arm_that_knows(pitch=["cable 1"], jaw=["asymmetric friction"])
+    arm = arm_with_known_effects(pitch=["cable 1"], jaw=["asymmetric friction"])
     always, candidates = drive_effects(arm, moving(arm)), optional_effects(arm, moving(arm))
     assert not set(always) & set(candidates)
     assert {("cable sine", 1.0), ("cable cosine", 1.0)} <= of(always, "actuator.pitch")
@@ -55,7 +55,7 @@ def test_effects_of_the_arm_file_are_mandatory():
     ],
 )
 def test_invalid_known_effects_are_rejected(known, message):
-    arm = arm_that_knows(**known)
+    arm = arm_with_known_effects(**known)
     with pytest.raises(ArmError, match=message):
         drive_effects(arm, moving(arm))
 
