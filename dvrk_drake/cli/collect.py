@@ -30,7 +30,7 @@ def record(
 ) -> None:
     """Record the measurements of an arm over LCM.
 
-    All received rows are in the file, even after Ctrl-C or an error.
+    The file contains only complete rows, even after Ctrl-C or an error.
 
     Args:
         output: New file: .csv for a CSV recording, .log for an LCM log.

@@ -95,8 +95,8 @@ def reproduce(
 ) -> None:
     """Reproduce the figures and tables of the paper.
 
-    The command writes a page that compares published and reproduced numbers. Without the recording of the paper
-    (--data), Fig. 4 is omitted and the other figures use a different simulated arm.
+    The command writes a page that compares published and reproduced numbers.
+    Without the recording of the paper, Fig. 4 is omitted and a different MTM is simulated.
 
     Args:
         what: Table, figure or experiment to reproduce.

@@ -179,8 +179,8 @@ def predict(
 ) -> None:
     """Predict the efforts of a recording with a model.
 
-    For a motion and a model with dynamics, the command writes the total efforts after the low-pass filter of the model.
-    Otherwise it writes holding efforts.
+    For a motion and a model with dynamics: total efforts, low-pass filtered as in the identification.
+    Otherwise: holding efforts.
 
     Args:
         output: CSV file to write: tau1..taun [N m; N if prismatic], in the coordinates of the recording.
@@ -210,8 +210,7 @@ def recalibrate(
 ) -> None:
     """Refit the friction and offsets of a model to a short new motion.
 
-    The result is valid for similar motions. At other positions and speeds the improvement can be much smaller
-    (docs/payload.md).
+    The result is valid for similar motions, positions and speeds only (docs/payload.md).
     """
     from dvrk_drake.reports.identification import print_recalibration
     from dvrk_drake.reports.terminal_tables import make_console

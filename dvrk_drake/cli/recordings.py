@@ -78,7 +78,7 @@ def convert(
 ) -> None:
     """Convert a recording to the CSV format of this project.
 
-    The formats are: CSV, LCM logs, team-mat (JHU-WPI recordings, MATLAB) and wpi-csv (WPI recordings, no header).
+    Formats: csv, lcm-log, team-mat (MATLAB files of JHU and WPI), wpi-csv (CSV of WPI, no header).
 
     Args:
         recording: File to convert.

@@ -235,7 +235,7 @@ def transparency(
         check_output(output, path or "", *(model or []), overwrite=overwrite)
     folder = plots_folder(plots, overwrite=overwrite)
     forces = []
-    names = [f"compensation by {compensation.name}" for compensation in compensations]
+    names = [f"compensation by {one.name}" if one.model else "no compensation" for one in compensations]
     with Steps(*names) as steps:
         for name, compensation in zip(names, compensations, strict=True):
             progress = step_progress(steps, name)

@@ -46,7 +46,7 @@ def print_demo(console: Console, result: DemoResult, folder: Path, *, verbose: b
     )
     table = make_table(
         f"RMS torque error at {result.fresh.poses} new poses [N m; N], drift and step error [rad; m]",
-        *("", "no model", "identified model", "paper's method", *(f"drift, {k}" for k in result.drift), "step error"),
+        *("", "no model", "identified", "paper's method", "drift, identified", "drift, nominal", "step error"),
     )
     for i, (ours, paper) in enumerate(zip(result.fresh.joints, result.fresh_paper.joints, strict=True)):
         errors = (ours.rms_torque, ours.rms_error, paper.rms_error, *(drift[i] for drift in drifts))

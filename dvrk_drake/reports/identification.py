@@ -341,6 +341,11 @@ def _print_pose_errors(
 
 def _print_pose_details(console: Console, result: StaticIdentification) -> None:
     """Prints the excluded measurements, the parameters with standard errors, and further errors of each joint."""
+    print_note(
+        console,
+        "Cross-validation error: 10 folds over the poses. Effects, parameters and feedforward scales are estimated "
+        "anew in each fold.",
+    )
     _print_excluded(console, result.excluded)
     print_static_parameters(console, result.model)
 
@@ -376,11 +381,7 @@ def print_static_parameters(console: Console, model: IdentifiedModel) -> None:
         positions = f"{j.position_lower:+.2f}..{j.position_upper:+.2f}"
         table.add_row(j.name, *(f"{e:.4f}" for e in errors), positions)
     console.print(table)
-    print_note(
-        console,
-        "The cross-validation error above is from 10 folds. Effects, parameters and feedforward scales are estimated "
-        "anew in each fold.",
-    )
+    console.print()
 
 
 def _print_excluded(console: Console, excluded: Sequence[ExcludedMeasurement]) -> None:

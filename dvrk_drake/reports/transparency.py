@@ -25,15 +25,16 @@ def print_transparency(console: Console, arm: Arm, forces: Sequence[OperatorForc
     """
     best, without = min(forces, key=lambda one: one.rms_force), forces[0]
     answer = f"Smallest interaction force at the handle: {best.rms_force:.2f} N RMS with {best.name}"
-    answer += "." if best is without else f", {without.rms_force:.2f} N with {without.name}."
+    answer += "." if best is without else f", {without.rms_force:.2f} N without compensation."
     print_answer(console, answer, f"dvrk-drake transparency --arm {arm.source} --model MODEL.yaml --plots FOLDER")
     headings = ("RMS force [N]", "95 % force [N]", "RMS torque [mN m]", "95 % torque [mN m]", "largest deviation [mm]")
     title = f"{arm.name}, simulated: interaction force and torque at the handle during {forces[0].time[-1]:.3g} s"
     table = make_table(title, "compensation", *headings)
     scales, formats = (1, 1, 1e3, 1e3, 1e3), (".2f", ".2f", ".0f", ".0f", ".1f")
     for one in forces:
+        name = "none" if one is without else one.name
         values = zip(_numbers(one).values(), scales, formats, strict=True)
-        table.add_row(one.name, *(f"{scale * value:{form}}" for value, scale, form in values))
+        table.add_row(name, *(f"{scale * value:{form}}" for value, scale, form in values))
     console.print(table)
     if verbose:
         console.print()
