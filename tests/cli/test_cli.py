@@ -384,7 +384,7 @@ def test_bad_input_is_refused_in_one_line(folder, capsys, tmp_path):
         ([text[0], text[1].replace(text[1].split(",")[9], "nan"), *text[2:]], f"{bad}:2: tau3 is nan"),
         ([text[0], *text[1:3], text[3] + ",1"], f"{bad}:4: has 15 cells, the header names 14"),
         ([], f"{bad}: is empty"),
-        (text[:4], f"{bad}: has 3 distinct poses, too few"),
+        (text[:4], f"{bad}: 3 distinct poses found"),
     ):
         bad.write_text("\n".join(lines))
         assert message in fails(capsys, "identify", bad, "--arm", "mtmr", "--output", out)
