@@ -189,4 +189,4 @@ def test_recalibrate_command(tmp_path, capsys):
     spiked.tau[500, 1] = 500.0
     write_recording(spiked, paths["short.csv"])
     assert main([*command, *again]) == 2
-    assert "above its limit" in refusal(capsys.readouterr().err)
+    assert "exceeds its limit" in refusal(capsys.readouterr().err)

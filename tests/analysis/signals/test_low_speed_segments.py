@@ -108,12 +108,12 @@ def test_recording_without_low_speed_segments_is_rejected(arm):
     q = np.zeros((50, 7))
     with pytest.raises(
         IdentificationError,
-        match=r"need a motion: qd1\.\.qd7, and t that increases by less than 0\.05 s, over 100 rows",
+        match=r"not a motion, .* qd1\.\.qd7, times t that increase by less than 0\.05 s, and at least 100 rows",
     ):
         low_speed_segments(Recording(q=q, tau=q), arm)
     t = np.arange(400) * 0.1
     q = np.zeros((400, 7))
-    with pytest.raises(IdentificationError, match=r"t that increases by less than 0\.05 s"):
+    with pytest.raises(IdentificationError, match=r"times t that increase by less than 0\.05 s"):
         low_speed_segments(Recording(q=q, qd=q, tau=q, t=t), arm)
     with pytest.raises(RecordingError, match="has no efforts"):
         low_speed_segments(Recording(q=q, qd=q, t=t), arm)
