@@ -24,13 +24,13 @@ def arm():
     return load_arm("psm")
 
 
-def test_rests_of_a_motion_are_found_and_identify_the_arm(arm):
+def test_static_segments_identify_the_arm(arm):
     generator = np.random.default_rng(0)
     poses = arm.sample_poses(16, generator, margin=0.1)
     recording = motion_with_pauses(arm, poses, generator)
     parts, measured = low_speed_segments(recording, arm)
     assert np.all(measured.sum(axis=1) == 1)
-    # A joint that hardly moves between two poses is slow all the time. Both rests are then one pass.
+    # A joint that hardly moves between two poses is always slow. Both static segments are then one low-speed segment.
     assert np.all(measured.sum(axis=0) >= 0.7 * len(poses))
     truth = IdentifiedModel.from_arm(arm)
     fresh = arm.sample_poses(200, generator)
@@ -62,7 +62,7 @@ def test_segments_at_1_khz_equal_those_at_200_hz(arm):
     assert fast.measured.sum(axis=0).min() >= 0.6 * len(poses)
 
 
-def test_rest_ends_at_a_gap_in_the_times(arm):
+def test_static_segment_ends_at_a_gap_in_the_times(arm):
     """The motion is unknown where samples are missing."""
     a, b = arm.sample_poses(2, np.random.default_rng(1), margin=0.1)
     recording = motion_with_pauses(arm, [a, b], np.random.default_rng(2), rest=2.0)
@@ -77,14 +77,14 @@ def test_rest_ends_at_a_gap_in_the_times(arm):
 
 @pytest.mark.parametrize("rate", [100.0, 1000.0])
 @pytest.mark.parametrize("with_speeds", [True, False])
-def test_rests_are_poses_of_all_joints(arm, rate, with_speeds):
+def test_static_segments_are_poses_of_all_joints(arm, rate, with_speeds):
     generator = np.random.default_rng(3)
     poses = arm.sample_poses(12, generator, margin=0.1)
     recording = motion_with_pauses(arm, [*poses, poses[0]], generator, rest=1.0, rate=rate)
     noisy = recording.qd + arm.per_joint(0.01, 0.001) * generator.normal(size=recording.q.shape)
     rests = static_poses(replace(recording, qd=noisy if with_speeds else None), arm)
     assert len(rests) == len(poses), "the last pose is the first again"
-    # A rest begins when the arm is slow, not when it stops.
+    # A static segment begins when the speed is low, before the arm stops.
     np.testing.assert_allclose(rests.q, poses, atol=1e-4)
     truth = IdentifiedModel.from_arm(arm).holding_torque(poses)
     assert np.all(np.abs(rests.tau - truth) < 1e-3 * arm.effort_limits)
@@ -93,7 +93,7 @@ def test_rests_are_poses_of_all_joints(arm, rate, with_speeds):
     assert found.note == f"Static poses found in the motion: 12, in {len(recording)} rows."
 
 
-def test_recording_without_rests_is_unchanged(arm):
+def test_recording_without_static_segments_is_unchanged(arm):
     generator = np.random.default_rng(4)
     poses = arm.sample_poses(12, generator, margin=0.1)
     moving = motion_with_pauses(arm, poses, generator, rest=0.0)
